@@ -1,0 +1,3 @@
+//! The `lads` command.
+#![forbid(unsafe_code)]
+fn main() {}

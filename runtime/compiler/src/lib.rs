@@ -1,0 +1,2 @@
+//! ONNX bundle to program image.
+#![forbid(unsafe_code)]

@@ -1,0 +1,2 @@
+//! The C boundary.
+#![no_std]

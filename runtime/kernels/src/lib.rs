@@ -1,0 +1,2 @@
+//! Dense kernels for batch-1 policies.
+#![no_std]

@@ -1,0 +1,2 @@
+//! MuJoCo environments, rollouts, metrics.
+#![forbid(unsafe_code)]
