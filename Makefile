@@ -1,0 +1,67 @@
+# lads: the two commands a fresh machine needs are `make run` and `make test`.
+# Needs Rust 1.95+, Python 3.11+, make and a C compiler; everything else is fetched from package registries.
+
+PYTHON ?= python3
+VENV   := .venv
+PY     := $(VENV)/bin/python
+MODEL  ?= models/kitchen.onnx
+ARGS   ?=
+RUNTIME := -p lads-core -p lads-kernels -p lads-compiler -p lads-ffi -p lads-cli
+
+.PHONY: run test setup lint test-runtime test-sim test-exporter collect train export bench clean help
+
+## run: the shipped policy over the paper's seen and unseen instructions
+run: setup
+	cargo run --release -p lads-sim --bin lads-run -- --model $(MODEL) $(ARGS)
+
+## test: format, lints, documentation, all Rust tests, the exporter's tests
+test: setup lint test-runtime test-sim test-exporter
+
+## setup: MuJoCo and the simulator's assets into vendor/ (idempotent)
+setup:
+	$(PYTHON) sim-harness/setup.py
+
+lint: setup
+	cargo fmt --all --check
+	cargo clippy --workspace --all-targets -- -D warnings
+	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps --quiet
+
+## test-runtime: the runtime alone; needs neither MuJoCo nor Python
+test-runtime:
+	cargo test $(RUNTIME)
+
+test-sim: setup
+	cargo test -p lads-sim -p lads-tests -p lads-benches
+
+# The stamp makes the environment anew whenever the package's pins change.
+$(VENV)/stamp: exporter/pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(PY) -m pip install --quiet --disable-pip-version-check -e 'exporter[test]'
+	touch $@
+
+test-exporter: setup $(VENV)/stamp
+	cargo build -p lads-cli -p lads-sim
+	$(PY) -m pytest -q exporter/tests tests/parity
+
+## collect: scripted demonstrations for the 22 seen instructions into data/kitchen.safetensors
+collect: setup
+	cargo run --release -p lads-sim --bin lads-collect -- --env kitchen -o data/kitchen.safetensors
+
+## train: the shipped policy from data/kitchen.safetensors into runs/kitchen
+train: $(VENV)/stamp
+	$(PY) -m lads_exporter train --config exporter/configs/kitchen.toml --data data/kitchen.safetensors --out runs/kitchen
+
+## export: runs/kitchen into models/kitchen.onnx
+export: $(VENV)/stamp
+	$(PY) -m lads_exporter export --run runs/kitchen -o models/kitchen.onnx
+
+## bench: kernels, entries and the control step
+bench:
+	cargo bench -p lads-benches
+
+clean:
+	cargo clean
+	rm -rf $(VENV) vendor
+
+help:
+	@sed -n 's/^## //p' Makefile
