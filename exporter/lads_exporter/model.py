@@ -1,0 +1,223 @@
+"""The networks of LADS for state observations (the paper's Section 4 and Appendix B.1).
+
+Shapes: B trajectories, T control steps, L words, O observation, A action, H horizon, M codes, D plan.
+All networks take normalised observations; `Normalizer` is applied by whoever feeds them and is folded
+into the graphs at export.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from .codebook import Codebook
+
+
+class Normalizer(nn.Module):
+    """(observation - mean) / std, with the statistics of the dataset."""
+
+    def __init__(self, observation_len):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(observation_len))
+        self.register_buffer("std", torch.ones(observation_len))
+
+    def forward(self, observations):
+        return (observations - self.mean) / self.std
+
+
+class Dropout(nn.Module):
+    """Dropout whose rate is rounded to 1/256: one random byte per element, which is several times faster on a CPU."""
+
+    def __init__(self, rate):
+        super().__init__()
+        self.threshold = round(rate * 256)
+
+    def forward(self, x):
+        if not self.training or self.threshold == 0:
+            return x
+        words = torch.empty((x.numel() + 7) // 8, dtype=torch.int64, device=x.device).random_(-(2**63), None)
+        keep = words.view(torch.uint8)[: x.numel()].view(x.shape) >= self.threshold
+        return x * keep.to(x.dtype).mul_(256 / (256 - self.threshold))
+
+
+class Block(nn.Module):
+    """One pre-norm transformer block; `forward` is causal over the whole sequence."""
+
+    def __init__(self, hidden, heads, dropout):
+        super().__init__()
+        self.heads = heads
+        self.norm1 = nn.LayerNorm(hidden)
+        self.qkv = nn.Linear(hidden, 3 * hidden)
+        self.out = nn.Linear(hidden, hidden)
+        self.norm2 = nn.LayerNorm(hidden)
+        self.up = nn.Linear(hidden, 4 * hidden)
+        self.down = nn.Linear(4 * hidden, hidden)
+        self.drop = Dropout(dropout)
+
+    def forward(self, x, rows=None):
+        """x [B, S, d]. With `rows` [B, R], only those rows' outputs are computed: [B, R, d]."""
+        batch, tokens, hidden = x.shape
+        qkv = self.qkv(self.norm1(x)).view(batch, tokens, 3, self.heads, hidden // self.heads)
+        q, k, v = qkv.permute(2, 0, 3, 1, 4)
+        mixed = F.scaled_dot_product_attention(q, k, v, is_causal=True).transpose(1, 2).reshape(batch, tokens, hidden)
+        if rows is not None:
+            mixed, x = take_rows(mixed, rows), take_rows(x, rows)
+        x = x + self.drop(self.out(mixed))
+        return x + self.drop(self.down(F.relu(self.up(self.norm2(x)))))
+
+
+def take_rows(x, rows):
+    """x [B, S, d], rows [B, R] -> [B, R, d]."""
+    return x.gather(1, rows[..., None].expand(-1, -1, x.shape[-1]))
+
+
+class HighLevelPolicy(nn.Module):
+    """pi_h: a causal transformer over words, states and actions; plan logits at every state token (equation 8)."""
+
+    def __init__(self, config, word_dim, observation_len, action_len, codes):
+        super().__init__()
+        hidden = config.hidden
+        self.embed_word = nn.Linear(word_dim, hidden)
+        self.embed_observation = nn.Linear(observation_len, hidden)
+        self.embed_action = nn.Linear(action_len, hidden)
+        self.embed_timestep = nn.Embedding(config.context_steps, hidden)
+        self.embed_norm = nn.LayerNorm(hidden)
+        self.drop = Dropout(config.dropout)
+        self.blocks = nn.ModuleList(Block(hidden, config.heads, config.dropout) for _ in range(config.layers))
+        self.norm = nn.LayerNorm(hidden)
+        self.head = nn.Linear(hidden, codes)
+        for module in self.modules():
+            if isinstance(module, (nn.Linear, nn.Embedding)):
+                nn.init.normal_(module.weight, 0.0, 0.02)
+            if isinstance(module, nn.Linear):
+                nn.init.zeros_(module.bias)
+
+    def forward(self, words, observations, actions):
+        """words: B tensors [L_i, E]; observations [B, T, O]; actions [B, T, A] -> logits [B, T, M].
+
+        Each sequence is its words, then s_0, a_0, s_1, a_1, ...; sequences are padded at their end, where
+        the causal mask hides the padding from every real token.
+        """
+        batch, steps = observations.shape[:2]
+        lengths = [len(row) for row in words]
+        embedded = self.embed_word(torch.cat(words)).split(lengths)
+        time = self.embed_timestep.weight[:steps]
+        pairs = torch.stack([self.embed_observation(observations) + time, self.embed_action(actions) + time], 2)
+        pairs = pairs.reshape(batch, 2 * steps, -1)[:, :-1]  # nothing follows the last action
+        most = max(lengths)
+        x = pairs.new_zeros(batch, most + 2 * steps - 1, pairs.shape[-1])
+        for row, prefix in enumerate(embedded):
+            x[row, : len(prefix)] = prefix
+            x[row, len(prefix) : len(prefix) + pairs.shape[1]] = pairs[row]
+        states = torch.tensor(lengths, device=x.device)[:, None] + 2 * torch.arange(steps, device=x.device)
+        x = self.drop(self.embed_norm(x))
+        for block in self.blocks[:-1]:
+            x = block(x)
+        return self.head(self.norm(self.blocks[-1](x, states))).float()
+
+
+class LowLevelPolicy(nn.Module):
+    """pi_l: an MLP from observation and plan to action; batch norm on all layers but the first and the last.
+
+    For states the paper's linear observation encoder and the first layer are one linear map; they are one here.
+    """
+
+    def __init__(self, config, observation_len, plan_len, action_len):
+        super().__init__()
+        hidden = config.hidden
+        self.slope = config.slope
+        self.first = nn.Linear(observation_len + plan_len, hidden)
+        self.middle = nn.ModuleList(nn.Linear(hidden, hidden, bias=False) for _ in range(config.layers - 2))
+        self.norms = nn.ModuleList(nn.BatchNorm1d(hidden) for _ in range(config.layers - 2))
+        self.last = nn.Linear(hidden, action_len)
+
+    def forward(self, observations, plans):
+        """observations [N, O], plans [N, D] -> actions [N, A]."""
+        x = F.leaky_relu(self.first(torch.cat([observations, plans], -1)), self.slope)
+        for linear, norm in zip(self.middle, self.norms):
+            x = F.leaky_relu(norm(linear(x)), self.slope)
+        return self.last(x)
+
+
+class TrajectoryEncoder(nn.Module):
+    """q: an LSTM over the encoded (s, a) of a segment, then a 3-layer MLP to the latent (before quantisation)."""
+
+    def __init__(self, hidden, observation_len, action_len, plan_len):
+        super().__init__()
+        self.embed_observation = nn.Linear(observation_len, hidden)
+        self.embed_action = nn.Linear(action_len, hidden)
+        self.lstm = nn.LSTM(2 * hidden, hidden, batch_first=True)
+        self.mlp = nn.Sequential(
+            nn.Linear(hidden, hidden), nn.LeakyReLU(), nn.Linear(hidden, hidden), nn.LeakyReLU(), nn.Linear(hidden, plan_len)
+        )
+
+    def input_weights(self):
+        """The two linear encoders multiplied into the LSTM's input weights: weight [4h, O+A], bias [4h]."""
+        on_observation, on_action = self.lstm.weight_ih_l0.chunk(2, 1)
+        weight = torch.cat([on_observation @ self.embed_observation.weight, on_action @ self.embed_action.weight], 1)
+        bias = self.lstm.bias_ih_l0 + on_observation @ self.embed_observation.bias + on_action @ self.embed_action.bias
+        return weight, bias
+
+    def forward(self, observations, actions, lengths):
+        """observations [N, H, O], actions [N, H, A], lengths [N] (valid steps, at least 1) -> latents [N, D]."""
+        weight, bias = self.input_weights()
+        hidden = self.lstm.hidden_size
+        start = observations.new_zeros(1, len(observations), hidden)
+        weights = [weight, self.lstm.weight_hh_l0, bias, self.lstm.bias_hh_l0]
+        joined = torch.cat([observations, actions], -1)
+        out = torch._VF.lstm(joined, (start, start), weights, True, 1, 0.0, self.training, False, True)[0]
+        return self.mlp(out[torch.arange(len(out), device=out.device), lengths - 1])
+
+
+class Alignment(nn.Module):
+    """The projectors phi and psi and the contrastive loss of equations 10, 25 and 26."""
+
+    def __init__(self, config, plan_len, sentence_dim, max_segments):
+        super().__init__()
+        hidden = config.hidden
+        self.embed = nn.Linear(plan_len, hidden)
+        self.position = nn.Parameter(torch.randn(max_segments, hidden) * 0.02)
+        layer = nn.TransformerEncoderLayer(hidden, config.heads, 4 * hidden, config.dropout, batch_first=True)
+        self.transformer = nn.TransformerEncoder(layer, config.layers, enable_nested_tensor=False)
+        self.phi = self._projector(hidden, hidden, config.out)
+        self.psi = self._projector(sentence_dim, hidden, config.out)
+        self.log_scale = nn.Parameter(torch.tensor(math.log(1 / 0.07)))
+
+    @staticmethod
+    def _projector(inputs, hidden, out):
+        return nn.Sequential(
+            nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, out)
+        )
+
+    def forward(self, plans, valid, sentences, instruction):
+        """plans [B, S, D], valid [B, S], sentences [B, E], instruction [B] -> loss.
+
+        Trajectories with the same instruction are neither positive nor negative to each other.
+        """
+        x = self.embed(plans) + self.position[: plans.shape[1]]
+        x = self.transformer(x, src_key_padding_mask=~valid)
+        x = (x * valid[..., None]).sum(1) / valid.sum(1, keepdim=True)
+        similarity = F.normalize(self.phi(x), dim=-1) @ F.normalize(self.psi(sentences), dim=-1).T
+        logits = similarity * self.log_scale.exp().clamp(max=100.0)
+        itself = torch.arange(len(plans), device=plans.device)
+        same = instruction[:, None] == instruction[None]
+        same[itself, itself] = False
+        logits = logits.masked_fill(same, -1e9)
+        return F.cross_entropy(logits, itself) + F.cross_entropy(logits.T, itself)
+
+
+class Lads(nn.Module):
+    """All networks of one policy. `forward` is not defined: the parts are trained and exported separately."""
+
+    def __init__(self, setting, encoded, max_segments=64):
+        super().__init__()
+        config, o, a = setting.config, setting.observation_len, setting.action_len
+        encoder = config.encoder
+        self.normalizer = Normalizer(o)
+        self.encoder = TrajectoryEncoder(encoder.hidden, o, a, encoder.codebook_dim)
+        self.codebook = Codebook(encoder)
+        self.low_level = LowLevelPolicy(config.low_level, o, encoder.codebook_dim, a)
+        self.high_level = HighLevelPolicy(config.high_level, encoded.dim, o, a, encoder.codebook_size)
+        sentence_dim = len(encoded.instructions[0].sentence)
+        self.alignment = Alignment(config.alignment, encoder.codebook_dim, sentence_dim, max_segments)

@@ -1,0 +1,57 @@
+"""Policies with random weights, through the same code as trained ones: for tests of the compiler and the runtime."""
+
+import numpy as np
+import torch
+
+from . import bundle
+from .model import Lads
+
+
+def _limits(setting):
+    rows = setting.environment["observation"]
+    low, high = (np.array([row[key] for row in rows], np.float64) for key in ("min", "max"))
+    return (low + high) / 2, (high - low) / 2
+
+
+def randomize(lads, setting, seed):
+    """Weights of healthy size everywhere, so that every token and every term matters in the outputs."""
+    generator = torch.Generator().manual_seed(seed)
+    draw = lambda tensor: torch.randn(tensor.shape, generator=generator)
+    with torch.no_grad():
+        for name, value in lads.named_parameters():
+            if "norm" in name and name.endswith("weight"):
+                value.copy_(1 + 0.2 * draw(value))
+            elif value.dim() > 1:
+                value.copy_(draw(value) / value.shape[-1] ** 0.5)
+            elif name.endswith("bias"):
+                value.copy_(0.2 * draw(value))
+        lads.high_level.embed_timestep.weight.copy_(0.3 * draw(lads.high_level.embed_timestep.weight))
+        lads.high_level.head.weight.mul_(2)
+        for norm in lads.low_level.norms:
+            norm.running_mean.copy_(0.2 * draw(norm.running_mean))
+            norm.running_var.copy_(0.5 + torch.rand(norm.running_var.shape, generator=generator))
+        centre, half = _limits(setting)
+        lads.normalizer.mean.copy_(torch.from_numpy(centre + 0.1 * half))
+        lads.normalizer.std.copy_(torch.from_numpy(0.3 * half))
+        lads.codebook.codes.copy_(draw(lads.codebook.codes))
+        lads.codebook.started.fill_(True)
+
+
+def observations(setting, steps, seed):
+    """Smooth made-up observations [steps, O] well inside the limits."""
+    centre, half = _limits(setting)
+    rng = np.random.default_rng(seed)
+    phase, speed = rng.uniform(0, 2 * np.pi, len(centre)), rng.uniform(0.01, 0.2, len(centre))
+    wave = np.sin(phase + speed * np.arange(steps)[:, None]) * rng.uniform(0.1, 0.6, len(centre))
+    return (centre + half * (wave + 0.01 * rng.uniform(-1, 1, wave.shape))).astype(np.float32)
+
+
+def export(setting, encoded, seed):
+    """A bundle with random weights and a golden episode over the whole context."""
+    torch.manual_seed(seed)
+    lads = Lads(setting, encoded)
+    randomize(lads, setting, seed)
+    steps, count = setting.config.high_level.context_steps, len(setting.instructions)
+    candidates = ((tried % count, observations(setting, steps, seed + tried)) for tried in range(1, 200))
+    provenance = {"dataset_sha256": "", "seed": seed, "steps": {}}
+    return lads, bundle.assemble(lads, setting, encoded, provenance, candidates)
