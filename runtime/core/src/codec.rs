@@ -200,4 +200,22 @@ macro_rules! word_enum {
     };
 }
 
-pub(crate) use {record, word_enum};
+/// Makes an enum of another crate a [`Field`] of one word with the discriminants written here.
+macro_rules! word_enum_for {
+    ($name:ty { $($variant:ident = $value:literal,)* }) => {
+        impl $crate::codec::Field for $name {
+            const WORDS: usize = 1;
+            fn put(&self, out: &mut $crate::codec::Writer) {
+                out.word(match self { $(Self::$variant => $value,)* });
+            }
+            fn take(from: &mut $crate::codec::Reader) -> Option<Self> {
+                match from.word()? {
+                    $($value => Some(Self::$variant),)*
+                    _ => None,
+                }
+            }
+        }
+    };
+}
+
+pub(crate) use {record, word_enum, word_enum_for};

@@ -14,27 +14,13 @@
 
 mod place;
 
-use crate::codec::{Field, Reader, Writer, record, word_enum};
+use crate::codec::{Field, Reader, Writer, record, word_enum_for};
 
+pub use lads_kernels::{Activation, BinaryKind, ReduceKind, UnaryKind};
 pub use place::{INT_SLOTS, IntSlot, Operand, Place, Port, Space, Span, StateSpan, WeightSpan};
 
 /// Words of an encoded op.
 pub const OP_WORDS: usize = 24;
-
-/// The non-linearity of a [`Linear`].
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Activation {
-    /// `x`
-    None,
-    /// `max(x, 0)`
-    Relu,
-    /// `x` where `x >= 0`, else `alpha * x`.
-    LeakyRelu(f32),
-    /// Hyperbolic tangent.
-    Tanh,
-    /// `1 / (1 + exp(-x))`
-    Sigmoid,
-}
 
 impl Field for Activation {
     const WORDS: usize = 2;
@@ -64,73 +50,25 @@ impl Field for Activation {
     }
 }
 
-word_enum! {
-    /// An operation on two elements.
-    pub enum BinaryKind {
-        /// `a + b`
-        Add = 0,
-        /// `a - b`
-        Sub = 1,
-        /// `a * b`
-        Mul = 2,
-        /// `a / b`
-        Div = 3,
-        /// The larger.
-        Max = 4,
-        /// The smaller.
-        Min = 5,
-        /// `a` to the power of `b`.
-        Pow = 6,
-    }
-}
+word_enum_for!(BinaryKind { Add = 0, Sub = 1, Mul = 2, Div = 3, Max = 4, Min = 5, Pow = 6, });
 
-word_enum! {
-    /// An operation on one element.
-    pub enum UnaryKind {
-        /// `max(x, 0)`
-        Relu = 0,
-        /// `x` where `x >= 0`, else `alpha * x`.
-        LeakyRelu = 1,
-        /// Hyperbolic tangent.
-        Tanh = 2,
-        /// `1 / (1 + exp(-x))`
-        Sigmoid = 3,
-        /// Natural exponential.
-        Exp = 4,
-        /// Natural logarithm.
-        Log = 5,
-        /// Square root.
-        Sqrt = 6,
-        /// `1 / sqrt(x)`
-        Rsqrt = 7,
-        /// `-x`
-        Neg = 8,
-        /// Absolute value.
-        Abs = 9,
-        /// `1 / x`
-        Recip = 10,
-        /// Error function.
-        Erf = 11,
-        /// `x * x`
-        Square = 12,
-    }
-}
+word_enum_for!(UnaryKind {
+    Relu = 0,
+    LeakyRelu = 1,
+    Tanh = 2,
+    Sigmoid = 3,
+    Exp = 4,
+    Log = 5,
+    Sqrt = 6,
+    Rsqrt = 7,
+    Neg = 8,
+    Abs = 9,
+    Recip = 10,
+    Erf = 11,
+    Square = 12,
+});
 
-word_enum! {
-    /// How an axis is reduced.
-    pub enum ReduceKind {
-        /// Sum of the elements.
-        Sum = 0,
-        /// Sum divided by the axis' length.
-        Mean = 1,
-        /// The largest element.
-        Max = 2,
-        /// The smallest element.
-        Min = 3,
-        /// Product of the elements.
-        Prod = 4,
-    }
-}
+word_enum_for!(ReduceKind { Sum = 0, Mean = 1, Max = 2, Min = 3, Prod = 4, });
 
 record! {
     /// `y = (accumulate ? y : 0) + activation(x·W + b)`; with `accumulate` the op is in place on `y`: a residual connection.
@@ -213,7 +151,7 @@ record! {
         pub queries: u32,
         /// Multiplies the scores.
         pub scale: f32,
-        /// `lads_kernels::attention_scratch_len(queries, heads, capacity)` elements, overlaps nothing.
+        /// `lads_kernels::attention_scratch_len(queries, capacity)` elements, overlaps nothing.
         pub scratch: Span,
     }
 }

@@ -1,0 +1,71 @@
+//! Sums in sixteen lanes: element `i` goes to lane `i % 16`, then the lanes are added as a tree. One order on every target.
+
+/// Lanes of a sum. Sixteen elements are one cache line, and fill vectors of four, eight or sixteen.
+pub const LANES: usize = 16;
+
+/// One block of elements.
+pub type Block = [f32; LANES];
+
+/// `acc[l] += f(a[l], b[l])`
+#[inline(always)]
+pub fn add_products(acc: &mut Block, a: &Block, b: &Block) {
+    for ((acc, &a), &b) in acc.iter_mut().zip(a).zip(b) {
+        *acc += a * b;
+    }
+}
+
+/// `acc[l] += a * b[l]`
+#[inline(always)]
+pub fn add_scaled(acc: &mut Block, a: f32, b: &Block) {
+    for (acc, &b) in acc.iter_mut().zip(b) {
+        *acc += a * b;
+    }
+}
+
+/// The sum of the lanes: halves are added until one element is left.
+#[inline(always)]
+pub fn tree(acc: &Block) -> f32 {
+    fn halve<const N: usize, const HALF: usize>(lanes: [f32; N]) -> [f32; HALF] {
+        let mut sums = [0.0; HALF];
+        let (low, high) = lanes.split_at(HALF);
+        for ((sum, &a), &b) in sums.iter_mut().zip(low).zip(high) {
+            *sum = a + b;
+        }
+        sums
+    }
+    let [sum] = halve::<2, 1>(halve::<4, 2>(halve::<8, 4>(halve::<16, 8>(*acc))));
+    sum
+}
+
+/// Sum of `f(x[i])`.
+#[inline(always)]
+pub fn sum_of(x: &[f32], f: impl Fn(f32) -> f32) -> f32 {
+    let mut acc = [0.0; LANES];
+    let (blocks, tail) = x.as_chunks::<LANES>();
+    for block in blocks {
+        for (acc, &x) in acc.iter_mut().zip(block) {
+            *acc += f(x);
+        }
+    }
+    for (acc, &x) in acc.iter_mut().zip(tail) {
+        *acc += f(x);
+    }
+    tree(&acc)
+}
+
+/// The largest element, or negative infinity; elements that are not a number are passed over.
+#[inline(always)]
+pub fn max_of(x: &[f32]) -> f32 {
+    let larger = |a: f32, b: f32| if b > a { b } else { a };
+    let mut acc = [f32::NEG_INFINITY; LANES];
+    let (blocks, tail) = x.as_chunks::<LANES>();
+    for block in blocks {
+        for (acc, &x) in acc.iter_mut().zip(block) {
+            *acc = larger(*acc, x);
+        }
+    }
+    for (acc, &x) in acc.iter_mut().zip(tail) {
+        *acc = larger(*acc, x);
+    }
+    acc.into_iter().fold(f32::NEG_INFINITY, larger)
+}

@@ -1,0 +1,93 @@
+//! Reductions of one axis, and the index of the smallest or largest element.
+
+use crate::lanes::{LANES, sum_of};
+use crate::math;
+
+/// How an axis is reduced.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ReduceKind {
+    /// Sum of the elements.
+    Sum,
+    /// Sum divided by the axis' length.
+    Mean,
+    /// The largest element; not a number if any is.
+    Max,
+    /// The smallest element; not a number if any is.
+    Min,
+    /// Product of the elements.
+    Prod,
+}
+
+/// The axis that is reduced: `x` is `[outer, len, inner]`, `outer` following from its length.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Axis {
+    /// Length of the axis.
+    pub len: usize,
+    /// Product of the dimensions after it.
+    pub inner: usize,
+}
+
+/// `y[o, i] = kind over a of x[o, a, i]`. Sums over the last axis run in sixteen lanes, all others in the axis' order.
+pub fn reduce(kind: ReduceKind, x: &[f32], axis: Axis, y: &mut [f32]) {
+    if axis.len == 0 || axis.inner == 0 {
+        return;
+    }
+    for (x, y) in x
+        .chunks_exact(axis.len * axis.inner)
+        .zip(y.chunks_exact_mut(axis.inner))
+    {
+        match kind {
+            ReduceKind::Sum => sum(x, y),
+            ReduceKind::Mean => {
+                sum(x, y);
+                for y in y {
+                    *y /= axis.len as f32;
+                }
+            }
+            ReduceKind::Max => fold(x, y, math::max),
+            ReduceKind::Min => fold(x, y, math::min),
+            ReduceKind::Prod => fold(x, y, |a, b| a * b),
+        }
+    }
+}
+
+fn sum(x: &[f32], y: &mut [f32]) {
+    match y {
+        [y] if x.len() > LANES => *y = sum_of(x, |x| x),
+        _ => fold(x, y, |a, b| a + b),
+    }
+}
+
+/// Combines the rows of `x`, each as long as `y`, from the first on.
+#[inline(always)]
+fn fold(x: &[f32], y: &mut [f32], f: impl Fn(f32, f32) -> f32) {
+    let mut rows = x.chunks_exact(y.len().max(1));
+    if let Some(first) = rows.next() {
+        y.copy_from_slice(first);
+    }
+    for row in rows {
+        for (y, &x) in y.iter_mut().zip(row) {
+            *y = f(*y, x);
+        }
+    }
+}
+
+/// Index of the largest element, the first of equal ones; elements that are not a number are passed over. 0 if there is none.
+pub fn arg_max(x: &[f32]) -> usize {
+    best(x, |x, best| x > best)
+}
+
+/// Index of the smallest element, the first of equal ones; elements that are not a number are passed over. 0 if there is none.
+pub fn arg_min(x: &[f32]) -> usize {
+    best(x, |x, best| x < best)
+}
+
+fn best(x: &[f32], better: impl Fn(f32, f32) -> bool) -> usize {
+    let mut found: Option<(usize, f32)> = None;
+    for (i, &x) in x.iter().enumerate().filter(|(_, x)| !x.is_nan()) {
+        if found.is_none_or(|(_, best)| better(x, best)) {
+            found = Some((i, x));
+        }
+    }
+    found.map_or(0, |(i, _)| i)
+}
