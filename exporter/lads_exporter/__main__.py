@@ -1,43 +1,141 @@
-"""Command line: `python -m lads_exporter random|train|export`."""
+"""Demonstrations to a LADS policy to one ONNX file."""
 
 import argparse
+import hashlib
 import sys
+from pathlib import Path
 
 from .config import UserError
 
 
+def _encode(setting):
+    from . import language
+
+    return language.encode(setting.config.language, [row["text"] for row in setting.instructions])
+
+
 def _random(arguments):
-    from . import bundle, config, language, random_policy
+    from . import bundle, config, random_policy
 
     setting = config.load(arguments.config)
-    encoded = language.encode(setting.config.language, [row["text"] for row in setting.instructions])
-    _, model = random_policy.export(setting, encoded, arguments.seed)
-    sha256 = bundle.save(model, arguments.output)
-    print(f"{arguments.output}: random weights, sha256 {sha256}")
+    _, model = random_policy.export(setting, _encode(setting), arguments.seed)
+    print(f"{arguments.output}: random weights, sha256 {bundle.save(model, arguments.output)}")
+
+
+def _device(name):
+    import torch
+
+    if name == "cuda" and not torch.cuda.is_available():
+        raise UserError("--device cuda: this machine has no usable CUDA GPU; use --device cpu")
+    return torch.device(name)
+
+
+def _train(arguments):
+    import torch
+
+    from . import config, dataset, training
+
+    if arguments.threads:
+        torch.set_num_threads(arguments.threads)
+    setting = config.load(arguments.config)
+    data = dataset.load(arguments.data, setting)
+    device = _device(arguments.device)
+    trainer = training.Trainer(setting, data, _encode(setting), arguments.out, device, arguments.seed)
+    if not trainer.run(resume=arguments.resume):
+        print(f"stopped; continue with --resume ({arguments.out})", file=sys.stderr)
+        return 130
+    print(f"{arguments.out}: trained; next: python -m lads_exporter export --run {arguments.out} -o models/{setting.config.name}.onnx")
+    return 0
+
+
+def _card(arguments, saved, sha256):
+    from . import bundle, card
+
+    beside = []
+    for pair in arguments.beside:
+        label, equals, path = pair.rpartition("=")
+        if not equals:
+            raise UserError(f"--beside {pair!r}: must be LABEL=FILE")
+        beside.append((label, card.read_results(path)))
+    results = card.read_results(arguments.results) if arguments.results else None
+    path = Path(arguments.output).with_suffix(".md")
+    bundle.write_atomically(path, card.write(arguments.run, saved, sha256, results, beside).encode())
+    print(f"{path}: model card")
+
+
+def _export(arguments):
+    from . import bundle, training
+    from .model import Lads
+
+    saved, setting = training.load_run(arguments.run)
+    encoded = _encode(setting)
+    identity = saved["identity"]
+    if encoded.sha256 != identity["language_sha256"]:
+        raise UserError(f"{arguments.run} was trained with other weights of {encoded.encoder}")
+    lads = Lads(setting, encoded)
+    lads.load_state_dict(saved["lads"])
+    names = training.STAGES[setting.config.training.schedule]
+    provenance = {
+        "dataset_sha256": identity["dataset_sha256"],
+        "seed": identity["seed"],
+        "steps": {name: getattr(setting.config.training, name).steps for name in names},
+    }
+    candidates = ((instruction, observations.numpy()) for instruction, observations in saved["golden"])
+    sha256 = bundle.save(bundle.assemble(lads, setting, encoded, provenance, candidates), arguments.output)
+    print(f"{arguments.output}: sha256 {sha256}")
+    _card(arguments, saved, sha256)
+
+
+def _card_alone(arguments):
+    from . import training
+
+    saved, _ = training.load_run(arguments.run)
+    if not Path(arguments.output).is_file():
+        raise UserError(f"no bundle at {arguments.output}; export one first (make export)")
+    _card(arguments, saved, hashlib.sha256(Path(arguments.output).read_bytes()).hexdigest())
 
 
 def _parser():
-    parser = argparse.ArgumentParser(prog="lads_exporter", description=__doc__)
-    commands = parser.add_subparsers(required=True)
+    parser = argparse.ArgumentParser(prog="python -m lads_exporter", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
     random = commands.add_parser("random", help="a bundle with random weights, for tests")
     random.add_argument("--config", required=True)
     random.add_argument("-o", "--output", required=True)
     random.add_argument("--seed", type=int, default=0)
-    random.set_defaults(run=_random)
+    random.set_defaults(run_command=_random)
+
+    train = commands.add_parser("train", help="train a policy from a dataset")
+    train.add_argument("--config", required=True, help="one TOML file per setting, in exporter/configs")
+    train.add_argument("--data", required=True, help=".safetensors of lads-collect, or D4RL kitchen .hdf5")
+    train.add_argument("--out", required=True, help="folder of the run: checkpoint, curves, summary")
+    train.add_argument("--resume", action="store_true", help="continue from the run's checkpoint")
+    train.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    train.add_argument("--seed", type=int, default=0)
+    train.add_argument("--threads", type=int, default=0, help="CPU threads; 0 leaves the choice to PyTorch")
+    train.set_defaults(run_command=_train)
+
+    export = commands.add_parser("export", help="a trained run to a bundle and its model card")
+    card = commands.add_parser("card", help="write the model card again, with results")
+    for command, function in ((export, _export), (card, _card_alone)):
+        command.add_argument("--run", required=True)
+        command.add_argument("-o", "--output", required=True, help="the bundle; the card lies beside it")
+        command.add_argument("--results", help="JSON of lads-run --json for this bundle")
+        command.add_argument("--beside", action="append", default=[], metavar="LABEL=FILE", help="results of another run")
+        command.set_defaults(run_command=function)
     return parser
 
 
 def main():
     arguments = _parser().parse_args()
     try:
-        arguments.run(arguments)
+        return arguments.run_command(arguments) or 0
     except (UserError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130
-    return 0
 
 
 if __name__ == "__main__":

@@ -83,11 +83,12 @@ def test_low_level_and_encoder(policy):
 def past_of(lads, x):
     """The keys and values of every block for embedded tokens x [1, S, d], by plain PyTorch."""
     out = {}
+    mask = torch.triu(torch.full((1, 1, x.shape[1], x.shape[1]), -1e9), 1)
     for number, block in enumerate(lads.high_level.blocks):
         rows = block.qkv(block.norm1(x)).chunk(3, -1)
         heads = [row.view(1, x.shape[1], block.heads, -1).transpose(1, 2) for row in rows]
         out[f"past_key_values.{number}.key"], out[f"past_key_values.{number}.value"] = heads[1], heads[2]
-        x = block(x)
+        x = block(x, mask)
     return out
 
 

@@ -1,0 +1,123 @@
+"""The model card: what the bundle was made from and by, and what it reached."""
+
+import csv
+import json
+from pathlib import Path
+
+from .config import UserError
+from .training import CURVES, SUMMARY
+
+
+def read_results(path):
+    """A results file of lads-run."""
+    try:
+        results = json.loads(Path(path).read_text(encoding="utf-8"))
+        for split in results["splits"].values():
+            for key in ("episodes", "n_rate", "k_rate", "full_success"):
+                split[key]
+        return results
+    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+        raise UserError(f"{path}: not a results file of lads-run --json ({error!r})") from error
+
+
+def _interval(value):
+    """K4 as lads-run writes it: a number, or an object with the Wilson interval."""
+    if isinstance(value, dict):
+        low, high = value.get("wilson95", value.get("interval95", (None, None)))
+        rate = value.get("rate", value.get("mean", 0.0))
+        return f"{rate:.2f}" + (f" ({low:.2f}-{high:.2f})" if low is not None else "")
+    return f"{value:.2f}"
+
+
+def _row(label, split):
+    k = " ".join(f"{value:.2f}" for value in split["k_rate"])
+    return f"| {label} | {split['episodes']} | {split['n_rate']:.2f} | {k} | {_interval(split['full_success'])} |"
+
+
+def _table(rows):
+    return ["| | episodes | N-rate | K-rate 1 2 3 4 | full success (95 %) |", "|---|---|---|---|---|", *rows]
+
+
+def _results(results, sha256, beside):
+    lines = ["", "## Results", ""]
+    if results is None:
+        return [*lines, "Not measured yet: run `lads-run --json FILE` and write this card again with `--results FILE`."]
+    if results.get("bundle_sha256") != sha256:
+        raise UserError(f"the results are of another bundle ({results.get('bundle_sha256')}), not of {sha256}")
+    lines += [f"`lads-run`, seed {results.get('seed')}, noise {results.get('noise')}, versions {json.dumps(results.get('versions'))}.", ""]
+    lines += _table([_row(name, split) for name, split in results["splits"].items()])
+    lines += ["", "| instruction | split | episodes | sub-tasks completed in episodes |", "|---|---|---|---|"]
+    for row in results.get("instructions", []):
+        done = row.get("completions")
+        text = ", ".join(f"{name} {count}" for name, count in done.items()) if isinstance(done, dict) else json.dumps(done)
+        lines.append(f"| {row['id']}: {row['text']} | {row['split']} | {row['episodes']} | {text} |")
+    if beside:
+        lines += ["", "## Other settings and seeds", ""]
+        pairs = [(label, name, split) for label, other in beside for name, split in other["splits"].items()]
+        lines += _table([_row(f"{label}, {name}", split) for label, name, split in pairs])
+    return lines
+
+
+def _curves(folder):
+    """First and last row of each stage."""
+    with open(Path(folder) / CURVES, encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    columns = ("loss", "bc", "align", "ce", "perplexity", "val_bc", "val_ce", "val_accuracy")
+    lines = ["| stage | step | " + " | ".join(columns) + " |", "|---" * (len(columns) + 2) + "|"]
+    for stage in dict.fromkeys(row["stage"] for row in rows):
+        own = [row for row in rows if row["stage"] == stage]
+        for row in (own[0], own[-1]):
+            lines.append(f"| {stage} | {row['step']} | " + " | ".join(row[name] for name in columns) + " |")
+    return lines
+
+
+def _plain(tables):
+    """A configuration as TOML-like lines, without the environment and the instructions."""
+    lines = []
+    for key, value in tables.items():
+        if isinstance(value, dict):
+            nested = [(name, inner) for name, inner in value.items() if isinstance(inner, dict) and key == "training"]
+            flat = {name: inner for name, inner in value.items() if (name, inner) not in nested}
+            lines += ["", f"[{key}]", *(f"{name} = {json.dumps(inner)}" for name, inner in flat.items())]
+            for name, inner in nested:
+                lines += [f"[{key}.{name}]", *(f"{k} = {json.dumps(v)}" for k, v in inner.items())]
+        else:
+            lines.append(f"{key} = {json.dumps(value)}")
+    return lines
+
+
+def write(folder, saved, sha256, results=None, beside=()):
+    """The card as Markdown. `folder` is the run's, `saved` its checkpoint."""
+    summary = json.loads((Path(folder) / SUMMARY).read_text(encoding="utf-8"))
+    tables, environment, _ = saved["identity"]["tables"]
+    steps = ", ".join(f"{name} {count} ({summary['seconds'][name]:.0f} s)" for name, count in summary["steps"].items())
+    held_out = ", ".join(f"{name.removeprefix('val_')} {value:.4g}" for name, value in summary["validation"].items())
+    share = summary["perplexity"] / summary["codebook_size"]
+    lines = [
+        f"# Model card: {tables['name']}",
+        "",
+        f"A LADS policy for {environment['id']} (version {environment['version']}), one ONNX file with the contract and a golden episode inside.",
+        "Intended for simulation and study; it has seen no real robot.",
+        "",
+        f"- sha256 of the bundle: `{sha256}`",
+        f"- data: {summary['episodes']} episodes, {summary['transitions']} transitions, sha256 `{summary['dataset_sha256']}`",
+        *(f"- data, {name}: {value if isinstance(value, str) else json.dumps(value)}" for name, value in saved["notes"].items()),
+        f"- language encoder: {tables['language']['encoder']}, layer {tables['language']['layer']}, sha256 `{saved['identity']['language_sha256']}`",
+        f"- training: {summary['schedule']}, seed {summary['seed']}, steps {steps}",
+        f"- codebook: perplexity {summary['perplexity']:.1f} of {summary['codebook_size']} over the dataset ({share:.0%}), {summary['revived']} codes revived",
+        f"- held out: {held_out}",
+        f"- versions: {', '.join(f'{name} {version}' for name, version in summary['versions'].items())}",
+        *_results(results, sha256, beside),
+        "",
+        "## Curves",
+        "",
+        *_curves(folder),
+        "",
+        "## Configuration",
+        "",
+        "```toml",
+        *_plain(tables),
+        "```",
+        "",
+    ]
+    return "\n".join(lines)

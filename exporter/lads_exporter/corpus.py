@@ -1,0 +1,127 @@
+"""A dataset as padded tensors on one device, with the samplers that training draws from.
+
+Shapes: E episodes, T the longest episode plus H (so that every window of H steps can be sliced).
+Observations are normalised with the statistics of the training episodes.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from .config import UserError
+
+POOL = 8  # batches of similar length are cut from a pool of this many
+
+
+@dataclass(frozen=True)
+class Segments:
+    """N windows of H steps; `valid` [N, H] is False beyond a trajectory's end."""
+
+    observations: torch.Tensor  # [N, H, O]
+    actions: torch.Tensor  # [N, H, A] the labels
+    executed: torch.Tensor  # [N, H, A]
+    lengths: torch.Tensor  # [N] valid steps
+    rows: torch.Tensor  # [N] row of the batch it belongs to
+    places: torch.Tensor  # [N] its number in that trajectory
+    low_level_observations: torch.Tensor  # [N, H, O] what the low level is shown; see `Corpus.shown`
+
+    @property
+    def valid(self):
+        horizon = self.observations.shape[1]
+        return torch.arange(horizon, device=self.lengths.device) < self.lengths[:, None]
+
+
+class Corpus:
+    def __init__(self, dataset, setting, encoded, device):
+        config = setting.config
+        self.horizon, self.device = config.encoder.horizon, device
+        count = len(dataset)
+        held_out = np.zeros(count, bool)
+        if config.data.validation_every > 0:
+            held_out[config.data.validation_every - 1 :: config.data.validation_every] = True
+        self.train, self.validation = (torch.from_numpy(np.flatnonzero(x)) for x in (~held_out, held_out))
+        if len(self.validation) == 0 or len(self.train) == 0:
+            raise UserError(f"{count} episodes are too few to hold out every {config.data.validation_every}th")
+        training_rows = np.concatenate([np.arange(dataset.rows(e).start, dataset.rows(e).stop) for e in self.train])
+        seen = dataset.observations[training_rows]
+        self.mean = torch.from_numpy(seen.mean(0, dtype=np.float64).astype(np.float32))
+        self.std = torch.from_numpy(np.maximum(seen.std(0, dtype=np.float64), config.data.std_floor).astype(np.float32))
+        normed = lambda array: (torch.from_numpy(array) - self.mean) / self.std
+        self.lengths = torch.from_numpy(dataset.lengths())
+        self.observations = self._padded(normed(dataset.observations), dataset)
+        self.actions = self._padded(torch.from_numpy(dataset.actions), dataset)
+        self.executed = self._padded(torch.from_numpy(dataset.executed), dataset)
+        self.states = self.noise = None
+        if config.data.renoise:
+            if dataset.states is None:
+                raise UserError("data.renoise = true needs noise-free states, which this dataset lacks; set it to false")
+            self.states = self._padded(normed(dataset.states), dataset)
+            self.noise = (torch.from_numpy(dataset.noise_amplitude()) / self.std).to(device)
+        self.instruction = torch.from_numpy(dataset.instruction)
+        self.words = [torch.from_numpy(row.words).to(device) for row in encoded.instructions]
+        self.sentences = torch.from_numpy(np.stack([row.sentence for row in encoded.instructions])).to(device)
+        weights = [config.data.weights.get(row["id"], 1.0) for row in setting.instructions]
+        self.weights = torch.tensor(weights)[self.instruction]
+
+    def _padded(self, rows, dataset):
+        steps = int(self.lengths.max()) + self.horizon
+        out = rows.new_zeros(len(dataset), steps, rows.shape[1])
+        for episode in range(len(dataset)):
+            out[episode, : self.lengths[episode]] = rows[dataset.rows(episode)]
+        return out.to(self.device)
+
+    def shown(self, episodes, steps):
+        """Normalised observations at (episode, step): as recorded, or the clean state with fresh noise."""
+        if self.states is None:
+            return self.observations[episodes, steps]
+        states = self.states[episodes, steps]
+        return states + self.noise * (2 * torch.rand_like(states) - 1)
+
+    def draw(self, batch, generator):
+        """`batch` training episodes by weight."""
+        weights = self.weights[self.train]
+        chosen = torch.multinomial(weights, batch, replacement=batch > len(weights), generator=generator)
+        return self.train[chosen]
+
+    def draw_alike(self, batch, step, generator_of):
+        """As `draw`, but of similar length: one of the batches of a pool sorted by length, each used once."""
+        pool = self.draw_pool(batch, generator_of(step // POOL))
+        order = torch.randperm(POOL, generator=generator_of(-1 - step // POOL))
+        return pool[order[step % POOL]]
+
+    def draw_pool(self, batch, generator):
+        drawn = torch.cat([self.draw(batch, generator) for _ in range(POOL)])
+        return drawn[self.lengths[drawn].argsort(stable=True)].view(POOL, batch)
+
+    def segments(self, episodes, offsets):
+        """Cuts each episode into windows of H steps that start at its offset; the last one may be shorter."""
+        rows, starts, places = [], [], []
+        for row, (length, offset) in enumerate(zip(self.lengths[episodes].tolist(), offsets.tolist())):
+            begin = torch.arange(min(offset, length - 1), length, self.horizon)
+            rows.append(torch.full_like(begin, row))
+            starts.append(begin)
+            places.append(torch.arange(len(begin)))
+        rows, starts, places = torch.cat(rows), torch.cat(starts), torch.cat(places)
+        return self._windows(episodes[rows], starts, rows, places)
+
+    def _windows(self, episodes, starts, rows, places):
+        steps = (starts[:, None] + torch.arange(self.horizon)).to(self.device)
+        lengths = (self.lengths[episodes] - starts).clamp(max=self.horizon).to(self.device)
+        at = episodes.to(self.device)[:, None], steps
+        tensors = (table[at] for table in (self.observations, self.actions, self.executed))
+        return Segments(*tensors, lengths, rows.to(self.device), places.to(self.device), self.shown(*at))
+
+    def every_window(self, episode):
+        """The windows that start at each step of an episode."""
+        starts = torch.arange(int(self.lengths[episode]))
+        return self._windows(torch.full_like(starts, episode), starts, torch.zeros_like(starts), starts)
+
+    @torch.no_grad()
+    def codes(self, encode):
+        """The code of the window that starts at each step, [E, T], -1 beyond an episode's end."""
+        out = torch.full(self.observations.shape[:2], -1, dtype=torch.long, device=self.device)
+        for episode in range(len(self.lengths)):
+            index = encode(self.every_window(episode))
+            out[episode, : len(index)] = index
+        return out

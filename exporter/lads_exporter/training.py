@@ -1,0 +1,435 @@
+"""Training LADS: jointly by Algorithm 1, or in three stages.
+
+The stop-gradients of equation 7 keep the cross-entropy from moving the plans and the other losses from
+moving the high level, so the stages minimise the same sum (equation 11) in turn:
+1. `plans`: encoder, codebook, low level and semantic regularisation;
+2. `low_level`: the low level alone, on the frozen codes of all windows;
+3. `high_level`: the transformer alone, on the frozen codes of all windows.
+
+Every step seeds the random numbers with (seed, stage, step): a resumed run does what an uninterrupted one
+would have done. An interrupt finishes the step at hand, writes a checkpoint and stops.
+"""
+
+import csv
+import io
+import json
+import math
+import signal
+import time
+import zlib
+from collections import defaultdict
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from tqdm import tqdm
+
+from . import __version__, config as configuration
+from .bundle import write_atomically
+from .codebook import nearest, perplexity
+from .config import UserError
+from .corpus import Corpus
+from .model import Lads
+
+STAGES = {"joint": ("joint",), "staged": ("plans", "low_level", "high_level")}
+LOG_EVERY, VALIDATE_EVERY, SAVE_SECONDS = 50, 500, 120
+CHECKPOINT, CURVES, SUMMARY = "checkpoint.pt", "curves.csv", "summary.json"
+COLUMNS = ("stage", "step", "learning_rate", "ms_per_step", "loss", "bc", "commitment", "align", "ce", "perplexity",
+           "revived", "val_bc", "val_perplexity", "val_ce", "val_accuracy")  # fmt: skip
+
+
+class Losses:
+    """The losses of Section 4 on a corpus, as functions of episodes."""
+
+    def __init__(self, lads, corpus, config):
+        self.lads, self.corpus, self.config = lads, corpus, config
+        self.autocast = config.training.bf16 and _fast_bfloat16(corpus.device)
+
+    def offsets(self, episodes, generator):
+        if not self.config.training.random_offset:
+            return torch.zeros(len(episodes), dtype=torch.long)
+        return torch.randint(self.corpus.horizon, (len(episodes),), generator=generator)
+
+    def plans(self, episodes, offsets):
+        """L_BC, the commitment term of L_VQ and L_align (equations 5, 6, 10), and the codes used."""
+        lads, segments = self.lads, self.corpus.segments(episodes, offsets)
+        latents = lads.encoder(segments.observations, segments.executed, segments.lengths)
+        plans, index, commitment = lads.codebook(latents)
+        valid = segments.valid
+        each = plans[:, None].expand(-1, self.corpus.horizon, -1)[valid]
+        actions = lads.low_level(segments.low_level_observations[valid], each)
+        losses = {"bc": F.mse_loss(actions, segments.actions[valid]), "commitment": commitment}
+        losses["align"] = self._align(plans, segments, episodes)
+        return losses, index
+
+    def _align(self, plans, segments, episodes):
+        if self.config.alignment.weight == 0:
+            return plans.new_zeros(())
+        most = int(segments.places.max()) + 1
+        sequence = plans.new_zeros(len(episodes), most, plans.shape[1])
+        valid = torch.zeros(len(episodes), most, dtype=torch.bool, device=plans.device)
+        sequence[segments.rows, segments.places] = plans
+        valid[segments.rows, segments.places] = True
+        instruction = self.corpus.instruction[episodes].to(plans.device)
+        return self.lads.alignment(sequence, valid, self.corpus.sentences[instruction], instruction)
+
+    def low_level(self, episodes, steps, plans):
+        """L_BC of single transitions [N] under given plans [N, D]."""
+        shown = self.corpus.shown(episodes, steps)
+        return {"bc": F.mse_loss(self.lads.low_level(shown, plans), self.corpus.actions[episodes, steps])}
+
+    def high_level(self, episodes, codes, counted):
+        """L_CE (equation 8): codes [B, T] of the windows that start at each step, `counted` [B, T] those that count.
+
+        Returns the loss and the accuracy.
+        """
+        corpus = self.corpus
+        length = int(corpus.lengths[episodes].max())
+        at = episodes.to(corpus.device)
+        words = [self._some_words(corpus.words[i]) for i in corpus.instruction[episodes]]
+        with torch.autocast(corpus.device.type, torch.bfloat16, enabled=self.autocast):
+            logits = self.lads.high_level(words, corpus.observations[at, :length], corpus.executed[at, :length])
+        counted = counted[:, :length] & (codes[:, :length] >= 0)
+        logits, targets = logits[counted], codes[:, :length][counted]
+        return F.cross_entropy(logits, targets), (logits.argmax(-1) == targets).float().mean()
+
+    def _some_words(self, words):
+        """The words less a random few, while training; the last token ([SEP]) always stays."""
+        rate = self.config.data.word_dropout
+        if rate == 0 or not self.lads.high_level.training:
+            return words
+        keep = torch.rand(len(words), device=words.device) >= rate
+        keep[-1] = True
+        return words[keep]
+
+    def decisions(self, episodes, offsets, steps):
+        """[B, T]: the steps offset + kH at which a window of the segmentation starts."""
+        step = torch.arange(steps)
+        return ((step >= offsets[:, None]) & ((step - offsets[:, None]) % self.corpus.horizon == 0)).to(self.corpus.device)
+
+    @torch.no_grad()
+    def encode(self, segments):
+        latents = self.lads.encoder(segments.observations, segments.executed, segments.lengths)
+        return nearest(latents, self.lads.codebook.codes)
+
+
+def _fast_bfloat16(device):
+    return device.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+
+
+class Stage:
+    """One stage: its parameters, and the total loss of one step."""
+
+    def __init__(self, name, trainer):
+        self.name, self.trainer = name, trainer
+        self.lads, self.corpus, self.losses = trainer.lads, trainer.corpus, trainer.losses
+        self.training = trainer.config.training
+        self.settings = getattr(self.training, name)
+        parts = {
+            "joint": ("encoder", "low_level", "alignment", "high_level"),
+            "plans": ("encoder", "low_level", "alignment"),
+            "low_level": ("low_level",),
+            "high_level": ("high_level",),
+        }[name]
+        self.modules = [getattr(self.lads, part) for part in parts]
+        if name in ("joint", "plans"):
+            self.modules.append(self.lads.codebook)
+        self.parameters = [value for part in parts for value in getattr(self.lads, part).parameters()]
+        rate, decay = self.settings.learning_rate, self.settings.weight_decay
+        self.optimizer = torch.optim.AdamW(self.parameters, rate, weight_decay=decay, fused=True)
+        self.codes = None
+        if name in ("low_level", "high_level"):
+            self.lads.eval()
+            self.codes = self.corpus.codes(self.losses.encode)
+        if name == "low_level":
+            self._list_transitions()
+
+    def _list_transitions(self):
+        corpus = self.corpus
+        lengths = corpus.lengths[corpus.train]
+        self.episodes = corpus.train.repeat_interleave(lengths)
+        self.steps = torch.cat([torch.arange(n) for n in lengths.tolist()])
+        self.cumulative = corpus.weights[self.episodes].double().cumsum(0)
+
+    def learning_rate(self, step):
+        """Linear warm-up, then a cosine down to `final` of the rate."""
+        s = self.settings
+        cosine = 0.5 * (1 + math.cos(math.pi * step / s.steps))
+        return s.learning_rate * min(1.0, (step + 1) / s.warmup) * (s.final + (1 - s.final) * cosine)
+
+    def loss(self, step):
+        """The total loss of a step and its parts."""
+        generator_of = lambda draw: torch.Generator().manual_seed(self.trainer.seed_of(self.name, "draw", draw))
+        if self.name == "low_level":
+            return self._low_level_loss(generator_of(step))
+        if self.name == "high_level":
+            episodes = self.corpus.draw_alike(self.settings.batch, step, generator_of)
+            offsets = torch.zeros(len(episodes), dtype=torch.long)
+            codes = self.codes[episodes.to(self.corpus.device)]
+            ce, _ = self.losses.high_level(episodes, codes, self._counted(episodes, offsets))
+            return ce, {"ce": ce}
+        return self._plans_loss(step, generator_of(step))
+
+    def _low_level_loss(self, generator):
+        corpus, batch = self.corpus, self.settings.batch
+        points = torch.rand(batch, generator=generator, dtype=torch.double) * self.cumulative[-1]
+        drawn = torch.searchsorted(self.cumulative, points).clamp(max=len(self.steps) - 1)
+        episodes, steps = self.episodes[drawn], self.steps[drawn]
+        starts = (steps - torch.randint(corpus.horizon, (batch,), generator=generator)).clamp(min=0)
+        episodes, steps, starts = (x.to(corpus.device) for x in (episodes, steps, starts))
+        parts = self.losses.low_level(episodes, steps, self.lads.codebook.codes[self.codes[episodes, starts]])
+        return self.training.bc_weight * parts["bc"], parts
+
+    def _counted(self, episodes, offsets):
+        steps = self.corpus.observations.shape[1]
+        if self.training.ce_at == "all":
+            return torch.ones(len(episodes), steps, dtype=torch.bool, device=self.corpus.device)
+        return self.losses.decisions(episodes, offsets, steps)
+
+    def _plans_loss(self, step, generator):
+        if step == self.trainer.config.encoder.kmeans_step:
+            self._start_codebook(generator)
+        episodes = self.corpus.draw(self.settings.batch, generator)
+        offsets = self.losses.offsets(episodes, generator)
+        parts, index = self.losses.plans(episodes, offsets)
+        total = self.training.bc_weight * parts["bc"] + parts["commitment"]
+        total = total + self.trainer.config.alignment.weight * parts["align"]
+        if self.lads.codebook.started:
+            parts["perplexity"] = perplexity(index, len(self.lads.codebook.codes))
+            if self.name == "joint":
+                parts["ce"], _ = self.losses.high_level(episodes, *self._joint_targets(episodes, offsets))
+                total = total + parts["ce"]
+        return total, parts
+
+    def _joint_targets(self, episodes, offsets):
+        """Codes by the encoder as it stands, without gradient, at the steps that count."""
+        counted = self._counted(episodes, offsets)
+        codes = torch.full(counted.shape, -1, dtype=torch.long, device=counted.device)
+        if self.training.ce_at == "all":
+            for row, episode in enumerate(episodes.tolist()):
+                index = self.losses.encode(self.corpus.every_window(episode))
+                codes[row, : len(index)] = index
+        else:
+            segments = self.corpus.segments(episodes, offsets)
+            steps = offsets.to(codes.device)[segments.rows] + segments.places * self.corpus.horizon
+            codes[segments.rows, steps] = self.losses.encode(segments)
+        return codes, counted
+
+    @torch.no_grad()
+    def _start_codebook(self, generator):
+        latents = []
+        for episodes in self.corpus.train.split(64):
+            segments = self.corpus.segments(episodes, self.losses.offsets(episodes, generator))
+            latents.append(self.lads.encoder(segments.observations, segments.executed, segments.lengths))
+        self.lads.codebook.start(torch.cat(latents))
+
+    @torch.no_grad()
+    def validate(self):
+        """Losses on the held-out episodes, segmented from step 0."""
+        corpus, episodes, out = self.corpus, self.corpus.validation, {}
+        zeros = torch.zeros(len(episodes), dtype=torch.long)
+        self.lads.eval()
+        parts, index = self.losses.plans(episodes, zeros)
+        out["val_bc"] = float(parts["bc"])
+        if self.lads.codebook.started:
+            out["val_perplexity"] = perplexity(index, len(self.lads.codebook.codes))
+        if self.name in ("joint", "high_level") and self.lads.codebook.started:
+            codes = torch.full(corpus.observations[episodes].shape[:2], -1, dtype=torch.long, device=corpus.device)
+            segments = corpus.segments(episodes, zeros)
+            codes[segments.rows, segments.places * corpus.horizon] = index
+            ce, accuracy = self.losses.high_level(episodes, codes, codes >= 0)
+            out |= {"val_ce": float(ce), "val_accuracy": float(accuracy)}
+        return out
+
+    def advance(self, step):
+        """One optimiser step; returns the parts of the loss as numbers."""
+        torch.manual_seed(self.trainer.seed_of(self.name, "step", step))
+        self.lads.eval()
+        for module in self.modules:
+            module.train()
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate(step)
+        total, parts = self.loss(step)
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        torch.nn.utils.clip_grad_norm_(self.parameters, self.training.clip)
+        self.optimizer.step()
+        numbers = {name: float(value) for name, value in parts.items()} | {"loss": float(total)}
+        if not math.isfinite(numbers["loss"]):
+            raise UserError(f"the loss is no longer finite at step {step} of stage {self.name}; lower its learning_rate")
+        return numbers
+
+
+class Trainer:
+    """A run: a folder with a checkpoint, the curves and at the end a summary."""
+
+    def __init__(self, setting, dataset, encoded, out, device, seed):
+        self.setting, self.config, self.out, self.seed = setting, setting.config, Path(out), seed
+        self.identity = {
+            "tables": configuration.to_tables(setting),
+            "dataset_sha256": dataset.sha256,
+            "language_sha256": encoded.sha256,
+            "seed": seed,
+        }
+        torch.manual_seed(self.seed_of("", "weights", 0))
+        self.lads = Lads(setting, encoded).to(device)
+        self.corpus = Corpus(dataset, setting, encoded, device)
+        self.lads.normalizer.mean.copy_(self.corpus.mean)
+        self.lads.normalizer.std.copy_(self.corpus.std)
+        self.losses = Losses(self.lads, self.corpus, self.config)
+        self.notes = dataset.notes
+        self.golden = golden_candidates(dataset, self.corpus.validation.tolist())
+        self.position = {"stage": 0, "step": 0}
+        self.curves, self.seconds = [], {}
+        self.stop = False
+
+    def seed_of(self, stage, what, step):
+        return zlib.crc32(f"{self.seed} {stage} {what} {step}".encode())
+
+    def resume(self):
+        path = self.out / CHECKPOINT
+        if not path.is_file():
+            raise UserError(f"nothing to resume: {path} does not exist")
+        saved = torch.load(path, map_location=self.corpus.device, weights_only=True)
+        for key, value in self.identity.items():
+            if saved["identity"][key] != value:
+                raise UserError(f"{path} was made with another {key.removesuffix('_sha256')}; train into a new folder")
+        self.lads.load_state_dict(saved["lads"])
+        self.position, self.curves, self.seconds = saved["position"], saved["curves"], saved["seconds"]
+        return saved["optimizer"]
+
+    def save(self, stage):
+        state = {
+            "identity": self.identity,
+            "position": self.position,
+            "lads": self.lads.state_dict(),
+            "optimizer": stage.optimizer.state_dict() if stage else None,
+            "curves": self.curves,
+            "seconds": self.seconds,
+            "notes": self.notes,
+            "golden": self.golden,
+        }
+        buffer = io.BytesIO()
+        torch.save(state, buffer)
+        write_atomically(self.out / CHECKPOINT, buffer.getvalue())
+        table = io.StringIO()
+        writer = csv.DictWriter(table, COLUMNS, restval="")
+        writer.writeheader()
+        writer.writerows(self.curves)
+        write_atomically(self.out / CURVES, table.getvalue().encode())
+
+    def run(self, resume=False, quiet=False):
+        """Trains to the end; False when it was interrupted (the checkpoint is then written)."""
+        if not resume and (self.out / CHECKPOINT).exists():
+            raise UserError(f"{self.out / CHECKPOINT} exists; continue it with --resume or choose another --out")
+        optimizer_state = self.resume() if resume else None
+        names = STAGES[self.config.training.schedule]
+        with self._interruptible():
+            while self.position["stage"] < len(names):
+                name = names[self.position["stage"]]
+                stage = Stage(name, self)
+                if optimizer_state and self.position["step"]:
+                    stage.optimizer.load_state_dict(optimizer_state)
+                optimizer_state = None
+                if not self._run_stage(stage, quiet):
+                    return False
+                self.position = {"stage": self.position["stage"] + 1, "step": 0}
+                self.save(None)
+        self._summarise(names)
+        return True
+
+    def _run_stage(self, stage, quiet):
+        steps, begun, saved = stage.settings.steps, time.monotonic(), time.monotonic()
+        spent = self.seconds.get(stage.name, 0.0)
+        sums, latest, counted_from = defaultdict(list), {}, time.monotonic()
+        bar = tqdm(total=steps, initial=self.position["step"], desc=stage.name, disable=quiet, unit="step")
+        with bar:
+            while self.position["step"] < steps and not self.stop:
+                step = self.position["step"]
+                for name, value in stage.advance(step).items():
+                    sums[name].append(value)
+                self.position["step"] = step + 1
+                bar.update()
+                if (step + 1) % LOG_EVERY == 0 or step + 1 == steps:
+                    row = {"stage": stage.name, "step": step + 1, "learning_rate": f"{stage.learning_rate(step):.3g}"}
+                    numbers = {name: sum(values) / len(values) for name, values in sums.items()}
+                    numbers["ms_per_step"] = (time.monotonic() - counted_from) * 1000 / len(sums["loss"])
+                    if (step + 1) % VALIDATE_EVERY == 0 or step + 1 == steps:
+                        latest = stage.validate()
+                        numbers |= latest
+                    row |= {name: f"{value:.5g}" for name, value in numbers.items()}
+                    row["revived"] = int(self.lads.codebook.revived)
+                    self.curves.append(row)
+                    shown = ("loss", "bc", "align", "ce", "perplexity")
+                    bar.set_postfix({name: f"{numbers[name]:.3g}" for name in shown if name in numbers} | _short(latest))
+                    sums.clear()
+                    counted_from = time.monotonic()
+                self.seconds[stage.name] = spent + time.monotonic() - begun
+                if time.monotonic() - saved > SAVE_SECONDS:
+                    self.save(stage)
+                    saved = time.monotonic()
+        self.save(stage)
+        return self.position["step"] >= steps
+
+    @contextmanager
+    def _interruptible(self):
+        def handler(number, frame):
+            self.stop = True
+
+        try:
+            before = signal.signal(signal.SIGINT, handler)
+        except ValueError:  # not the main thread: nobody can press Ctrl-C here
+            yield
+            return
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    def _summarise(self, names):
+        self.lads.eval()
+        codes = self.corpus.codes(self.losses.encode)
+        starts = codes[:, :: self.corpus.horizon]
+        last = {}
+        for row in self.curves:
+            last |= {name: float(value) for name, value in row.items() if name.startswith("val_")}
+        summary = {
+            "setting": self.config.name,
+            "schedule": self.config.training.schedule,
+            "seed": self.seed,
+            "dataset_sha256": self.identity["dataset_sha256"],
+            "episodes": len(self.corpus.lengths),
+            "transitions": int(self.corpus.lengths.sum()),
+            "steps": {name: getattr(self.config.training, name).steps for name in names},
+            "seconds": {name: round(self.seconds.get(name, 0.0), 1) for name in names},
+            "perplexity": perplexity(starts[starts >= 0], len(self.lads.codebook.codes)),
+            "codebook_size": len(self.lads.codebook.codes),
+            "revived": int(self.lads.codebook.revived),
+            "validation": last,
+            "versions": {"lads-exporter": __version__, "torch": torch.__version__},
+        }
+        write_atomically(self.out / SUMMARY, (json.dumps(summary, indent=1) + "\n").encode())
+
+
+def golden_candidates(dataset, episodes, most=24):
+    """Held-out episodes one of which will be the bundle's golden episode: (instruction index, observations [T, O])."""
+    chosen = episodes[:: max(1, len(episodes) // most)][:most]
+    return [(int(dataset.instruction[e]), torch.from_numpy(dataset.observations[dataset.rows(e)].copy())) for e in chosen]
+
+
+def _short(validation):
+    return {name: f"{value:.3g}" for name, value in validation.items()}
+
+
+def load_run(folder):
+    """A finished or interrupted run's checkpoint and its setting."""
+    path = Path(folder) / CHECKPOINT
+    if not path.is_file():
+        raise UserError(f"no run in {folder}: {path} does not exist; train one first (make train)")
+    saved = torch.load(path, map_location="cpu", weights_only=True)
+    setting = configuration.from_tables(*saved["identity"]["tables"], path)
+    names = STAGES[setting.config.training.schedule]
+    if saved["position"]["stage"] < len(names):
+        raise UserError(f"{folder} is not finished (stage {names[saved['position']['stage']]}); continue it with --resume")
+    return saved, setting
