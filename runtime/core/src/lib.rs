@@ -1,4 +1,16 @@
-//! Program image, executor, policy and controller.
+//! Runs a compiled LADS policy: program image in, actions out, once every control period.
+//!
+//! - [`Policy::new_checked`] is a view on a program image, all of it checked; it copies nothing.
+//! - [`Workspace::new`] takes the caller's memory: [`Policy::arena_len`] and [`Policy::state_len`] elements.
+//! - [`Controller`] puts both to work: [`set_instruction`](Controller::set_instruction), then
+//!   [`step`](Controller::step) for every observation.
+//!
+//! Invariants: no `std`, no allocation, no unsafe code, no panic. Sizes (contract), weights (image) and mutable state
+//! (workspace) are three types. Everything about a model is checked when it is opened; afterwards only what the caller passes
+//! can be refused, with one small error enum per operation. The same image and the same calls give the same bits on every
+//! target.
+//!
+//! [`op`] and [`image`] describe the format for the compiler that writes it.
 #![no_std]
 #![forbid(unsafe_code)]
 #![cfg_attr(
@@ -11,6 +23,32 @@
     )
 )]
 
+#[cfg(test)]
+extern crate std;
+
+mod check;
 pub mod codec;
+mod contract;
+mod controller;
+mod decision;
+mod errors;
+mod exec;
+mod golden;
 pub mod image;
 pub mod op;
+mod policy;
+pub mod program;
+mod self_test;
+mod workspace;
+
+pub use check::Fault;
+pub use contract::{Contract, ContractError, Decision, Element, KnownInstruction, Network};
+pub use controller::{Controller, Instruction, StepReport};
+pub use decision::PlanIndex;
+pub use errors::{EncodeError, InstructionError, StepError};
+pub use exec::ExecError;
+pub use golden::Golden;
+pub use policy::{Policy, PolicyError};
+pub use program::{Program, ProgramError};
+pub use self_test::{SelfTest, SelfTestError};
+pub use workspace::{Workspace, WorkspaceTooSmall};

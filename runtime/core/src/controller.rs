@@ -1,0 +1,399 @@
+//! The control loop of a policy: observation in, action out, once every control period.
+//!
+//! At control step `t` the tokens of the previous action and the observation are appended to the KV cache; when `t` is a
+//! multiple of the horizon the same step also evaluates the logits and picks the plan; then the low level maps observation and
+//! plan to an action.
+//!
+//! ```text
+//! t = 0        start:        [s_0]          → logits        plan = decide(logits)
+//! t % H == 0   step_decide:  [a_{t-1}, s_t] → logits        plan = decide(logits)
+//! otherwise    step_record:  [a_{t-1}, s_t]
+//! every t      act: (s_t, plan) → a_t, clipped to the contract's limits
+//! ```
+//!
+//! Invariants:
+//! - A call that returns an error leaves the controller as it was: what a step computes goes to a second bank and to cache
+//!   rows that do not count yet, and is taken over at the end. (One exception: see [`Controller::set_instruction`].)
+//! - An action that leaves the controller is finite and inside the contract's limits.
+//! - Nothing is allocated, no call blocks, and the work of a step is bounded by the longest context.
+
+use crate::contract::Decision;
+use crate::decision::{Decider, PlanIndex, margin};
+use crate::errors::{EncodeError, InstructionError, StepError};
+use crate::exec::{ExecError, Inputs};
+use crate::image::{Beyond, ProgramKind};
+use crate::op::Port;
+use crate::policy::Policy;
+use crate::workspace::Workspace;
+
+/// What a policy is told to do.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Instruction<'w> {
+    /// Number of an instruction in the contract.
+    Id(u32),
+    /// Word embeddings, `[n, word_dim]` with `n` from 1 to the contract's `words_len`.
+    Words(&'w [f32]),
+}
+
+/// What happened in a control step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StepReport {
+    /// Control steps since the context began: 0 in the first step after an instruction, a reset or a restart of the context.
+    pub timestep: u32,
+    /// The plan in force.
+    pub plan: PlanIndex,
+    /// Whether this step decided it.
+    pub decided: bool,
+    /// The largest logit of the last decision minus the second largest; infinite with a codebook of one.
+    pub margin: f32,
+}
+
+/// The counters that a step advances.
+#[derive(Debug, Clone, Copy)]
+struct Clock {
+    /// Control steps since the context began.
+    timestep: u32,
+    /// Tokens in the KV cache.
+    past: usize,
+    /// Plan in force.
+    plan: PlanIndex,
+    /// Of the last decision.
+    margin: f32,
+}
+
+/// A policy at work in memory that the caller lent.
+#[derive(Debug)]
+pub struct Controller<'a, 'm> {
+    policy: Policy<'a>,
+    workspace: Workspace<'m>,
+    decider: Decider,
+    clock: Clock,
+    /// Words of the instruction in the cache; 0 when there is none.
+    words: usize,
+}
+
+impl<'a, 'm> Controller<'a, 'm> {
+    /// A controller with the contract's decision rule and no instruction yet. The workspace has to be one made for this policy:
+    /// with that of another policy, steps may fail.
+    pub fn new(policy: Policy<'a>, workspace: Workspace<'m>) -> Self {
+        let decider = Decider::new(policy.contract().decision());
+        let clock = Clock {
+            timestep: 0,
+            past: 0,
+            plan: PlanIndex(0),
+            margin: 0.0,
+        };
+        Self {
+            policy,
+            workspace,
+            decider,
+            clock,
+            words: 0,
+        }
+    }
+
+    /// The policy at work.
+    pub fn policy(&self) -> &Policy<'a> {
+        &self.policy
+    }
+
+    /// Changes how plans are picked, from the next decision on. Sampling starts again from the seed.
+    pub fn set_decision(&mut self, decision: Decision) {
+        self.decider = Decider::new(decision);
+    }
+
+    /// How plans are picked.
+    pub fn decision(&self) -> Decision {
+        self.decider.rule()
+    }
+
+    /// Follows an instruction from the next step on: a new episode, `t = 0`. Sampling goes on where it was.
+    ///
+    /// A refused instruction changes nothing. [`InstructionError::Program`], which a sound image never causes, leaves the
+    /// controller without an instruction.
+    pub fn set_instruction(&mut self, instruction: Instruction) -> Result<(), InstructionError> {
+        let contract = self.policy.contract();
+        let words = match instruction {
+            Instruction::Id(id) => {
+                let count = contract.instruction_count() as u32;
+                contract
+                    .instruction(id as usize)
+                    .ok_or(InstructionError::Unknown { id, count })?
+                    .words
+            }
+            Instruction::Words(words) => words,
+        };
+        let (dim, most) = (contract.word_dim(), contract.words_len());
+        let count = words.len() / dim.max(1);
+        if !words.len().is_multiple_of(dim) {
+            return Err(InstructionError::Length {
+                got: words.len(),
+                word_dim: dim,
+            });
+        }
+        if count == 0 || count > most {
+            return Err(InstructionError::Words { got: count, most });
+        }
+        if let Some(index) = words.iter().position(|x| !x.is_finite()) {
+            return Err(InstructionError::NotFinite { index });
+        }
+        self.words = 0;
+        let inputs = Inputs {
+            words,
+            ..Inputs::default()
+        };
+        self.run(ProgramKind::Instruct, 0, &inputs)
+            .map_err(InstructionError::Program)?;
+        self.words = count;
+        self.reset();
+        Ok(())
+    }
+
+    /// Starts a new episode with the same instruction: `t = 0`, the words stay in the context. Sampling goes on where it was.
+    pub fn reset(&mut self) {
+        self.clock = Clock {
+            timestep: 0,
+            past: self.words,
+            plan: PlanIndex(0),
+            margin: 0.0,
+        };
+    }
+
+    /// One control step: writes the action for an observation, both in the contract's units.
+    pub fn step(
+        &mut self,
+        observation: &[f32],
+        action: &mut [f32],
+    ) -> Result<StepReport, StepError> {
+        let needed = self.policy.contract().action_len();
+        if action.len() != needed {
+            return Err(StepError::ActionLength {
+                got: action.len(),
+                needed,
+            });
+        }
+        let report = self.advance(observation)?;
+        action.copy_from_slice(self.workspace.now.action);
+        Ok(report)
+    }
+
+    /// Tells the controller what was really executed since the last step, where that is not the action it returned; the next
+    /// step puts it into the context, clipped to the contract's limits.
+    pub fn executed(&mut self, action: &[f32]) -> Result<(), StepError> {
+        let contract = self.policy.contract();
+        let needed = contract.action_len();
+        if action.len() != needed {
+            return Err(StepError::ActionLength {
+                got: action.len(),
+                needed,
+            });
+        }
+        if let Some(index) = action.iter().position(|x| !x.is_finite()) {
+            return Err(StepError::NotFinite { index });
+        }
+        if self.clock.timestep == 0 {
+            return Err(StepError::NothingExecuted);
+        }
+        for ((to, &from), limits) in self
+            .workspace
+            .now
+            .action
+            .iter_mut()
+            .zip(action)
+            .zip(contract.actions())
+        {
+            *to = from.clamp(limits.min, limits.max);
+        }
+        Ok(())
+    }
+
+    /// The logits of the last decision, one per codebook entry; zeros before the first.
+    pub fn logits(&self) -> &[f32] {
+        self.workspace.now.logits
+    }
+
+    /// The action of the last step, or what [`executed`](Self::executed) said.
+    pub(crate) fn last_action(&self) -> &[f32] {
+        self.workspace.now.action
+    }
+
+    /// The plan that one horizon of a demonstration follows: `observations` is `[H, O]`, `actions` is `[H, A]`. Changes nothing
+    /// in the episode under way.
+    pub fn encode(
+        &mut self,
+        observations: &[f32],
+        actions: &[f32],
+    ) -> Result<PlanIndex, EncodeError> {
+        let contract = self.policy.contract();
+        let program = *self.policy.program(ProgramKind::Encode);
+        if program.is_empty() {
+            return Err(EncodeError::NoEncoder);
+        }
+        let lens =
+            [contract.observation_len(), contract.action_len()].map(|len| len.saturating_mul(contract.horizon()));
+        for (got, needed) in [observations.len(), actions.len()].into_iter().zip(lens) {
+            if got != needed {
+                return Err(EncodeError::Length { got, needed });
+            }
+        }
+        if !observations.iter().chain(actions).all(|x| x.is_finite()) {
+            return Err(EncodeError::NotFinite);
+        }
+        let inputs = Inputs {
+            observation: observations,
+            action: actions,
+            ..Inputs::default()
+        };
+        self.run(ProgramKind::Encode, 0, &inputs)
+            .map_err(EncodeError::Program)?;
+        let index = self.workspace.machine.output_int(&program, Port::PlanIndex);
+        Ok(PlanIndex(index.unwrap_or(0)))
+    }
+
+    /// A controller as [`new`](Self::new) made it, but for the decision rule.
+    pub(crate) fn renew(&mut self, rule: Decision) {
+        self.words = 0;
+        self.reset();
+        self.set_decision(rule);
+        self.workspace.now.logits.fill(0.0);
+    }
+
+    /// A control step that leaves its action in the state.
+    pub(crate) fn advance(&mut self, observation: &[f32]) -> Result<StepReport, StepError> {
+        self.check(observation)?;
+        let clock = self.begin()?;
+        let decides = clock
+            .timestep
+            .is_multiple_of(self.policy.contract().horizon() as u32);
+        let program = match (clock.timestep, decides) {
+            (0, _) => ProgramKind::Start,
+            (_, true) => ProgramKind::StepDecide,
+            (_, false) => ProgramKind::StepRecord,
+        };
+        let Workspace { machine, now, next } = &mut self.workspace;
+        let (policy, weights) = (&self.policy, self.policy.weights());
+        next.copy_from(now);
+        let mut decider = self.decider.clone();
+        let (mut plan, mut plan_margin) = (clock.plan, clock.margin);
+
+        let inputs = Inputs {
+            observation,
+            action: now.action,
+            timestep: clock.timestep,
+            ..Inputs::default()
+        };
+        let high = policy.program(program);
+        machine
+            .run(high, weights, clock.past, &inputs)
+            .map_err(StepError::Program)?;
+        if decides {
+            take_finite(machine.output(high, Port::Logits), next.logits)?;
+            plan = decider.pick(next.logits);
+            plan_margin = margin(next.logits);
+            let lookup = policy.program(ProgramKind::Lookup);
+            let inputs = Inputs {
+                plan_index: plan.0,
+                ..Inputs::default()
+            };
+            machine
+                .run(lookup, weights, 0, &inputs)
+                .map_err(StepError::Program)?;
+            take_finite(machine.output(lookup, Port::Plan), next.plan)?;
+        }
+        let act = policy.program(ProgramKind::Act);
+        let inputs = Inputs {
+            observation,
+            plan: next.plan,
+            plan_index: plan.0,
+            ..Inputs::default()
+        };
+        machine
+            .run(act, weights, 0, &inputs)
+            .map_err(StepError::Program)?;
+        take_finite(machine.output(act, Port::Action), next.action)?;
+        for (action, limits) in next.action.iter_mut().zip(policy.contract().actions()) {
+            *action = action.clamp(limits.min, limits.max);
+        }
+
+        now.copy_from(next);
+        self.decider = decider;
+        let past = clock.past + high.tokens();
+        self.clock = Clock {
+            timestep: clock.timestep + 1,
+            past,
+            plan,
+            margin: plan_margin,
+        };
+        Ok(StepReport {
+            timestep: clock.timestep,
+            plan,
+            decided: decides,
+            margin: plan_margin,
+        })
+    }
+
+    /// Where the coming step starts: a full context restarts behind the words, or refuses.
+    fn begin(&self) -> Result<Clock, StepError> {
+        if self.words == 0 {
+            return Err(StepError::NoInstruction);
+        }
+        let contract = self.policy.contract();
+        let steps = contract.context_steps();
+        if (self.clock.timestep as usize) < steps {
+            return Ok(self.clock);
+        }
+        match contract.beyond() {
+            Beyond::Restart => Ok(Clock {
+                timestep: 0,
+                past: self.words,
+                ..self.clock
+            }),
+            Beyond::Refuse => Err(StepError::ContextFull { steps }),
+        }
+    }
+
+    fn check(&self, observation: &[f32]) -> Result<(), StepError> {
+        let contract = self.policy.contract();
+        let needed = contract.observation_len();
+        if observation.len() != needed {
+            return Err(StepError::ObservationLength {
+                got: observation.len(),
+                needed,
+            });
+        }
+        for (index, (&value, limits)) in observation.iter().zip(contract.observations()).enumerate()
+        {
+            if !value.is_finite() {
+                return Err(StepError::NotFinite { index });
+            }
+            if value < limits.min || value > limits.max {
+                let (min, max) = (limits.min, limits.max);
+                return Err(StepError::OutOfLimits {
+                    index,
+                    value,
+                    min,
+                    max,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    fn run(&mut self, kind: ProgramKind, past: usize, inputs: &Inputs) -> Result<(), ExecError> {
+        self.workspace.machine.run(
+            self.policy.program(kind),
+            self.policy.weights(),
+            past,
+            inputs,
+        )
+    }
+}
+
+/// Copies what a program gave, if all of it is finite.
+fn take_finite(from: &[f32], to: &mut [f32]) -> Result<(), StepError> {
+    if from.len() != to.len() || !from.iter().all(|x| x.is_finite()) {
+        return Err(StepError::NotFiniteResult);
+    }
+    to.copy_from_slice(from);
+    Ok(())
+}
