@@ -255,7 +255,7 @@ class Stage:
         total.backward()
         torch.nn.utils.clip_grad_norm_(self.parameters, self.training.clip)
         self.optimizer.step()
-        numbers = {name: float(value) for name, value in parts.items()} | {"loss": float(total)}
+        numbers = {name: float(torch.as_tensor(value).detach()) for name, value in (parts | {"loss": total}).items()}
         if not math.isfinite(numbers["loss"]):
             raise UserError(f"the loss is no longer finite at step {step} of stage {self.name}; lower its learning_rate")
         return numbers
