@@ -13,29 +13,32 @@ def read_results(path):
     try:
         results = json.loads(Path(path).read_text(encoding="utf-8"))
         for split in results["splits"].values():
-            for key in ("episodes", "n_rate", "k_rate", "full_success"):
+            for key in ("episodes", "n_rate", "k_rate", "full_success", "full_success_interval", "un_instructed"):
                 split[key]
         return results
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
         raise UserError(f"{path}: not a results file of lads-run --json ({error!r})") from error
 
 
-def _interval(value):
-    """K4 as lads-run writes it: a number, or an object with the Wilson interval."""
-    if isinstance(value, dict):
-        low, high = value.get("wilson95", value.get("interval95", (None, None)))
-        rate = value.get("rate", value.get("mean", 0.0))
-        return f"{rate:.2f}" + (f" ({low:.2f}-{high:.2f})" if low is not None else "")
-    return f"{value:.2f}"
+def _number(value):
+    return "-" if value is None else f"{value:.2f}"
 
 
 def _row(label, split):
-    k = " ".join(f"{value:.2f}" for value in split["k_rate"])
-    return f"| {label} | {split['episodes']} | {split['n_rate']:.2f} | {k} | {_interval(split['full_success'])} |"
+    """One line of a results table; rates without episodes are null in the file and a dash here."""
+    k = " ".join(_number(value) for value in split["k_rate"])
+    low, high = split["full_success_interval"]
+    full = f"{_number(split['full_success'])} ({_number(low)}-{_number(high)})"
+    return f"| {label} | {split['episodes']} | {_number(split['n_rate'])} | {k} | {full} | {split['un_instructed']} |"
 
 
 def _table(rows):
-    return ["| | episodes | N-rate | K-rate 1 2 3 4 | full success (95 %) |", "|---|---|---|---|---|", *rows]
+    head = "| | episodes | N-rate | K-rate 1 2 3 4 | full success (Wilson 95 %) | un-instructed sub-tasks |"
+    return [head, "|---|---|---|---|---|---|", *rows]
+
+
+def _counts(rates):
+    return ", ".join(f"{rate['sub_task']} {rate['count']}" for rate in rates)
 
 
 def _results(results, sha256, beside):
@@ -46,11 +49,10 @@ def _results(results, sha256, beside):
         raise UserError(f"the results are of another bundle ({results.get('bundle_sha256')}), not of {sha256}")
     lines += [f"`lads-run`, seed {results.get('seed')}, noise {results.get('noise')}, versions {json.dumps(results.get('versions'))}.", ""]
     lines += _table([_row(name, split) for name, split in results["splits"].items()])
-    lines += ["", "| instruction | split | episodes | sub-tasks completed in episodes |", "|---|---|---|---|"]
+    lines += ["", "| instruction | split | episodes | N-rate | completed, of the commanded | un-instructed |", "|---|---|---|---|---|---|"]
     for row in results.get("instructions", []):
-        done = row.get("completions")
-        text = ", ".join(f"{name} {count}" for name, count in done.items()) if isinstance(done, dict) else json.dumps(done)
-        lines.append(f"| {row['id']}: {row['text']} | {row['split']} | {row['episodes']} | {text} |")
+        done, others = (_counts(row.get(key, [])) for key in ("completions", "un_instructed_completions"))
+        lines.append(f"| {row['id']} | {row['split']} | {row['episodes']} | {_number(row.get('n_rate'))} | {done} | {others} |")
     if beside:
         lines += ["", "## Other settings and seeds", ""]
         pairs = [(label, name, split) for label, other in beside for name, split in other["splits"].items()]

@@ -173,12 +173,19 @@ def test_commands_from_dataset_to_bundle(tmp_path):
     sha256 = out.stdout.split("sha256 ")[1].split()[0]
     card = (tmp_path / "tiny.md").read_text()
     assert sha256 in card and "Not measured yet" in card
-    split = {"episodes": 4, "n_rate": 3.5, "k_rate": [1, 1, 0.75, 0.75], "full_success": 0.75}
-    results = {"bundle_sha256": sha256, "seed": 1, "noise": "v0", "splits": {"seen": split, "unseen": split}, "instructions": []}
+    split = {"episodes": 4, "n_rate": 3.5, "k_rate": [1, 1, 0.75, None], "full_success": 0.75}
+    split |= {"full_success_interval": [0.3, 0.95], "un_instructed": 2}
+    done = {"completions": [{"sub_task": "drawer", "count": 3}], "un_instructed_completions": []}
+    instructions = [{"id": "dl", "text": "", "split": "seen", "episodes": 4, "n_rate": 3.5} | done]
+    splits = {"seen": split, "unseen": split}
+    results = {"bundle_sha256": sha256, "seed": 1, "noise": "v0", "splits": splits, "instructions": instructions}
     (tmp_path / "results.json").write_text(json.dumps(results))
     arguments = ("card", "--run", tmp_path / "run", "-o", tmp_path / "tiny.onnx", "--results")
     out = run_command(*arguments, tmp_path / "results.json")
-    assert out.returncode == 0 and "| seen | 4 | 3.50 |" in (tmp_path / "tiny.md").read_text()
+    assert out.returncode == 0, out.stderr
+    card = (tmp_path / "tiny.md").read_text()
+    assert "| seen | 4 | 3.50 | 1.00 1.00 0.75 - | 0.75 (0.30-0.95) | 2 |" in card
+    assert "| dl | seen | 4 | 3.50 | drawer 3 |  |" in card
     (tmp_path / "other.json").write_text(json.dumps(results | {"bundle_sha256": "0"}))
     out = run_command(*arguments, tmp_path / "other.json")
     assert out.returncode == 2 and "another bundle" in out.stderr
