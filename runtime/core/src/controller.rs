@@ -229,8 +229,8 @@ impl<'a, 'm> Controller<'a, 'm> {
         if program.is_empty() {
             return Err(EncodeError::NoEncoder);
         }
-        let lens =
-            [contract.observation_len(), contract.action_len()].map(|len| len.saturating_mul(contract.horizon()));
+        let lens = [contract.observation_len(), contract.action_len()]
+            .map(|len| len.saturating_mul(contract.horizon()));
         for (got, needed) in [observations.len(), actions.len()].into_iter().zip(lens) {
             if got != needed {
                 return Err(EncodeError::Length { got, needed });

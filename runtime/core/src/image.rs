@@ -22,7 +22,7 @@
 //!
 //! Every section starts on a word; sections do not overlap and follow each other in this order. [`Layout`] computes the
 //! offsets, [`Layout::header`] the header and [`crc32`] the checksum, so a writer only fills records
-//! ([`Field::put`](crate::codec::Field::put) into [`Field::WORDS`] words each).
+//! ([`Field::put`] into [`Field::WORDS`] words each).
 
 use crate::codec::{Field, Reader, Writer, record, word_enum};
 use crate::op::{Place, Port, Span, WeightSpan};

@@ -1,0 +1,74 @@
+//! Nothing is allocated once a controller exists: a counting global allocator over 1,000 steps, two instructions, a reset, an
+//! encoding and a self-test.
+
+mod support;
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use lads_core::Instruction;
+use support::assemble::{parts, with_golden};
+use support::{Memory, Model, Random, Spec};
+
+/// The system's allocator, counting calls.
+struct Counting;
+
+static CALLS: AtomicUsize = AtomicUsize::new(0);
+
+// SAFETY: every call is passed on unchanged to the system's allocator, which keeps the contract.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        CALLS.fetch_add(1, Ordering::Relaxed);
+        // SAFETY: the caller keeps the contract of `alloc`.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        CALLS.fetch_add(1, Ordering::Relaxed);
+        // SAFETY: the caller keeps the contract of `dealloc`.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+#[test]
+fn a_thousand_steps_allocate_nothing() {
+    let model = Model::random(Spec::TINY, 11);
+    let image = with_golden(parts(&model), 20).image();
+    let policy = image.policy();
+    let mut memory = Memory::for_policy(&policy);
+    let observations: Vec<_> = Random(2).vec(3 * 1000, 1.0);
+    let words = Random(3).vec(2 * 4, 1.0);
+    let mut action = [0.0; 2];
+
+    let before = CALLS.load(Ordering::SeqCst);
+    let mut controller = memory.controller(&policy);
+    let tested = controller.self_test().is_ok();
+    let mut sound = controller.set_instruction(Instruction::Id(0)).is_ok();
+    for (step, observation) in observations.chunks(3).enumerate() {
+        match step {
+            300 => {
+                sound &= controller
+                    .set_instruction(Instruction::Words(&words))
+                    .is_ok();
+            }
+            600 => controller.reset(),
+            _ => {}
+        }
+        sound &= controller.step(observation, &mut action).is_ok();
+        sound &= controller.executed(&action).is_ok();
+        sound &= controller.step(&[f32::NAN; 3], &mut action).is_err();
+    }
+    sound &= controller
+        .encode(&observations[..9], &observations[..6])
+        .is_ok();
+    let calls = CALLS.load(Ordering::SeqCst) - before;
+
+    assert!(sound && tested);
+    assert_eq!(calls, 0, "the allocator was called");
+    // The counter counts.
+    drop(std::hint::black_box(vec![0_u8; 100]));
+    assert!(CALLS.load(Ordering::SeqCst) - before >= 2);
+}

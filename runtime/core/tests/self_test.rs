@@ -1,0 +1,125 @@
+//! The self-test passes on a sound image and names the first step that differs on one that is not.
+
+mod support;
+
+use lads_core::{Decision, Instruction, PlanIndex, SelfTestError, StepError};
+use support::assemble::{parts, with_golden};
+use support::writer::Parts;
+use support::{Memory, Model, Spec};
+
+fn recorded() -> Parts {
+    with_golden(parts(&Model::random(Spec::TINY, 11)), 20)
+}
+
+fn outcome(parts: &Parts) -> Result<lads_core::SelfTest, SelfTestError> {
+    let image = parts.image();
+    let policy = image.policy();
+    let mut memory = Memory::for_policy(&policy);
+    memory.controller(&policy).self_test()
+}
+
+#[test]
+fn a_sound_policy_passes_with_no_error_at_all() {
+    let passed = outcome(&recorded()).expect("the policy is sound");
+    assert_eq!((passed.steps, passed.largest_error), (20, 0.0));
+}
+
+#[test]
+fn without_a_recording_there_is_no_test() {
+    let mut parts = recorded();
+    parts.golden = None;
+    assert_eq!(outcome(&parts), Err(SelfTestError::NoGolden));
+}
+
+#[test]
+fn the_first_difference_is_named() {
+    let sound = recorded();
+    let episode = sound.golden.as_ref().expect("there is one");
+
+    let mut parts = sound.clone();
+    let expected = (episode.plans[13] + 1) % 5;
+    parts.golden.as_mut().expect("there is one").plans[13] = expected;
+    let got = PlanIndex(episode.plans[13]);
+    assert_eq!(
+        outcome(&parts),
+        Err(SelfTestError::Plan {
+            step: 13,
+            expected: PlanIndex(expected),
+            got
+        })
+    );
+
+    let mut parts = sound.clone();
+    let got = episode.actions[2 * 7 + 1];
+    for (wrong, fails) in [(got + 2e-4, true), (got - 2e-4, true), (got + 5e-5, false)] {
+        parts.golden.as_mut().expect("there is one").actions[2 * 7 + 1] = wrong;
+        let named = Err(SelfTestError::Action {
+            step: 7,
+            index: 1,
+            expected: wrong,
+            got,
+        });
+        assert_eq!(outcome(&parts).is_err(), fails);
+        assert!(!fails || outcome(&parts) == named);
+    }
+
+    let mut parts = sound;
+    parts.golden.as_mut().expect("there is one").observations[3 * 4] = 50.0;
+    let error = StepError::OutOfLimits {
+        index: 0,
+        value: 50.0,
+        min: -3.0,
+        max: 3.0,
+    };
+    assert_eq!(outcome(&parts), Err(SelfTestError::Step { step: 4, error }));
+}
+
+#[test]
+fn a_changed_weight_is_found() {
+    let sound = recorded();
+    let mut parts = sound.clone();
+    // The embedding of observations takes part in every step.
+    let at = parts
+        .weights
+        .iter()
+        .rposition(|&w| w != 0.0)
+        .expect("there are weights");
+    let words_from = parts.instructions[0].words.offset as usize;
+    assert!(at >= words_from);
+    for weight in &mut parts.weights[..words_from] {
+        *weight *= 1.01;
+    }
+    assert!(outcome(&parts).is_err());
+}
+
+#[test]
+fn afterwards_the_controller_is_fresh() {
+    let image = recorded().image();
+    let policy = image.policy();
+    let sample = Decision::Sample {
+        temperature: 3.0,
+        seed: 9,
+    };
+    let run = |test_first: bool| {
+        let mut memory = Memory::for_policy(&policy);
+        let mut controller = memory.controller(&policy);
+        controller.set_decision(sample);
+        let mut action = [0.0; 2];
+        if test_first {
+            assert!(controller.self_test().is_ok());
+            assert_eq!(controller.decision(), sample);
+            assert_eq!(
+                controller.step(&[0.1; 3], &mut action),
+                Err(StepError::NoInstruction)
+            );
+            assert!(controller.logits().iter().all(|&logit| logit == 0.0));
+        }
+        controller
+            .set_instruction(Instruction::Id(0))
+            .expect("the instruction is known");
+        (0..12)
+            .map(|_| controller.step(&[0.1; 3], &mut action).map(|r| (r, action)))
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(run(false), run(true));
+}
