@@ -5,6 +5,8 @@
 //! their objects, so a routine that failed half-way can simply be run again. Distances in metres, angles in radians, z up, the kitchen
 //! towards +y.
 
+use std::cell::Cell;
+
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use super::arm::{Pose, site_id};
@@ -17,8 +19,18 @@ const OPEN: bool = true;
 const CLOSED: bool = false;
 /// Attempts of one sub-task before the demonstration is given up.
 const ATTEMPTS: usize = 3;
+/// Grips before the sub-task is begun anew.
+const GRIPS: usize = 3;
+/// The approach's funnel: within this distance of the axis the hand may advance, m.
+const FUNNEL_WIDTH: f64 = 0.012;
+/// How far it waits back per metre outside.
+const FUNNEL_SLOPE: f64 = 4.0;
+/// How far back it waits at most, m.
+const FUNNEL_LEN: f64 = 0.1;
 
 // Elements of the state.
+const LEFT_FINGER: usize = 7;
+const RIGHT_FINGER: usize = 8;
 const BOTTOM_KNOB: usize = 11;
 const TOP_KNOB: usize = 15;
 const SWITCH: usize = 17;
@@ -26,6 +38,46 @@ const SLIDE: usize = 19;
 const HINGE: usize = 21;
 const MICROWAVE: usize = 22;
 const KETTLE: usize = 23;
+
+type Sense<'a, P, T> = &'a dyn Fn(&P) -> T;
+
+/// What to grip and how to pull it.
+struct Grip<'a, P> {
+    /// Where the hand closes.
+    contact: Sense<'a, P, Pose>,
+    /// Where the hand pulls to, ahead of the object.
+    goal: Sense<'a, P, Pose>,
+    /// How far the object has come.
+    turned: Sense<'a, P, f64>,
+    done: Sense<'a, P, bool>,
+    /// Distance between the fingers below which nothing is held, m.
+    width: f64,
+}
+
+/// Notices that a movement has no effect.
+struct Progress {
+    patience: usize,
+    best: Cell<f64>,
+    idle: Cell<usize>,
+}
+
+impl Progress {
+    /// Gives up after `patience` control steps without progress.
+    fn new(patience: usize) -> Self {
+        Self { patience, best: Cell::new(f64::NEG_INFINITY), idle: Cell::new(0) }
+    }
+
+    /// To be asked once per control step with how far the movement has come.
+    fn stalled(&self, value: f64) -> bool {
+        if value > self.best.get() + 0.003 {
+            self.best.set(value);
+            self.idle.set(0);
+        } else {
+            self.idle.set(self.idle.get() + 1);
+        }
+        self.idle.get() > self.patience
+    }
+}
 
 /// The hand points towards +y with the fingers opening along x; then turned about the world's axes.
 fn grasp() -> Rotation3<f64> {
@@ -93,9 +145,44 @@ impl Performer<'_> {
         Ok(())
     }
 
-    /// Holds still while the fingers open or close.
-    fn fingers(&mut self, open: bool, steps: usize, hold: Pose) -> Result<(), OutOfTime> {
-        self.reach(Move::new(open, 0.0, steps), hold)?;
+    /// Comes to a contact pose along the hand's own axis: the farther the hand is off the axis, the farther back it waits.
+    fn approach(&mut self, open: bool, near: f64, steps: usize, contact: impl Fn(&Self) -> Pose) -> Result<bool, OutOfTime> {
+        let funnel = |this: &Self| {
+            let contact = contact(this);
+            let axis = contact.rotation * Vector3::z();
+            let offset = this.hand().position - contact.position;
+            let aside = (offset - axis * offset.dot(&axis)).norm();
+            pose(contact.position - axis * (FUNNEL_SLOPE * (aside - FUNNEL_WIDTH)).clamp(0.0, FUNNEL_LEN), contact.rotation)
+        };
+        self.follow(Move::new(open, 0.0, steps), funnel, |this| {
+            let (goal, hand) = (contact(this), this.hand());
+            (goal.position - hand.position).norm() < near && goal.rotation.angle_to(&hand.rotation) < 0.3
+        })
+    }
+
+    /// Grips what is at `contact` and pulls it along until it is `done`; grips again where the fingers slip off.
+    fn grip_and_pull(&mut self, pace: f64, grip: &Grip<'_, Self>) -> Result<(), OutOfTime> {
+        for _ in 0..GRIPS {
+            self.approach(OPEN, 0.02, 30, grip.contact)?;
+            self.follow(Move::new(CLOSED, 0.0, 3), grip.contact, |_| false)?;
+            let progress = Progress::new(12);
+            let held = |this: &Self| this.position(LEFT_FINGER) + this.position(RIGHT_FINGER) > grip.width;
+            let finished = |this: &Self| (grip.done)(this) || !held(this) || progress.stalled((grip.turned)(this));
+            self.follow(Move::new(CLOSED, 0.0, 80).linear(pace), grip.goal, finished)?;
+            if (grip.done)(self) {
+                break;
+            }
+            let hand = self.hand();
+            let back = hand.position - hand.rotation * Vector3::z() * 0.09;
+            self.reach(Move::new(OPEN, 0.03, 8).any_rotation(), pose(back, (grip.contact)(self).rotation))?;
+        }
+        Ok(())
+    }
+
+    /// Opens the fingers where the hand is.
+    fn release(&mut self, steps: usize) -> Result<(), OutOfTime> {
+        let hand = self.hand();
+        self.reach(Move::new(OPEN, 0.0, steps), hand)?;
         Ok(())
     }
 
@@ -109,18 +196,18 @@ impl Performer<'_> {
         };
         let start = handle(self) - 0.15 * inwards + self.jitter();
         self.transit(&pose(start, rotation), OPEN, 0.15, 45)?;
-        let contact = |this: &Self| pose(handle(this) - 0.012 * inwards, rotation);
-        self.follow(Move::new(OPEN, 0.02, 25), contact, |_| false)?;
-        self.follow(Move::new(CLOSED, 0.0, 3), contact, |_| false)?;
         let pull = |this: &Self| {
             let arm = handle(this) - anchor;
             pose(handle(this) + 0.07 * vector(arm.y, -arm.x, 0.0).normalize(), turned(0.5) * grasp())
         };
-        self.follow(Move::new(CLOSED, 0.0, 60), pull, |this| {
-            this.position(MICROWAVE) < -0.70 || (this.hand().position - handle(this)).norm() > 0.15
+        self.grip_and_pull(0.5, &Grip {
+            contact: &|this| pose(handle(this) - 0.012 * inwards, rotation),
+            goal: &pull,
+            turned: &|this| -this.position(MICROWAVE),
+            done: &|this| this.position(MICROWAVE) < -0.70,
+            width: 0.02,
         })?;
-        let hold = pose(self.hand().position, rotation);
-        self.fingers(OPEN, 3, hold)?;
+        self.release(3)?;
         self.retreat(OPEN, vector(0.08, -0.13, 0.05))
     }
 
@@ -132,28 +219,33 @@ impl Performer<'_> {
             // Coming from above: down in front of the kettle, not across its handle.
             self.transit(&pose(kettle(self) + vector(0.0, -0.27, 0.36), rotation), CLOSED, 0.4, 45)?;
         }
-        let start = kettle(self) + vector(0.0, -0.24, 0.14) + self.jitter();
+        let start = kettle(self) + vector(0.0, -0.26, 0.14) + self.jitter();
         self.transit(&pose(start, rotation), CLOSED, 0.15, 45)?;
+        let front = |this: &Self| pose(vector(kettle(this).x, kettle(this).y - 0.19, 1.72), rotation);
+        self.approach(CLOSED, 0.03, 15, front)?;
         let push = |this: &Self| pose(vector(kettle(this).x, kettle(this).y - 0.05, 1.72), rotation);
-        self.follow(Move::new(CLOSED, 0.02, 60), push, |this| kettle(this).y > 0.66)?;
+        let progress = Progress::new(10);
+        self.follow(Move::new(CLOSED, 0.02, 60), push, |this| {
+            kettle(this).y > 0.66 || progress.stalled(kettle(this).y)
+        })?;
         self.retreat(CLOSED, vector(0.0, -0.15, 0.10))
     }
 
     fn knob(&mut self, site: &str, element: usize, pitch: f64) -> Result<(), OutOfTime> {
         let rotation = pitched(pitch);
         let centre = self.site(site);
-        let contact = centre + vector(0.0, -0.033, 0.0);
         let turn = |this: &Self| -this.position(element);
-        let jitter = 0.7 * self.jitter();
-        let start = centre + vector(0.0, -0.13, -0.13 * pitch.tan()) + jitter;
-        let grip = rolled(turn(self)) * rotation;
-        self.transit(&pose(start, grip), OPEN, 0.15, 45)?;
-        self.reach(Move::new(OPEN, 0.015, 20), pose(contact, grip))?;
-        self.fingers(CLOSED, 3, pose(contact, grip))?;
-        let roll = |this: &Self| pose(contact, rolled((turn(this) + 0.6).min(1.35)) * rotation);
-        self.follow(Move::new(CLOSED, 0.0, 40), roll, |this| turn(this) > 0.82)?;
-        let hold = self.hand();
-        self.fingers(OPEN, 2, hold)?;
+        let start = centre + vector(0.0, -0.13, -0.13 * pitch.tan()) + 0.7 * self.jitter();
+        self.transit(&pose(start, rolled(turn(self)) * rotation), OPEN, 0.15, 45)?;
+        let at = |angle: f64| pose(centre + vector(0.0, -0.033, 0.0), rolled(angle) * rotation);
+        self.grip_and_pull(0.5, &Grip {
+            contact: &|this| at(turn(this)),
+            goal: &|this| at((turn(this) + 0.6).min(1.35)),
+            turned: &|this| turn(this),
+            done: &|this| turn(this) > 0.82,
+            width: 0.0,
+        })?;
+        self.release(2)?;
         self.retreat(OPEN, vector(0.0, -0.13, 0.0))
     }
 
@@ -161,8 +253,12 @@ impl Performer<'_> {
         let centre = self.site("light_site") + 0.7 * self.jitter();
         let at = |x: f64, y: f64| pose(centre + vector(x, y, 0.0), grasp());
         self.transit(&at(0.075, -0.13), CLOSED, 0.15, 45)?;
-        self.reach(Move::new(CLOSED, 0.025, 20), at(0.060, -0.04))?;
-        self.follow(Move::new(CLOSED, 0.0, 40), |_| at(-0.12, -0.04), |this| this.position(SWITCH) < -0.66)?;
+        self.approach(CLOSED, 0.025, 20, |_| at(0.060, -0.04))?;
+        let progress = Progress::new(10);
+        self.follow(Move::new(CLOSED, 0.0, 40), |_| at(-0.12, -0.04), |this| {
+            let missed = this.hand().position.x < centre.x - 0.03 && this.position(SWITCH) > -0.1;
+            this.position(SWITCH) < -0.66 || missed || progress.stalled(-this.position(SWITCH))
+        })?;
         self.retreat(CLOSED, vector(0.0, -0.13, 0.0))
     }
 
@@ -173,9 +269,12 @@ impl Performer<'_> {
         let site = self.site("slide_site");
         let contact = vector(site.x - 0.07, site.y, 2.49) + 0.045 * backwards + self.jitter();
         self.transit(&pose(contact + 0.15 * backwards, rotation), CLOSED, 0.15, 45)?;
-        self.reach(Move::new(CLOSED, 0.025, 20), pose(contact, rotation))?;
+        self.approach(CLOSED, 0.025, 20, |_| pose(contact, rotation))?;
         let push = |this: &Self| pose(vector(this.site("slide_site").x + 0.06, contact.y, contact.z), rotation);
-        self.follow(Move::new(CLOSED, 0.0, 60).linear(0.8), push, |this| this.position(SLIDE) > 0.30)?;
+        let progress = Progress::new(12);
+        self.follow(Move::new(CLOSED, 0.0, 60).linear(0.8), push, |this| {
+            this.position(SLIDE) > 0.30 || progress.stalled(this.position(SLIDE))
+        })?;
         self.retreat(CLOSED, vector(-0.03, -0.13, 0.0))
     }
 
@@ -188,18 +287,21 @@ impl Performer<'_> {
         };
         let start = handle(self) + vector(0.0, -0.15, 0.0) + self.jitter();
         self.transit(&pose(start, rotation), OPEN, 0.15, 45)?;
-        let contact = |this: &Self| pose(handle(this) + vector(0.0, -0.012, 0.0), rotation);
-        self.follow(Move::new(OPEN, 0.025, 25), contact, |_| false)?;
-        self.follow(Move::new(CLOSED, 0.0, 3), contact, |_| false)?;
         let pull = |this: &Self| {
             let ahead = anchor + turned(16_f64.to_radians()) * (handle(this) - anchor);
             pose(ahead, turned(-0.4 + 0.8 * this.position(HINGE)) * rotation)
         };
-        self.follow(Move::new(CLOSED, 0.0, 80).linear(0.7), pull, |this| {
-            this.position(HINGE) > 1.22 || (this.hand().position - handle(this)).norm() > 0.15
+        self.grip_and_pull(0.7, &Grip {
+            contact: &|this| {
+                let yaw = 0.5 * this.position(HINGE);
+                pose(handle(this) + turned(yaw) * vector(0.0, -0.012, 0.0), turned(yaw) * rotation)
+            },
+            goal: &pull,
+            turned: &|this| this.position(HINGE),
+            done: &|this| this.position(HINGE) > 1.22,
+            width: 0.02,
         })?;
-        let hold = self.hand();
-        self.fingers(OPEN, 3, hold)?;
+        self.release(3)?;
         self.retreat(OPEN, vector(-0.02, -0.15, -0.05))
     }
 }
