@@ -5,7 +5,12 @@
 
 pub mod assets;
 pub mod environment;
+pub mod evaluate;
+pub mod fit;
 pub mod kitchen;
-pub mod random;
 pub mod metrics;
+pub mod random;
 pub mod registry;
+pub mod results;
+pub mod rollout;
+pub mod table;

@@ -53,7 +53,9 @@ pub fn wilson(successes: usize, trials: usize) -> Interval {
 pub struct Rate {
     /// Episodes in which it happened.
     pub count: usize,
-    /// `count` over all episodes; `None` without episodes.
+    /// Episodes in which it could.
+    pub episodes: usize,
+    /// `count` over `episodes`; `None` without episodes.
     pub rate: Option<f64>,
     /// Wilson 95 % interval of `rate`.
     pub interval: Interval,
@@ -64,6 +66,7 @@ impl Rate {
     pub fn new(count: usize, episodes: usize) -> Self {
         Self {
             count,
+            episodes,
             rate: share(count, episodes),
             interval: wilson(count, episodes),
         }
@@ -149,7 +152,7 @@ fn standard_error(sum: usize, sum_of_squares: usize, episodes: usize) -> Option<
     Some((n_times_deviations / n / (n - 1.0) / n).sqrt())
 }
 
-/// Percentiles of a set of durations [µs].
+/// Percentiles of a set of durations, in microseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Latency {
     /// Number of durations.
@@ -163,8 +166,9 @@ pub struct Latency {
 }
 
 impl Latency {
-    /// Percentiles of durations in nanoseconds, by nearest rank: the smallest duration that at least `p` percent do not exceed. Sorts them.
-    pub fn of_ns(durations_ns: &mut [u64]) -> Self {
+    /// Percentiles of durations in nanoseconds, by nearest rank: the smallest duration that at least `p` percent do not exceed.
+    pub fn of_ns(durations_ns: &[u64]) -> Self {
+        let mut durations_ns = durations_ns.to_vec();
         durations_ns.sort_unstable();
         let at = |percent: usize| {
             let rank = (durations_ns.len() * percent).div_ceil(100);
@@ -292,19 +296,19 @@ mod tests {
 
     #[test]
     fn percentiles_are_nearest_rank() {
-        let mut durations: Vec<u64> = (1..=200).rev().map(|x| x * 1_000).collect();
-        let latency = Latency::of_ns(&mut durations);
+        let durations: Vec<u64> = (1..=200).rev().map(|x| x * 1_000).collect();
+        let latency = Latency::of_ns(&durations);
         assert_eq!(
             (latency.count, latency.p50, latency.p99, latency.max),
             (200, Some(100.0), Some(198.0), Some(200.0))
         );
-        let one = Latency::of_ns(&mut [1_500]);
+        let one = Latency::of_ns(&[1_500]);
         assert_eq!(
             (one.p50, one.p99, one.max),
             (Some(1.5), Some(1.5), Some(1.5))
         );
         assert_eq!(
-            Latency::of_ns(&mut []),
+            Latency::of_ns(&[]),
             Latency {
                 count: 0,
                 p50: None,

@@ -1,0 +1,242 @@
+//! Many episodes over many threads, with the same result whatever their number.
+//!
+//! Each thread has its own environment and its own controller and takes the next episode from one queue. Every episode draws from streams
+//! of its own (seed, instruction, episode), and results are put in the order of the queue, so scheduling cannot show. What can fail: an
+//! environment that does not open, an episode that does not finish; then all threads stop after their current episode.
+
+use std::panic::resume_unwind;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::thread;
+
+use lads_core::{Decision, Policy, WorkspaceTooSmall};
+use thiserror::Error;
+
+use crate::environment::{Environment, EpisodeSeed};
+use crate::random::Stream;
+use crate::rollout::{Driver, Episode, Memory, RolloutError, Task, Timing};
+
+/// Fourth number of the entropy of the stream that seeds plan sampling; the environment's noise has only the first three.
+const DECISION_STREAM: u64 = 1;
+
+/// One instruction to run.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Assignment {
+    /// Index of the instruction in the policy's table.
+    pub instruction: u32,
+    /// The environment's indices of the sub-tasks that it commands.
+    pub commanded: Vec<usize>,
+}
+
+/// What to run, and how.
+pub struct Evaluation<'e> {
+    /// The compiled policy.
+    pub policy: Policy<'e>,
+    /// Its instructions.
+    pub assignments: &'e [Assignment],
+    /// Episodes of each instruction.
+    pub episodes: u32,
+    /// Seed of all random streams.
+    pub seed: u64,
+    /// How plans are chosen; a sampling seed in it is replaced by one per episode.
+    pub decision: Decision,
+    /// Threads, at least one.
+    pub threads: usize,
+}
+
+/// Why an evaluation gave no result.
+#[derive(Debug, Error)]
+pub enum EvaluationError<E> {
+    /// An environment could not be opened.
+    #[error("{0}")]
+    Environment(E),
+    /// The policy's own numbers do not add up.
+    #[error("the policy's workspace is too small: {0}")]
+    Workspace(WorkspaceTooSmall),
+    /// An episode could not be finished.
+    #[error("episode {episode} of instruction {instruction}: {source}")]
+    Rollout {
+        /// Index of the instruction.
+        instruction: u32,
+        /// Number of the episode.
+        episode: u32,
+        /// What happened.
+        source: RolloutError,
+    },
+    /// It was told to stop.
+    #[error("interrupted")]
+    Interrupted,
+}
+
+/// Episodes of each assignment in order, and the durations of all.
+#[derive(Debug)]
+pub struct Evaluated {
+    /// One list of episodes per assignment.
+    pub episodes: Vec<Vec<Episode>>,
+    /// Durations, summed over the threads.
+    pub timing: Timing,
+}
+
+/// What one thread did: its episodes with their places in the queue.
+struct Share {
+    episodes: Vec<(usize, Episode)>,
+    timing: Timing,
+}
+
+impl Evaluation<'_> {
+    /// Number of episodes in all.
+    pub fn len(&self) -> usize {
+        self.assignments.len() * self.episodes as usize
+    }
+
+    /// Whether there is nothing to run.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Runs all episodes. `open` makes one environment per thread, `finished` is called after each episode, `stop` ends the work early.
+    pub fn run<E, O>(
+        &self,
+        open: O,
+        stop: &AtomicBool,
+        finished: &(dyn Fn() + Sync),
+    ) -> Result<Evaluated, EvaluationError<E>>
+    where
+        E: Send,
+        O: Fn() -> Result<Box<dyn Environment>, E> + Sync,
+    {
+        let queue = AtomicUsize::new(0);
+        // Raised by a thread that failed, so that the others do not work for nothing.
+        let failed = AtomicBool::new(false);
+        let next = || {
+            let halted = stop.load(Ordering::Relaxed) || failed.load(Ordering::Relaxed);
+            let place = (!halted).then(|| queue.fetch_add(1, Ordering::Relaxed))?;
+            (place < self.len()).then_some(place)
+        };
+        let work = || {
+            let done = self.worker(&open, &next, finished);
+            failed.fetch_or(done.is_err(), Ordering::Relaxed);
+            done
+        };
+        let threads = self.threads.clamp(1, self.len().max(1));
+        let outcomes = thread::scope(|scope| {
+            let workers: Vec<_> = (0..threads).map(|_| scope.spawn(work)).collect();
+            workers
+                .into_iter()
+                .map(|worker| worker.join().unwrap_or_else(|panic| resume_unwind(panic)))
+                .collect::<Vec<_>>()
+        });
+
+        let mut timing = Timing::default();
+        let mut all = Vec::with_capacity(self.len());
+        for outcome in outcomes {
+            let share = outcome?;
+            all.extend(share.episodes);
+            timing.absorb(share.timing);
+        }
+        if all.len() < self.len() {
+            return Err(EvaluationError::Interrupted);
+        }
+        all.sort_unstable_by_key(|&(place, _)| place);
+        let mut ordered = all.into_iter().map(|(_, episode)| episode);
+        let episodes = self
+            .assignments
+            .iter()
+            .map(|_| ordered.by_ref().take(self.episodes as usize).collect())
+            .collect();
+        Ok(Evaluated { episodes, timing })
+    }
+
+    fn worker<E, O>(
+        &self,
+        open: &O,
+        next: &dyn Fn() -> Option<usize>,
+        finished: &dyn Fn(),
+    ) -> Result<Share, EvaluationError<E>>
+    where
+        O: Fn() -> Result<Box<dyn Environment>, E>,
+    {
+        let mut environment = open().map_err(EvaluationError::Environment)?;
+        let mut memory = Memory::of(&self.policy);
+        let controller = memory
+            .controller(self.policy)
+            .map_err(EvaluationError::Workspace)?;
+        let mut driver = Driver::new(controller, environment.as_mut());
+        let mut episodes = Vec::new();
+        while let Some(place) = next() {
+            let episode = (place % self.episodes as usize) as u32;
+            let Some(assignment) = self.assignments.get(place / self.episodes as usize) else {
+                break;
+            };
+            let run = driver
+                .run(&self.task(assignment, episode))
+                .map_err(|source| EvaluationError::Rollout {
+                    instruction: assignment.instruction,
+                    episode,
+                    source,
+                })?;
+            episodes.push((place, run));
+            finished();
+        }
+        Ok(Share {
+            episodes,
+            timing: driver.timing,
+        })
+    }
+
+    fn task<'t>(&self, assignment: &'t Assignment, episode: u32) -> Task<'t> {
+        let seed = EpisodeSeed {
+            seed: self.seed,
+            instruction: u64::from(assignment.instruction),
+            episode: u64::from(episode),
+        };
+        let decision = match self.decision {
+            Decision::Sample { temperature, .. } => Decision::Sample {
+                temperature,
+                seed: decision_seed(seed),
+            },
+            Decision::Argmax => Decision::Argmax,
+        };
+        Task {
+            instruction: assignment.instruction,
+            commanded: &assignment.commanded,
+            seed,
+            decision,
+        }
+    }
+}
+
+/// Seed of the stream from which one episode's plans are sampled: the first draw of numpy's `default_rng([seed, instruction, episode, 1])`,
+/// 53 bits.
+fn decision_seed(seed: EpisodeSeed) -> u64 {
+    let [run, instruction, episode] = seed.entropy();
+    let unit = Stream::new(&[run, instruction, episode, DECISION_STREAM]).unit();
+    (unit * (1_u64 << 53) as f64) as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_episode_samples_from_another_stream() {
+        let seeds = (0..4).flat_map(|instruction| {
+            (0..4).map(move |episode| EpisodeSeed {
+                seed: 7,
+                instruction,
+                episode,
+            })
+        });
+        let mut drawn: Vec<u64> = seeds.map(decision_seed).collect();
+        assert_eq!(
+            drawn[0],
+            decision_seed(EpisodeSeed {
+                seed: 7,
+                instruction: 0,
+                episode: 0
+            })
+        );
+        drawn.sort_unstable();
+        drawn.dedup();
+        assert_eq!(drawn.len(), 16);
+    }
+}

@@ -1,0 +1,172 @@
+//! Does a bundle's contract fit an environment? Every difference is refused by name, before anything moves.
+//!
+//! A policy that is driven with the elements of its observation in another order, or at another rate, does not fail: it moves the wrong
+//! joint. So id, version, control period and every element must agree, and every sub-task must be one that is watched. Environments name
+//! an element after its joint where the joint has one coordinate, so an element agrees by its name or by its joint.
+
+use lads_core::{Contract, Element};
+use thiserror::Error;
+
+use crate::environment::Environment;
+
+/// Relative difference up to which two control periods are the same: four times the rounding of the contract's `f32`.
+const PERIOD_TOLERANCE: f64 = 2.4e-7;
+
+/// The first difference between a contract and an environment.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum Misfit {
+    /// A text differs: the environment's id or version.
+    #[error("the contract's {field} is '{contract}', the environment's is '{environment}'")]
+    Text {
+        /// The contract's field.
+        field: &'static str,
+        /// What the contract says.
+        contract: String,
+        /// What the environment says.
+        environment: String,
+    },
+    /// The control periods differ.
+    #[error("the contract's control_period_s is {contract}, the environment's is {environment}")]
+    ControlPeriod {
+        /// The contract's, in seconds.
+        contract: f64,
+        /// The environment's, in seconds.
+        environment: f64,
+    },
+    /// Observation or action have different lengths.
+    #[error("the contract's {field} has {contract} elements, the environment's has {environment}")]
+    Len {
+        /// The contract's field.
+        field: &'static str,
+        /// Elements in the contract.
+        contract: usize,
+        /// Elements in the environment.
+        environment: usize,
+    },
+    /// An element of observation or action has another name.
+    #[error(
+        "element {index} of the contract's {field} is '{contract}', the environment's is '{environment}'"
+    )]
+    Name {
+        /// The contract's field.
+        field: &'static str,
+        /// Index of the element, from 0.
+        index: usize,
+        /// Its name in the contract.
+        contract: String,
+        /// Its name in the environment.
+        environment: String,
+    },
+    /// An instruction commands a sub-task that the environment does not watch.
+    #[error(
+        "instruction '{instruction}' of the contract commands '{sub_task}', which the environment does not know"
+    )]
+    SubTask {
+        /// Id of the instruction.
+        instruction: String,
+        /// The unknown sub-task.
+        sub_task: String,
+    },
+}
+
+/// Compares `contract` with `environment`; on success gives, for each instruction of the contract, the environment's indices of the
+/// sub-tasks that it commands.
+pub fn check(
+    contract: &Contract<'_>,
+    environment: &dyn Environment,
+) -> Result<Vec<Vec<usize>>, Misfit> {
+    same_text(
+        "environment.id",
+        contract.environment_id(),
+        environment.id(),
+    )?;
+    same_text(
+        "environment.version",
+        contract.environment_version(),
+        environment.version(),
+    )?;
+    let (period, simulated) = (
+        f64::from(contract.control_period_s()),
+        environment.control_period_s(),
+    );
+    let difference = (period - simulated).abs();
+    if difference.is_nan() || difference > PERIOD_TOLERANCE * simulated {
+        return Err(Misfit::ControlPeriod {
+            contract: period,
+            environment: simulated,
+        });
+    }
+    same_elements(
+        "observation",
+        contract.observations(),
+        environment.observation_names(),
+    )?;
+    same_elements("action", contract.actions(), environment.action_names())?;
+    contract
+        .instructions()
+        .map(|known| {
+            sub_tasks(known.sub_tasks)
+                .map(|name| index_of(known.id, name, environment))
+                .collect()
+        })
+        .collect()
+}
+
+/// The names in a contract's list of sub-tasks.
+pub fn sub_tasks(list: &str) -> impl Iterator<Item = &str> {
+    list.split(',')
+        .map(str::trim)
+        .filter(|name| !name.is_empty())
+}
+
+fn index_of(
+    instruction: &str,
+    sub_task: &str,
+    environment: &dyn Environment,
+) -> Result<usize, Misfit> {
+    let place = environment
+        .sub_tasks()
+        .iter()
+        .position(|&known| known == sub_task);
+    place.ok_or_else(|| Misfit::SubTask {
+        instruction: instruction.to_owned(),
+        sub_task: sub_task.to_owned(),
+    })
+}
+
+fn same_text(field: &'static str, contract: &str, environment: &str) -> Result<(), Misfit> {
+    if contract == environment {
+        return Ok(());
+    }
+    Err(Misfit::Text {
+        field,
+        contract: contract.to_owned(),
+        environment: environment.to_owned(),
+    })
+}
+
+fn same_elements<'c>(
+    field: &'static str,
+    contract: impl Iterator<Item = Element<'c>>,
+    environment: &[&str],
+) -> Result<(), Misfit> {
+    let contract: Vec<_> = contract.collect();
+    if contract.len() != environment.len() {
+        return Err(Misfit::Len {
+            field,
+            contract: contract.len(),
+            environment: environment.len(),
+        });
+    }
+    let differs = |element: &Element<'_>, name| element.name != name && element.joint != name;
+    let mut pairs = contract.iter().zip(environment).enumerate();
+    match pairs.find(|(_, (element, name))| differs(element, **name)) {
+        None => Ok(()),
+        Some((index, (element, name))) => Err(Misfit::Name {
+            field,
+            index,
+            contract: element.name.to_owned(),
+            environment: (*name).to_owned(),
+        }),
+    }
+}

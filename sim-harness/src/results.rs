@@ -1,0 +1,522 @@
+//! What `lads-run` reports: rollouts summed up per instruction and per split, and their JSON form (documented in RESULTS.md).
+//!
+//! Invariants: the order is the contract's order of instructions and then of episodes, whatever the thread count; everything but
+//! `latency_us` and `time` depends only on bundle, seed, noise, decision and versions. Writing goes to a temporary file beside the target
+//! that is renamed when it is complete, so a failure leaves the target as it was.
+
+use std::collections::BTreeMap;
+use std::io::{self, Write as _};
+use std::path::Path;
+
+use lads_core::image::Split;
+use lads_core::{Decision, KnownInstruction};
+use serde::Serialize;
+
+use crate::environment::Environment;
+use crate::fit;
+use crate::metrics::{Latency, Outcome, Rate, Score};
+use crate::rollout::{Episode, Timing};
+
+/// Value of the JSON's `format`.
+pub const FORMAT: &str = "lads-results";
+
+/// Version of the JSON form; changes when a field changes its meaning or goes.
+pub const FORMAT_VERSION: u32 = 1;
+
+/// A sub-task that was completed in an episode.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Completion {
+    /// Name of the sub-task.
+    pub sub_task: &'static str,
+    /// Control step, counted from 1, after which it held for the first time.
+    pub step: usize,
+    /// Whether the instruction commands it.
+    pub commanded: bool,
+}
+
+/// One episode.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Run {
+    /// Number of the episode within its instruction; with the seed it names the episode's random streams.
+    pub episode: usize,
+    /// Control steps executed.
+    pub steps: usize,
+    /// Completed sub-tasks in the order of their completion.
+    pub completions: Vec<Completion>,
+    /// Latent plan indices in the order in which they were decided, one per horizon.
+    pub plans: Vec<u32>,
+}
+
+/// How often one sub-task was completed.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SubTaskRate {
+    /// Name of the sub-task.
+    pub sub_task: &'static str,
+    /// How often, with a Wilson 95 % interval.
+    #[serde(flatten)]
+    pub rate: Rate,
+}
+
+/// All episodes of one instruction.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct InstructionResult {
+    /// The instruction's id in the contract.
+    pub id: String,
+    /// Its text.
+    pub text: String,
+    /// The split it belongs to: `seen` or `unseen` in training.
+    pub split: &'static str,
+    /// Its score; the field `episodes` is among these.
+    #[serde(flatten)]
+    pub score: Score,
+    /// Rate of every commanded sub-task, in the order of the instruction.
+    pub completions: Vec<SubTaskRate>,
+    /// Rate of every other sub-task that was completed at least once, in the environment's order.
+    pub un_instructed_completions: Vec<SubTaskRate>,
+    /// The episodes.
+    pub runs: Vec<Run>,
+}
+
+impl InstructionResult {
+    /// Sums up the episodes of one instruction; `watched` are the environment's sub-tasks.
+    pub fn new(
+        instruction: &KnownInstruction<'_>,
+        watched: &[&'static str],
+        episodes: &[Episode],
+    ) -> Self {
+        let asked: Vec<&str> = fit::sub_tasks(instruction.sub_tasks).collect();
+        // In the instruction's order, in the environment's names.
+        let commanded = asked
+            .iter()
+            .filter_map(|name| watched.iter().find(|known| *known == name));
+        let commanded: Vec<&'static str> = commanded.copied().collect();
+        let runs: Vec<Run> = episodes
+            .iter()
+            .enumerate()
+            .map(|(number, e)| run(number, e, watched, &commanded))
+            .collect();
+        let rate = |sub_task: &'static str| {
+            let done = |run: &&Run| run.completions.iter().any(|c| c.sub_task == sub_task);
+            let count = runs.iter().filter(done).count();
+            SubTaskRate {
+                sub_task,
+                rate: Rate::new(count, runs.len()),
+            }
+        };
+        let others = watched.iter().filter(|name| !commanded.contains(name));
+        let others = others
+            .map(|&name| rate(name))
+            .filter(|other| other.rate.count > 0);
+        Self {
+            id: instruction.id.to_owned(),
+            text: instruction.text.to_owned(),
+            split: match instruction.split {
+                Split::Seen => "seen",
+                Split::Unseen => "unseen",
+            },
+            score: Score::of(runs.iter().map(|run| outcome(run, commanded.len()))),
+            completions: commanded.iter().map(|&name| rate(name)).collect(),
+            un_instructed_completions: others.collect(),
+            runs,
+        }
+    }
+}
+
+/// One episode in the environment's names.
+fn run(number: usize, episode: &Episode, watched: &[&'static str], commanded: &[&str]) -> Run {
+    let named = |completion: &crate::environment::Completion| {
+        let &sub_task = watched.get(completion.sub_task)?;
+        Some(Completion {
+            sub_task,
+            step: completion.step,
+            commanded: commanded.contains(&sub_task),
+        })
+    };
+    Run {
+        episode: number,
+        steps: episode.steps,
+        completions: episode.completions.iter().filter_map(named).collect(),
+        plans: episode.plans.clone(),
+    }
+}
+
+fn outcome(run: &Run, commanded: usize) -> Outcome {
+    let completed = run.completions.iter().filter(|c| c.commanded).count();
+    Outcome {
+        commanded,
+        completed,
+        un_instructed: run.completions.len() - completed,
+    }
+}
+
+/// All instructions of one split together.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SplitResult {
+    /// Its score; the field `episodes` is among these.
+    #[serde(flatten)]
+    pub score: Score,
+    /// Rate of every sub-task over the episodes that commanded it.
+    pub completions: Vec<SubTaskRate>,
+    /// Rate of every sub-task over the episodes that did not command it, where it was completed at least once.
+    pub un_instructed_completions: Vec<SubTaskRate>,
+}
+
+/// The two splits.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Splits {
+    /// Instructions of the training data.
+    pub seen: SplitResult,
+    /// Instructions that were held out.
+    pub unseen: SplitResult,
+}
+
+impl Splits {
+    /// Sums up all episodes of each split; `watched` are the environment's sub-tasks.
+    pub fn of(instructions: &[InstructionResult], watched: &[&'static str]) -> Self {
+        let of_split = |split| {
+            instructions
+                .iter()
+                .filter(|result| result.split == split)
+                .collect::<Vec<_>>()
+        };
+        Self {
+            seen: SplitResult::of(&of_split("seen"), watched),
+            unseen: SplitResult::of(&of_split("unseen"), watched),
+        }
+    }
+}
+
+impl SplitResult {
+    fn of(instructions: &[&InstructionResult], watched: &[&'static str]) -> Self {
+        let outcomes = instructions.iter().flat_map(|result| {
+            result
+                .runs
+                .iter()
+                .map(|run| outcome(run, result.completions.len()))
+        });
+        let rate = |sub_task: &'static str, commanded: bool| {
+            let commands = |result: &&InstructionResult| {
+                result.completions.iter().any(|c| c.sub_task == sub_task) == commanded
+            };
+            let runs = instructions
+                .iter()
+                .copied()
+                .filter(commands)
+                .flat_map(|result| &result.runs);
+            let done = |run: &&Run| run.completions.iter().any(|c| c.sub_task == sub_task);
+            let count = runs.clone().filter(done).count();
+            SubTaskRate {
+                sub_task,
+                rate: Rate::new(count, runs.count()),
+            }
+        };
+        let rates = |commanded| watched.iter().map(move |&name| rate(name, commanded));
+        Self {
+            score: Score::of(outcomes),
+            completions: rates(true).filter(|of| of.rate.episodes > 0).collect(),
+            un_instructed_completions: rates(false).filter(|of| of.rate.count > 0).collect(),
+        }
+    }
+}
+
+/// Latency of the controller, in microseconds, by the kind of call.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct LatencyByKind {
+    /// Control steps that keep the plan.
+    pub ordinary: Latency,
+    /// Control steps that decide a new plan, every horizon.
+    pub decision: Latency,
+    /// Setting an instruction, which runs its words through the high level.
+    pub instruct: Latency,
+}
+
+impl LatencyByKind {
+    /// Percentiles of all calls.
+    pub fn of(timing: &Timing) -> Self {
+        Self {
+            ordinary: Latency::of_ns(&timing.ordinary_ns),
+            decision: Latency::of_ns(&timing.decision_ns),
+            instruct: Latency::of_ns(&timing.instruct_ns),
+        }
+    }
+}
+
+/// Where the time went, summed over the threads unless it says `wall`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TimeUse {
+    /// Wall time from the first episode to the last, in seconds.
+    pub wall_s: f64,
+    /// Threads that ran episodes.
+    pub threads: usize,
+    /// Time inside episodes, in seconds.
+    pub episodes_s: f64,
+    /// Time inside the environment's reset and step, in seconds, which is physics but for noise and task checks.
+    pub simulator_s: f64,
+    /// Time inside the controller, in seconds.
+    pub controller_s: f64,
+    /// `simulator_s` over `episodes_s`; `None` without episodes.
+    pub simulator_share: Option<f64>,
+}
+
+impl TimeUse {
+    /// Sums up what was measured.
+    pub fn of(timing: &Timing, wall: std::time::Duration, threads: usize) -> Self {
+        let (simulator_s, episodes_s) = (
+            timing.simulator.as_secs_f64(),
+            timing.episodes.as_secs_f64(),
+        );
+        Self {
+            wall_s: wall.as_secs_f64(),
+            threads,
+            episodes_s,
+            simulator_s,
+            controller_s: timing.controller().as_secs_f64(),
+            simulator_share: (episodes_s > 0.0).then(|| simulator_s / episodes_s),
+        }
+    }
+}
+
+/// How plans were chosen.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct DecisionUsed {
+    /// `argmax` or `sample`.
+    pub rule: &'static str,
+    /// Temperature of the softmax that is sampled; `None` for argmax.
+    pub temperature: Option<f32>,
+}
+
+impl From<Decision> for DecisionUsed {
+    fn from(decision: Decision) -> Self {
+        match decision {
+            Decision::Argmax => Self {
+                rule: "argmax",
+                temperature: None,
+            },
+            Decision::Sample { temperature, .. } => Self {
+                rule: "sample",
+                temperature: Some(temperature),
+            },
+        }
+    }
+}
+
+/// Which environment the rollouts ran in.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct EnvironmentUsed {
+    /// The contract's environment id.
+    pub id: &'static str,
+    /// Its version.
+    pub version: &'static str,
+    /// Control period, in seconds.
+    pub control_period_s: f64,
+    /// Longest episode, in control steps.
+    pub max_steps: usize,
+}
+
+impl From<&dyn Environment> for EnvironmentUsed {
+    fn from(environment: &dyn Environment) -> Self {
+        Self {
+            id: environment.id(),
+            version: environment.version(),
+            control_period_s: environment.control_period_s(),
+            max_steps: environment.max_steps(),
+        }
+    }
+}
+
+/// The whole report of one `lads-run`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Results {
+    /// [`FORMAT`].
+    pub format: &'static str,
+    /// [`FORMAT_VERSION`].
+    pub format_version: u32,
+    /// Environment of the rollouts.
+    pub environment: EnvironmentUsed,
+    /// SHA-256 of the bundle file, in hexadecimal digits.
+    pub bundle_sha256: String,
+    /// Seed of all random streams.
+    pub seed: u64,
+    /// Noise level of the environment.
+    pub noise: String,
+    /// How plans were chosen.
+    pub decision: DecisionUsed,
+    /// Episodes asked for per instruction.
+    pub episodes_per_instruction: u32,
+    /// Versions of what the numbers depend on, by name.
+    pub versions: BTreeMap<&'static str, String>,
+    /// Scores by split.
+    pub splits: Splits,
+    /// Results by instruction, in the contract's order.
+    pub instructions: Vec<InstructionResult>,
+    /// Latency of the controller.
+    pub latency_us: LatencyByKind,
+    /// Where the time went.
+    pub time: TimeUse,
+}
+
+/// Writes `results` to `path` as JSON: to a temporary file in the same folder, then renamed.
+pub fn write_json(results: &Results, path: &Path) -> io::Result<()> {
+    let mut file = temporary_beside(path)?;
+    serde_json::to_writer_pretty(&mut file, results)?;
+    file.write_all(b"\n")?;
+    file.as_file().sync_all()?;
+    file.persist(path).map_err(|error| error.error)?;
+    Ok(())
+}
+
+/// A temporary file in the folder of `path`, so that it can be renamed to it; also the check, made before any rollout, that this will work.
+pub fn temporary_beside(path: &Path) -> io::Result<tempfile::NamedTempFile> {
+    if path.is_dir() {
+        return Err(io::Error::new(
+            io::ErrorKind::IsADirectory,
+            "it is a folder",
+        ));
+    }
+    let folder = match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    };
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".lads-run-").suffix(".tmp");
+    // As `File::create` would: readable by all whom the umask lets.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    builder.tempfile_in(folder)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WATCHED: [&str; 5] = ["a", "b", "c", "d", "e"];
+
+    fn episode(done: &[(usize, usize)]) -> Episode {
+        let completion = |&(sub_task, step)| crate::environment::Completion { sub_task, step };
+        Episode {
+            steps: 280,
+            completions: done.iter().map(completion).collect(),
+            plans: vec![0; 14],
+        }
+    }
+
+    fn two_instructions() -> [InstructionResult; 2] {
+        let known = |id, sub_tasks, split| KnownInstruction {
+            id,
+            text: "t",
+            sub_tasks,
+            split,
+            words: &[],
+        };
+        let first = [
+            episode(&[(0, 3), (1, 9), (4, 11), (2, 20), (3, 30)]),
+            episode(&[(1, 5)]),
+        ];
+        let second = [episode(&[(0, 2), (3, 8)])];
+        [
+            InstructionResult::new(&known("dcba", "d, c, b, a", Split::Seen), &WATCHED, &first),
+            InstructionResult::new(&known("eabc", "e,a,b,c", Split::Unseen), &WATCHED, &second),
+        ]
+    }
+
+    fn counts(rates: &[SubTaskRate]) -> Vec<(&str, usize)> {
+        rates
+            .iter()
+            .map(|rate| (rate.sub_task, rate.rate.count))
+            .collect()
+    }
+
+    #[test]
+    fn rates_by_hand() {
+        let [first, second] = two_instructions();
+        assert_eq!(
+            counts(&first.completions),
+            [("d", 1), ("c", 1), ("b", 2), ("a", 1)]
+        );
+        assert_eq!(counts(&first.un_instructed_completions), [("e", 1)]);
+        assert_eq!(
+            (first.score.n_rate, first.score.full_success),
+            (Some(2.5), Some(0.5))
+        );
+        assert_eq!(
+            first.score.k_rate,
+            [Some(1.0), Some(0.5), Some(0.5), Some(0.5)]
+        );
+        assert_eq!(counts(&second.un_instructed_completions), [("d", 1)]);
+        assert_eq!(
+            (second.score.n_rate, second.score.un_instructed),
+            (Some(1.0), 1)
+        );
+        let order: Vec<_> = first.runs[0]
+            .completions
+            .iter()
+            .map(|c| (c.sub_task, c.commanded))
+            .collect();
+        assert_eq!(
+            order,
+            [
+                ("a", true),
+                ("b", true),
+                ("e", false),
+                ("c", true),
+                ("d", true)
+            ]
+        );
+    }
+
+    #[test]
+    fn splits_by_hand() {
+        let [first, second] = two_instructions();
+        let splits = Splits::of(std::slice::from_ref(&first), &WATCHED);
+        assert_eq!(
+            (splits.seen.score.episodes, splits.unseen.score.episodes),
+            (2, 0)
+        );
+        assert_eq!(
+            (splits.seen.score.n_rate, splits.unseen.score.n_rate),
+            (Some(2.5), None)
+        );
+        assert!(splits.unseen.completions.is_empty());
+        let third = InstructionResult {
+            id: "b".to_owned(),
+            ..second.clone()
+        };
+        let splits = Splits::of(&[first, second, third], &WATCHED);
+        assert_eq!(
+            (splits.seen.score.n_rate, splits.unseen.score.n_rate),
+            (Some(2.5), Some(1.0))
+        );
+        // Both unseen episodes command e, a, b, c and complete a and d; nobody commands d.
+        assert_eq!(
+            counts(&splits.unseen.completions),
+            [("a", 2), ("b", 0), ("c", 0), ("e", 0)]
+        );
+        assert_eq!(counts(&splits.unseen.un_instructed_completions), [("d", 2)]);
+        assert!(
+            splits
+                .unseen
+                .completions
+                .iter()
+                .all(|of| of.rate.episodes == 2)
+        );
+    }
+
+    #[test]
+    fn a_failed_write_leaves_the_old_file() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(
+            temporary_beside(folder.path()).is_err(),
+            "a folder is no target"
+        );
+        assert!(temporary_beside(&folder.path().join("no/such/r.json")).is_err());
+        let target = folder.path().join("r.json");
+        std::fs::write(&target, "old").unwrap();
+        drop(temporary_beside(&target).unwrap());
+        assert_eq!(std::fs::read_to_string(&target).unwrap(), "old");
+        assert_eq!(
+            std::fs::read_dir(folder.path()).unwrap().count(),
+            1,
+            "no temporary file stays"
+        );
+    }
+}
