@@ -4,9 +4,13 @@
 #![forbid(unsafe_code)]
 
 pub mod assets;
+pub mod collect;
+pub mod dataset;
 pub mod environment;
 pub mod evaluate;
+pub mod expert;
 pub mod fit;
+pub mod instructions;
 pub mod kitchen;
 pub mod metrics;
 pub mod random;

@@ -69,13 +69,20 @@ impl Arm {
     pub fn new(physics: &Physics) -> Self {
         let site = site_id(physics, "end_effector");
         let home = Joints::from_iterator(INITIAL_POSITIONS.iter().copied());
-        Self { site, home, scratch: MjData::new(physics.model_clone()) }
+        Self {
+            site,
+            home,
+            scratch: MjData::new(physics.model_clone()),
+        }
     }
 
     /// Where the hand is.
     pub fn pose(&self, physics: &Physics) -> Pose {
         let rotation = Matrix3::from_row_slice(&physics.site_xmat()[self.site]);
-        Pose { position: physics.site_xpos()[self.site].into(), rotation: Rotation3::from_matrix_unchecked(rotation) }
+        Pose {
+            position: physics.site_xpos()[self.site].into(),
+            rotation: Rotation3::from_matrix_unchecked(rotation),
+        }
     }
 
     /// Joint displacement of one control step towards a pose.
@@ -84,25 +91,45 @@ impl Arm {
         let linear = POSITION_GAIN * (goal.position - pose.position);
         let angular = ROTATION_GAIN * (goal.rotation * pose.rotation.inverse()).scaled_axis();
         let mut twist = Vector6::zeros();
-        twist.fixed_rows_mut::<3>(0).copy_from(&linear.cap_magnitude(pace.linear * CONTROL_PERIOD_S));
-        twist.fixed_rows_mut::<3>(3).copy_from(&(ROTATION_WEIGHT * angular.cap_magnitude(pace.angular * CONTROL_PERIOD_S)));
+        twist
+            .fixed_rows_mut::<3>(0)
+            .copy_from(&linear.cap_magnitude(pace.linear * CONTROL_PERIOD_S));
+        twist
+            .fixed_rows_mut::<3>(3)
+            .copy_from(&(ROTATION_WEIGHT * angular.cap_magnitude(pace.angular * CONTROL_PERIOD_S)));
         let angles = joint_angles(physics);
         let mut room = [(0.0, 0.0); JOINTS];
         for (joint, room) in room.iter_mut().enumerate() {
-            *room = ((LIMIT_LOW[joint] - angles[joint]).min(0.0), (LIMIT_HIGH[joint] - angles[joint]).max(0.0));
+            *room = (
+                (LIMIT_LOW[joint] - angles[joint]).min(0.0),
+                (LIMIT_HIGH[joint] - angles[joint]).max(0.0),
+            );
         }
-        self.limited_step(&self.jacobian(physics), &twist, &(NULL_SPACE_GAIN * (self.home - angles)), &room)
+        self.limited_step(
+            &self.jacobian(physics),
+            &twist,
+            &(NULL_SPACE_GAIN * (self.home - angles)),
+            &room,
+        )
     }
 
     /// Joint angles that bring the hand to a pose, always sought from the home posture, so that a pose has one posture.
     pub fn inverse_kinematics(&mut self, physics: &Physics, goal: &Pose) -> Joints {
-        let start = Joints::from_fn(|joint, _| self.home[joint].clamp(LIMIT_LOW[joint], LIMIT_HIGH[joint]));
+        let start =
+            Joints::from_fn(|joint, _| self.home[joint].clamp(LIMIT_LOW[joint], LIMIT_HIGH[joint]));
         self.scratch.qpos_mut().copy_from_slice(physics.qpos());
         self.scratch.qpos_mut()[..JOINTS].copy_from_slice(start.as_slice());
         for _ in 0..INVERSE_KINEMATICS_STEPS {
             self.scratch.kinematics();
             self.scratch.com_pos();
-            let step = self.displacement(&self.scratch, goal, Pace { linear: 0.6, angular: 2.5 });
+            let step = self.displacement(
+                &self.scratch,
+                goal,
+                Pace {
+                    linear: 0.6,
+                    angular: 2.5,
+                },
+            );
             for (angle, step) in self.scratch.qpos_mut().iter_mut().zip(step.iter()) {
                 *angle += step;
             }
@@ -114,7 +141,13 @@ impl Arm {
     }
 
     /// The damped least-squares step for a weighted twist, with the joints kept inside their `room`.
-    fn limited_step(&self, jacobian: &Jacobian, twist: &Vector6<f64>, posture: &Joints, room: &[(f64, f64); JOINTS]) -> Joints {
+    fn limited_step(
+        &self,
+        jacobian: &Jacobian,
+        twist: &Vector6<f64>,
+        posture: &Joints,
+        room: &[(f64, f64); JOINTS],
+    ) -> Joints {
         let mut step = Joints::zeros();
         let mut free = [true; JOINTS];
         for _ in 0..ACTIVE_SET_ROUNDS {
@@ -123,12 +156,18 @@ impl Arm {
             let open = jacobian * SMatrix::<f64, JOINTS, JOINTS>::from_diagonal(&mask);
             let normal = open * open.transpose() + DAMPING * DAMPING * Matrix6::identity();
             // Symmetric with eigenvalues of at least DAMPING^2, so the factorisation exists.
-            let Some(factor) = normal.cholesky() else { return step };
+            let Some(factor) = normal.cholesky() else {
+                return step;
+            };
             let pull = posture.component_mul(&mask);
             let residual = twist - jacobian * fixed - open * pull;
             step = fixed + pull + open.transpose() * factor.solve(&residual);
-            let outside = |joint: usize, step: &Joints| step[joint] < room[joint].0 || step[joint] > room[joint].1;
-            let violating: Vec<usize> = (0..JOINTS).filter(|&joint| free[joint] && outside(joint, &step)).collect();
+            let outside = |joint: usize, step: &Joints| {
+                step[joint] < room[joint].0 || step[joint] > room[joint].1
+            };
+            let violating: Vec<usize> = (0..JOINTS)
+                .filter(|&joint| free[joint] && outside(joint, &step))
+                .collect();
             if violating.is_empty() {
                 break;
             }
@@ -145,7 +184,11 @@ impl Arm {
         let (translation, rotation) = physics.jac_site(true, true, self.site);
         let columns = translation.len() / 3;
         Jacobian::from_fn(|row, joint| {
-            if row < 3 { translation[row * columns + joint] } else { ROTATION_WEIGHT * rotation[(row - 3) * columns + joint] }
+            if row < 3 {
+                translation[row * columns + joint]
+            } else {
+                ROTATION_WEIGHT * rotation[(row - 3) * columns + joint]
+            }
         })
     }
 }
@@ -153,7 +196,12 @@ impl Arm {
 /// The action that displaces the arm's joints within one control step, scaled down as a whole where it asks for too much.
 ///
 /// `share` is the part of the full speed that may be used; `open` opens or closes the fingers with full force.
-pub fn action(physics: &Physics, displacement: &Joints, share: f64, open: bool) -> [f64; ACTION_LEN] {
+pub fn action(
+    physics: &Physics,
+    displacement: &Joints,
+    share: f64,
+    open: bool,
+) -> [f64; ACTION_LEN] {
     // The servos have no integral part: gravity and Coriolis forces are offset beforehand.
     let gravity = Joints::from_fn(|joint, _| physics.qfrc_bias()[joint] / STIFFNESS[joint]);
     let wanted = displacement / RESPONSE;
@@ -162,7 +210,13 @@ pub fn action(physics: &Physics, displacement: &Joints, share: f64, open: bool) 
         .fold(1.0, f64::max);
     let offset = (wanted / excess + gravity) / FULL_OFFSET;
     let fingers = if open { 1.0 } else { -1.0 };
-    std::array::from_fn(|index| if index < JOINTS { offset[index].clamp(-1.0, 1.0) } else { fingers })
+    std::array::from_fn(|index| {
+        if index < JOINTS {
+            offset[index].clamp(-1.0, 1.0)
+        } else {
+            fingers
+        }
+    })
 }
 
 /// The arm's joint angles.

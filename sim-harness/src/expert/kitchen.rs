@@ -64,7 +64,11 @@ struct Progress {
 impl Progress {
     /// Gives up after `patience` control steps without progress.
     fn new(patience: usize) -> Self {
-        Self { patience, best: Cell::new(f64::NEG_INFINITY), idle: Cell::new(0) }
+        Self {
+            patience,
+            best: Cell::new(f64::NEG_INFINITY),
+            idle: Cell::new(0),
+        }
     }
 
     /// To be asked once per control step with how far the movement has come.
@@ -141,22 +145,36 @@ impl Performer<'_> {
     /// Backs off by `way` with the hand as it is, far enough for the next transit.
     fn retreat(&mut self, open: bool, way: Vector3<f64>) -> Result<(), OutOfTime> {
         let hand = self.hand();
-        self.reach(Move::new(open, 0.07, 8).any_rotation(), pose(hand.position + way, hand.rotation))?;
+        self.reach(
+            Move::new(open, 0.07, 8).any_rotation(),
+            pose(hand.position + way, hand.rotation),
+        )?;
         Ok(())
     }
 
     /// Comes to a contact pose along the hand's own axis: the farther the hand is off the axis, the farther back it waits.
-    fn approach(&mut self, open: bool, near: f64, steps: usize, contact: impl Fn(&Self) -> Pose) -> Result<bool, OutOfTime> {
+    fn approach(
+        &mut self,
+        open: bool,
+        near: f64,
+        steps: usize,
+        contact: impl Fn(&Self) -> Pose,
+    ) -> Result<bool, OutOfTime> {
         let funnel = |this: &Self| {
             let contact = contact(this);
             let axis = contact.rotation * Vector3::z();
             let offset = this.hand().position - contact.position;
             let aside = (offset - axis * offset.dot(&axis)).norm();
-            pose(contact.position - axis * (FUNNEL_SLOPE * (aside - FUNNEL_WIDTH)).clamp(0.0, FUNNEL_LEN), contact.rotation)
+            pose(
+                contact.position
+                    - axis * (FUNNEL_SLOPE * (aside - FUNNEL_WIDTH)).clamp(0.0, FUNNEL_LEN),
+                contact.rotation,
+            )
         };
         self.follow(Move::new(open, 0.0, steps), funnel, |this| {
             let (goal, hand) = (contact(this), this.hand());
-            (goal.position - hand.position).norm() < near && goal.rotation.angle_to(&hand.rotation) < 0.3
+            (goal.position - hand.position).norm() < near
+                && goal.rotation.angle_to(&hand.rotation) < 0.3
         })
     }
 
@@ -166,15 +184,21 @@ impl Performer<'_> {
             self.approach(OPEN, 0.02, 30, grip.contact)?;
             self.follow(Move::new(CLOSED, 0.0, 3), grip.contact, |_| false)?;
             let progress = Progress::new(12);
-            let held = |this: &Self| this.position(LEFT_FINGER) + this.position(RIGHT_FINGER) > grip.width;
-            let finished = |this: &Self| (grip.done)(this) || !held(this) || progress.stalled((grip.turned)(this));
+            let held =
+                |this: &Self| this.position(LEFT_FINGER) + this.position(RIGHT_FINGER) > grip.width;
+            let finished = |this: &Self| {
+                (grip.done)(this) || !held(this) || progress.stalled((grip.turned)(this))
+            };
             self.follow(Move::new(CLOSED, 0.0, 80).linear(pace), grip.goal, finished)?;
             if (grip.done)(self) {
                 break;
             }
             let hand = self.hand();
             let back = hand.position - hand.rotation * Vector3::z() * 0.09;
-            self.reach(Move::new(OPEN, 0.03, 8).any_rotation(), pose(back, (grip.contact)(self).rotation))?;
+            self.reach(
+                Move::new(OPEN, 0.03, 8).any_rotation(),
+                pose(back, (grip.contact)(self).rotation),
+            )?;
         }
         Ok(())
     }
@@ -198,32 +222,59 @@ impl Performer<'_> {
         self.transit(&pose(start, rotation), OPEN, 0.15, 45)?;
         let pull = |this: &Self| {
             let arm = handle(this) - anchor;
-            pose(handle(this) + 0.07 * vector(arm.y, -arm.x, 0.0).normalize(), turned(0.5) * grasp())
+            pose(
+                handle(this) + 0.07 * vector(arm.y, -arm.x, 0.0).normalize(),
+                turned(0.5) * grasp(),
+            )
         };
-        self.grip_and_pull(0.5, &Grip {
-            contact: &|this| pose(handle(this) - 0.012 * inwards, rotation),
-            goal: &pull,
-            turned: &|this| -this.position(MICROWAVE),
-            done: &|this| this.position(MICROWAVE) < -0.70,
-            width: 0.02,
-        })?;
+        self.grip_and_pull(
+            0.5,
+            &Grip {
+                contact: &|this| pose(handle(this) - 0.012 * inwards, rotation),
+                goal: &pull,
+                turned: &|this| -this.position(MICROWAVE),
+                done: &|this| this.position(MICROWAVE) < -0.70,
+                width: 0.02,
+            },
+        )?;
         self.release(3)?;
         self.retreat(OPEN, vector(0.08, -0.13, 0.05))
     }
 
     fn kettle(&mut self) -> Result<(), OutOfTime> {
         let rotation = pitched(-35_f64.to_radians());
-        let kettle = |this: &Self| vector(this.position(KETTLE), this.position(KETTLE + 1), this.position(KETTLE + 2));
+        let kettle = |this: &Self| {
+            vector(
+                this.position(KETTLE),
+                this.position(KETTLE + 1),
+                this.position(KETTLE + 2),
+            )
+        };
         let hand = self.hand().position;
         if hand.z > 1.95 && hand.y > 0.3 {
             // Coming from above: down in front of the kettle, not across its handle.
-            self.transit(&pose(kettle(self) + vector(0.0, -0.27, 0.36), rotation), CLOSED, 0.4, 45)?;
+            self.transit(
+                &pose(kettle(self) + vector(0.0, -0.27, 0.36), rotation),
+                CLOSED,
+                0.4,
+                45,
+            )?;
         }
         let start = kettle(self) + vector(0.0, -0.26, 0.14) + self.jitter();
         self.transit(&pose(start, rotation), CLOSED, 0.15, 45)?;
-        let front = |this: &Self| pose(vector(kettle(this).x, kettle(this).y - 0.19, 1.72), rotation);
+        let front = |this: &Self| {
+            pose(
+                vector(kettle(this).x, kettle(this).y - 0.19, 1.72),
+                rotation,
+            )
+        };
         self.approach(CLOSED, 0.03, 15, front)?;
-        let push = |this: &Self| pose(vector(kettle(this).x, kettle(this).y - 0.05, 1.72), rotation);
+        let push = |this: &Self| {
+            pose(
+                vector(kettle(this).x, kettle(this).y - 0.05, 1.72),
+                rotation,
+            )
+        };
         let progress = Progress::new(10);
         self.follow(Move::new(CLOSED, 0.02, 60), push, |this| {
             kettle(this).y > 0.66 || progress.stalled(kettle(this).y)
@@ -238,13 +289,16 @@ impl Performer<'_> {
         let start = centre + vector(0.0, -0.13, -0.13 * pitch.tan()) + 0.7 * self.jitter();
         self.transit(&pose(start, rolled(turn(self)) * rotation), OPEN, 0.15, 45)?;
         let at = |angle: f64| pose(centre + vector(0.0, -0.033, 0.0), rolled(angle) * rotation);
-        self.grip_and_pull(0.5, &Grip {
-            contact: &|this| at(turn(this)),
-            goal: &|this| at((turn(this) + 0.6).min(1.35)),
-            turned: &|this| turn(this),
-            done: &|this| turn(this) > 0.82,
-            width: 0.0,
-        })?;
+        self.grip_and_pull(
+            0.5,
+            &Grip {
+                contact: &|this| at(turn(this)),
+                goal: &|this| at((turn(this) + 0.6).min(1.35)),
+                turned: &|this| turn(this),
+                done: &|this| turn(this) > 0.82,
+                width: 0.0,
+            },
+        )?;
         self.release(2)?;
         self.retreat(OPEN, vector(0.0, -0.13, 0.0))
     }
@@ -255,10 +309,15 @@ impl Performer<'_> {
         self.transit(&at(0.075, -0.13), CLOSED, 0.15, 45)?;
         self.approach(CLOSED, 0.025, 20, |_| at(0.060, -0.04))?;
         let progress = Progress::new(10);
-        self.follow(Move::new(CLOSED, 0.0, 40), |_| at(-0.12, -0.04), |this| {
-            let missed = this.hand().position.x < centre.x - 0.03 && this.position(SWITCH) > -0.1;
-            this.position(SWITCH) < -0.66 || missed || progress.stalled(-this.position(SWITCH))
-        })?;
+        self.follow(
+            Move::new(CLOSED, 0.0, 40),
+            |_| at(-0.12, -0.04),
+            |this| {
+                let missed =
+                    this.hand().position.x < centre.x - 0.03 && this.position(SWITCH) > -0.1;
+                this.position(SWITCH) < -0.66 || missed || progress.stalled(-this.position(SWITCH))
+            },
+        )?;
         self.retreat(CLOSED, vector(0.0, -0.13, 0.0))
     }
 
@@ -268,9 +327,19 @@ impl Performer<'_> {
         let backwards = vector(0.0, -pitch.cos(), -pitch.sin());
         let site = self.site("slide_site");
         let contact = vector(site.x - 0.07, site.y, 2.49) + 0.045 * backwards + self.jitter();
-        self.transit(&pose(contact + 0.15 * backwards, rotation), CLOSED, 0.15, 45)?;
+        self.transit(
+            &pose(contact + 0.15 * backwards, rotation),
+            CLOSED,
+            0.15,
+            45,
+        )?;
         self.approach(CLOSED, 0.025, 20, |_| pose(contact, rotation))?;
-        let push = |this: &Self| pose(vector(this.site("slide_site").x + 0.06, contact.y, contact.z), rotation);
+        let push = |this: &Self| {
+            pose(
+                vector(this.site("slide_site").x + 0.06, contact.y, contact.z),
+                rotation,
+            )
+        };
         let progress = Progress::new(12);
         self.follow(Move::new(CLOSED, 0.0, 60).linear(0.8), push, |this| {
             this.position(SLIDE) > 0.30 || progress.stalled(this.position(SLIDE))
@@ -291,16 +360,22 @@ impl Performer<'_> {
             let ahead = anchor + turned(16_f64.to_radians()) * (handle(this) - anchor);
             pose(ahead, turned(-0.4 + 0.8 * this.position(HINGE)) * rotation)
         };
-        self.grip_and_pull(0.7, &Grip {
-            contact: &|this| {
-                let yaw = 0.5 * this.position(HINGE);
-                pose(handle(this) + turned(yaw) * vector(0.0, -0.012, 0.0), turned(yaw) * rotation)
+        self.grip_and_pull(
+            0.7,
+            &Grip {
+                contact: &|this| {
+                    let yaw = 0.5 * this.position(HINGE);
+                    pose(
+                        handle(this) + turned(yaw) * vector(0.0, -0.012, 0.0),
+                        turned(yaw) * rotation,
+                    )
+                },
+                goal: &pull,
+                turned: &|this| this.position(HINGE),
+                done: &|this| this.position(HINGE) > 1.22,
+                width: 0.02,
             },
-            goal: &pull,
-            turned: &|this| this.position(HINGE),
-            done: &|this| this.position(HINGE) > 1.22,
-            width: 0.02,
-        })?;
+        )?;
         self.release(3)?;
         self.retreat(OPEN, vector(-0.02, -0.15, -0.05))
     }

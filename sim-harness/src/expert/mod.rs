@@ -35,11 +35,19 @@ pub struct Style {
 
 impl Style {
     /// No variation at all.
-    pub const PLAIN: Self = Self { speed: 1.0, jitter: 0.0, recovery_noise: 0.0 };
+    pub const PLAIN: Self = Self {
+        speed: 1.0,
+        jitter: 0.0,
+        recovery_noise: 0.0,
+    };
 
     /// A random style: speed 0.85 to 1.2, jitter 9 mm, noise of a standard deviation between 0 and `recovery_noise`.
     pub fn draw(stream: &mut Stream, recovery_noise: f64) -> Self {
-        Self { speed: stream.uniform(0.85, 1.2), jitter: 0.009, recovery_noise: recovery_noise * stream.unit() }
+        Self {
+            speed: stream.uniform(0.85, 1.2),
+            jitter: 0.009,
+            recovery_noise: recovery_noise * stream.unit(),
+        }
     }
 }
 
@@ -76,7 +84,16 @@ struct Move {
 impl Move {
     /// A movement with open or closed fingers that ends within `near` metres of its goal or after `steps` control steps.
     const fn new(open: bool, near: f64, steps: usize) -> Self {
-        Self { open, pace: Pace { linear: 0.5, angular: 2.5 }, near, aligned: 0.3, steps }
+        Self {
+            open,
+            pace: Pace {
+                linear: 0.5,
+                angular: 2.5,
+            },
+            near,
+            aligned: 0.3,
+            steps,
+        }
     }
 
     const fn linear(mut self, speed: f64) -> Self {
@@ -103,7 +120,12 @@ pub struct Performer<'k> {
 
 impl<'k> Performer<'k> {
     /// Starts an episode of at most `max_steps` control steps, with a style drawn from the episode's seed.
-    pub fn new(kitchen: &'k mut Kitchen, seed: EpisodeSeed, recovery_noise: f64, max_steps: usize) -> Self {
+    pub fn new(
+        kitchen: &'k mut Kitchen,
+        seed: EpisodeSeed,
+        recovery_noise: f64,
+        max_steps: usize,
+    ) -> Self {
         let [run, instruction, episode] = seed.entropy();
         let mut stream = Stream::new(&[run, EXPERT_STREAM, instruction, episode]);
         let style = Style::draw(&mut stream, recovery_noise);
@@ -111,10 +133,24 @@ impl<'k> Performer<'k> {
     }
 
     /// The same with a given style, whose noise and jitter are drawn from `stream`.
-    pub fn with_style(kitchen: &'k mut Kitchen, seed: EpisodeSeed, stream: Stream, style: Style, max_steps: usize) -> Self {
+    pub fn with_style(
+        kitchen: &'k mut Kitchen,
+        seed: EpisodeSeed,
+        stream: Stream,
+        style: Style,
+        max_steps: usize,
+    ) -> Self {
         kitchen.reset(seed);
         let arm = Arm::new(kitchen.physics());
-        Self { kitchen, arm, stream, style, drift: [0.0; JOINTS], transitions: Vec::with_capacity(max_steps), max_steps }
+        Self {
+            kitchen,
+            arm,
+            stream,
+            style,
+            drift: [0.0; JOINTS],
+            transitions: Vec::with_capacity(max_steps),
+            max_steps,
+        }
     }
 
     /// The style in force.
@@ -142,7 +178,8 @@ impl<'k> Performer<'k> {
         if self.transitions.len() >= self.max_steps {
             return Err(OutOfTime);
         }
-        let innovation = (1.0 - NOISE_CORRELATION * NOISE_CORRELATION).sqrt() * self.style.recovery_noise;
+        let innovation =
+            (1.0 - NOISE_CORRELATION * NOISE_CORRELATION).sqrt() * self.style.recovery_noise;
         let mut executed = label;
         for (drift, executed) in self.drift.iter_mut().zip(&mut executed) {
             *drift = NOISE_CORRELATION * *drift + innovation * self.stream.normal();
@@ -174,22 +211,41 @@ impl<'k> Performer<'k> {
     }
 
     /// Moves in joint space to the posture of a pose; precise to `near` rad in every joint.
-    fn transit(&mut self, goal: &Pose, open: bool, near: f64, steps: usize) -> Result<(), OutOfTime> {
+    fn transit(
+        &mut self,
+        goal: &Pose,
+        open: bool,
+        near: f64,
+        steps: usize,
+    ) -> Result<(), OutOfTime> {
         let posture = self.arm.inverse_kinematics(self.kitchen.physics(), goal);
         for _ in 0..steps {
             let error: Joints = posture - joint_angles(self.kitchen.physics());
             if error.amax() < near {
                 break;
             }
-            let label = action(self.kitchen.physics(), &(TRANSIT_GAIN * error), self.style.speed.min(1.0), open);
+            let label = action(
+                self.kitchen.physics(),
+                &(TRANSIT_GAIN * error),
+                self.style.speed.min(1.0),
+                open,
+            );
             self.act(label)?;
         }
         Ok(())
     }
 
     /// Follows a goal that may move, until it is reached, `done` or `steps` are over. True when it was reached or done.
-    fn follow(&mut self, how: Move, goal: impl Fn(&Self) -> Pose, done: impl Fn(&Self) -> bool) -> Result<bool, OutOfTime> {
-        let pace = Pace { linear: how.pace.linear * self.style.speed, angular: how.pace.angular * self.style.speed };
+    fn follow(
+        &mut self,
+        how: Move,
+        goal: impl Fn(&Self) -> Pose,
+        done: impl Fn(&Self) -> bool,
+    ) -> Result<bool, OutOfTime> {
+        let pace = Pace {
+            linear: how.pace.linear * self.style.speed,
+            angular: how.pace.angular * self.style.speed,
+        };
         for step in 0..how.steps {
             if done(self) {
                 return Ok(true);
@@ -200,7 +256,12 @@ impl<'k> Performer<'k> {
                 return Ok(true);
             }
             let physics = self.kitchen.physics();
-            let label = action(physics, &self.arm.displacement(physics, &goal, pace), 1.0, how.open);
+            let label = action(
+                physics,
+                &self.arm.displacement(physics, &goal, pace),
+                1.0,
+                how.open,
+            );
             self.act(label)?;
         }
         Ok(done(self))
