@@ -85,7 +85,7 @@ class Training:
     bc_weight: float  # on the mean squared error per action element
     random_offset: bool  # start the segmentation of a trajectory at a random step below H
     ce_at: str  # "all" window starts, or "decisions" (multiples of H) only
-    bf16: bool  # autocast of the transformer where the CPU or GPU has bfloat16
+    bf16: bool  # bfloat16 in the transformer and in matrix products where the CPU or GPU has it
     joint: Stage
     plans: Stage  # staged 1: encoder, codebook, low level, alignment
     low_level: Stage  # staged 2: low level on frozen codes

@@ -118,6 +118,17 @@ def _fast_bfloat16(device):
     return device.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
 
 
+@contextmanager
+def _matmul_precision(name):
+    """"medium" lets matrix products round their inputs to bfloat16 where that is faster; sums stay in float32."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision(name)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
 class Stage:
     """One stage: its parameters, and the total loss of one step."""
 
@@ -325,7 +336,7 @@ class Trainer:
             raise UserError(f"{self.out / CHECKPOINT} exists; continue it with --resume or choose another --out")
         optimizer_state = self.resume() if resume else None
         names = STAGES[self.config.training.schedule]
-        with self._interruptible():
+        with self._interruptible(), _matmul_precision("medium" if self.config.training.bf16 else "highest"):
             while self.position["stage"] < len(names):
                 name = names[self.position["stage"]]
                 stage = Stage(name, self)

@@ -7,7 +7,7 @@ import torch
 
 from lads_exporter import config
 from lads_exporter.codebook import Codebook, kmeans, nearest, perplexity
-from lads_exporter.model import Alignment, HighLevelPolicy, TrajectoryEncoder
+from lads_exporter.model import Alignment, Dropout, HighLevelPolicy, TrajectoryEncoder, attend
 
 
 @pytest.fixture(scope="module")
@@ -134,6 +134,29 @@ def test_logits_depend_on_the_past_only(setting):
     assert (before[:, 12:] - after[:, 12:]).abs().max() > 1e-2
     actions[:, 3] += 1.0
     assert (policy(words, observations, actions)[:, 5] - after[:, 5]).abs().max() > 1e-3, "actions must be seen"
+
+
+@pytest.mark.parametrize(("rows", "step", "prefix"), [(50, 1, 0), (1, 1, 0), (33, 2, 9), (5, 2, 30), (1, 2, 4)])
+def test_attention_in_blocks_equals_the_fused_operator(rows, step, prefix):
+    """Values and gradients; the fused operator is what a GPU runs."""
+    torch.manual_seed(0)
+    keys = prefix + (rows - 1) * step + 1
+    q, k, v = (torch.randn(2, 2, size, 8, requires_grad=True) for size in (rows, keys, keys))
+    own = prefix + step * torch.arange(rows)
+    mask = torch.where(torch.arange(keys) > own[:, None], -1e4, 0.0).expand(2, 1, -1, -1)
+    outputs = attend(q, k, v, mask, step), torch.nn.functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+    assert torch.allclose(*outputs, atol=1e-5)
+    gradients = [torch.autograd.grad(out.square().sum(), (q, k, v)) for out in outputs]
+    assert all(torch.allclose(a, b, atol=1e-4) for a, b in zip(*gradients))
+
+
+def test_dropout_keeps_the_mean_and_the_rate():
+    torch.manual_seed(0)
+    drop, x = Dropout(0.1), torch.ones(1000, 1001)
+    out = drop(x)
+    assert (out == 0).float().mean().item() == pytest.approx(26 / 256, abs=2e-3)
+    assert out.mean().item() == pytest.approx(1, abs=2e-3)
+    assert drop.eval()(x) is x
 
 
 def test_same_instruction_is_no_negative(setting):
