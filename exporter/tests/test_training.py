@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import subprocess
 import sys
 
@@ -151,8 +152,10 @@ def test_batches_of_similar_length_use_every_drawn_episode(tmp_path):
     assert batches.flatten().sort().values.tolist() == pool.flatten().sort().values.tolist()
 
 
-def run_command(*arguments):
-    return subprocess.run([sys.executable, "-m", "lads_exporter", *map(str, arguments)], capture_output=True, text=True)
+def run_command(*arguments, folder=None):
+    command = [sys.executable, "-m", "lads_exporter", *map(str, arguments)]
+    environment = os.environ | {"PYTHONPATH": str(config.find("pyproject.toml").resolve().parent)}
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment)
 
 
 def test_commands_from_dataset_to_bundle(tmp_path):
@@ -201,7 +204,7 @@ def test_commands_from_dataset_to_bundle(tmp_path):
     ],
 )
 def test_bad_input_ends_with_one_line(tmp_path, arguments, message):
-    out = subprocess.run([sys.executable, "-m", "lads_exporter", *arguments], capture_output=True, text=True, cwd=tmp_path)
+    out = run_command(*arguments, folder=tmp_path)
     assert out.returncode == 2
     assert message in out.stderr and out.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
