@@ -8,9 +8,13 @@ pub type Block = [f32; LANES];
 
 /// `acc[l] += f(a[l], b[l])`
 #[inline(always)]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "constant bounds; compilers vectorise this form best"
+)]
 pub fn add_products(acc: &mut Block, a: &Block, b: &Block) {
-    for ((acc, &a), &b) in acc.iter_mut().zip(a).zip(b) {
-        *acc += a * b;
+    for i in 0..LANES {
+        acc[i] += a[i] * b[i];
     }
 }
 
@@ -24,17 +28,20 @@ pub fn add_scaled(acc: &mut Block, a: f32, b: &Block) {
 
 /// The sum of the lanes: halves are added until one element is left.
 #[inline(always)]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "constant bounds; compilers vectorise this form best"
+)]
 pub fn tree(acc: &Block) -> f32 {
-    fn halve<const N: usize, const HALF: usize>(lanes: [f32; N]) -> [f32; HALF] {
-        let mut sums = [0.0; HALF];
-        let (low, high) = lanes.split_at(HALF);
-        for ((sum, &a), &b) in sums.iter_mut().zip(low).zip(high) {
-            *sum = a + b;
-        }
-        sums
+    let mut eight = [0.0; 8];
+    for i in 0..8 {
+        eight[i] = acc[i] + acc[i + 8];
     }
-    let [sum] = halve::<2, 1>(halve::<4, 2>(halve::<8, 4>(halve::<16, 8>(*acc))));
-    sum
+    let mut four = [0.0; 4];
+    for i in 0..4 {
+        four[i] = eight[i] + eight[i + 4];
+    }
+    (four[0] + four[2]) + (four[1] + four[3])
 }
 
 /// Sum of `f(x[i])`.

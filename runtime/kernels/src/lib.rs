@@ -7,7 +7,7 @@
 //!   multiply-add is fused, and `exp`, `tanh` and `sigmoid` are the polynomials of [`math`].
 //! - Plain Rust that compilers vectorise: inner loops run over arrays of sixteen elements.
 //!
-//! [`reference`] holds the naive twin of every kernel; `tests/twins.rs` compares them on random shapes.
+//! [`mod@reference`] holds the naive twin of every kernel; `tests/twins.rs` compares them on random shapes.
 #![no_std]
 #![forbid(unsafe_code)]
 #![allow(

@@ -1,0 +1,377 @@
+//! Every kernel against its naive twin, on random shapes and values.
+
+use lads_kernels::reference as naive;
+use lads_kernels::{
+    Activation, Attention, Axis, BinaryKind, Input, Linear, MatMul, ReduceKind, StridedCopy,
+    UnaryKind, append, arg_max, arg_min, attention_scratch_len, binary, layer_norm, pack,
+    packed_len, reduce, softmax, unary, unary_in_place,
+};
+use proptest::prelude::*;
+use proptest::sample::select;
+
+const UNARY: [UnaryKind; 13] = [
+    UnaryKind::Relu,
+    UnaryKind::LeakyRelu,
+    UnaryKind::Tanh,
+    UnaryKind::Sigmoid,
+    UnaryKind::Exp,
+    UnaryKind::Log,
+    UnaryKind::Sqrt,
+    UnaryKind::Rsqrt,
+    UnaryKind::Neg,
+    UnaryKind::Abs,
+    UnaryKind::Recip,
+    UnaryKind::Erf,
+    UnaryKind::Square,
+];
+
+const BINARY: [BinaryKind; 7] = [
+    BinaryKind::Add,
+    BinaryKind::Sub,
+    BinaryKind::Mul,
+    BinaryKind::Div,
+    BinaryKind::Max,
+    BinaryKind::Min,
+    BinaryKind::Pow,
+];
+
+const REDUCE: [ReduceKind; 5] = [
+    ReduceKind::Sum,
+    ReduceKind::Mean,
+    ReduceKind::Max,
+    ReduceKind::Min,
+    ReduceKind::Prod,
+];
+
+/// Values in -1..1 from a seed: long vectors would make proptest slow, and shrinking their elements says nothing.
+fn values(len: usize, seed: u64) -> Vec<f32> {
+    let mut state = seed;
+    let next = || {
+        state = state
+            .wrapping_mul(6364136223846793005)
+            .wrapping_add(1442695040888963407);
+        (state >> 40) as f32 / (1_u64 << 23) as f32 - 1.0
+    };
+    std::iter::repeat_with(next).take(len).collect()
+}
+
+/// Equal up to `bound` times the size of what was added up.
+#[track_caller]
+fn close(got: &[f32], expected: &[f32], bound: f32) {
+    assert_eq!(got.len(), expected.len());
+    for (i, (&got, &expected)) in got.iter().zip(expected).enumerate() {
+        let equal = got == expected || got.is_nan() && expected.is_nan();
+        let near = (got - expected).abs() <= bound * expected.abs().max(1.0);
+        assert!(equal || near, "element {i}: {got} against {expected}");
+    }
+}
+
+fn activation() -> impl Strategy<Value = Activation> {
+    let all = [
+        Activation::None,
+        Activation::Relu,
+        Activation::LeakyRelu(0.2),
+        Activation::Tanh,
+        Activation::Sigmoid,
+    ];
+    select(all.to_vec())
+}
+
+proptest! {
+    #[test]
+    fn linear_equals_its_twin(
+        (m, k, n) in (1_usize..6, 1_usize..70, 1_usize..50),
+        activation in activation(),
+        (with_bias, accumulate) in any::<(bool, bool)>(),
+        seed in any::<u64>(),
+    ) {
+        let (x, w) = (values(m * k, seed), values(k * n, seed ^ 1));
+        let bias = if with_bias { values(n, seed ^ 2) } else { Vec::new() };
+        let before = values(m * n, seed ^ 3);
+        let mut packed = vec![f32::NAN; packed_len(k, n)];
+        pack(&w, k, n, &mut packed);
+        let layer = Linear { k, n, w: &packed, bias: &bias, activation, accumulate };
+        let mut y = before.clone();
+        layer.run(&x, &mut y);
+        let mut expected = vec![0.0; m * n];
+        naive::linear(&x, &w, &bias, activation, [k, n], &mut expected);
+        if accumulate {
+            expected.iter_mut().zip(&before).for_each(|(y, before)| *y += before);
+        }
+        close(&y, &expected, 1e-5);
+        // Each row alone gives the same bits as the rows together.
+        for (row, x) in x.chunks(k).enumerate() {
+            let mut alone = before[row * n..(row + 1) * n].to_vec();
+            layer.run(x, &mut alone);
+            prop_assert_eq!(&alone, &y[row * n..(row + 1) * n]);
+        }
+    }
+
+    #[test]
+    fn layer_norm_equals_its_twin(rows in 1_usize..4, cols in 1_usize..150, seed in any::<u64>()) {
+        let (x, gamma, beta) = (values(rows * cols, seed), values(cols, seed ^ 1), values(cols, seed ^ 2));
+        let (mut y, mut expected) = (vec![0.0; rows * cols], vec![0.0; rows * cols]);
+        layer_norm(&x, &gamma, &beta, 1e-5, &mut y);
+        naive::layer_norm(&x, &gamma, &beta, 1e-5, &mut expected);
+        // A single column, or two that are nearly equal, are all cancellation.
+        close(&y, &expected, if cols < 4 { 1e-2 } else { 1e-5 });
+    }
+
+    #[test]
+    fn softmax_equals_its_twin(
+        rows in 1_usize..4,
+        cols in 1_usize..150,
+        scale in select(vec![1.0_f32, 30.0, 1e4]),
+        seed in any::<u64>(),
+    ) {
+        let x: Vec<f32> = values(rows * cols, seed).iter().map(|x| x * scale).collect();
+        let (mut y, mut expected) = (vec![0.0; rows * cols], vec![0.0; rows * cols]);
+        softmax(&x, cols, &mut y);
+        naive::softmax(&x, cols, &mut expected);
+        close(&y, &expected, 1e-6);
+        for row in y.chunks(cols) {
+            prop_assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-5);
+        }
+    }
+
+    #[test]
+    fn attention_equals_its_twin(
+        (heads, head_dim) in (1_usize..5, select(vec![1_usize, 3, 5, 8, 16, 17, 32, 48])),
+        (past, tokens) in (0_usize..40, 1_usize..6),
+        (queries, gap) in (1_usize..6, 0_usize..7),
+        seed in any::<u64>(),
+    ) {
+        let queries = queries.min(tokens);
+        let (width, capacity) = (heads * head_dim, past + tokens + 2);
+        let stride = width + gap;
+        let new = values(2 * tokens * stride, seed);
+        let (new_k, new_v) = new.split_at(tokens * stride);
+        // What lies beyond the tokens must not matter.
+        let mut caches = [seed ^ 1, seed ^ 2].map(|seed| values(capacity * width, seed));
+        for cache in &mut caches {
+            cache[(past + tokens) * width..].fill(f32::NAN);
+        }
+        let [mut cache_k, mut cache_v] = caches;
+        append(new_k, stride, width, &mut cache_k, past);
+        append(new_v, stride, width, &mut cache_v, past);
+        for token in 0..tokens {
+            let row = (past + token) * width..(past + token + 1) * width;
+            prop_assert_eq!(&cache_k[row.clone()], &new_k[token * stride..token * stride + width]);
+            prop_assert_eq!(&cache_v[row], &new_v[token * stride..token * stride + width]);
+        }
+        let q: Vec<f32> = values((queries - 1) * stride + width, seed ^ 3).iter().map(|q| q * 4.0).collect();
+        let attention = Attention {
+            heads,
+            head_dim,
+            scale: 1.0 / (head_dim as f32).sqrt(),
+            q_stride: stride,
+            visible: past + tokens - queries + 1,
+            cache_k: &cache_k,
+            cache_v: &cache_v,
+        };
+        let mut scratch = vec![f32::NAN; attention_scratch_len(queries, capacity)];
+        let (mut y, mut expected) = (vec![f32::NAN; queries * width], vec![0.0; queries * width]);
+        attention.run(&q, &mut y, &mut scratch);
+        naive::attention(&attention, &q, &mut expected);
+        close(&y, &expected, 1e-5);
+    }
+
+    #[test]
+    fn unary_equals_its_twin(kind in select(UNARY.to_vec()), len in 1_usize..40, seed in any::<u64>()) {
+        let x: Vec<f32> = values(len, seed).iter().map(|x| x * 8.0).collect();
+        let expected: Vec<f32> = x.iter().map(|&x| naive::unary(kind, 0.2, x)).collect();
+        let mut y = vec![0.0; len];
+        unary(kind, 0.2, &x, &mut y);
+        close(&y, &expected, 1e-6);
+        let mut in_place = x;
+        unary_in_place(kind, 0.2, &mut in_place);
+        close(&in_place, &y, 0.0);
+    }
+
+    #[test]
+    fn binary_equals_its_twin(
+        kind in select(BINARY.to_vec()),
+        dims in prop::array::uniform4(1_usize..5),
+        (a_keeps, b_keeps) in any::<([bool; 4], [bool; 4])>(),
+        gap in 1_usize..3,
+        seed in any::<u64>(),
+    ) {
+        let len = dims.iter().product();
+        let (a_strides, b_strides) = (strides(dims, a_keeps, gap), strides(dims, b_keeps, 1));
+        let (a, b) = (values(len * gap, seed), values(len, seed ^ 1));
+        let at = |x: &[f32], strides, i| x[naive::offset(dims, strides, i)];
+        let expected = |a: &dyn Fn(usize) -> f32, b: &dyn Fn(usize) -> f32| {
+            (0..len).map(|i| naive::binary(kind, a(i), b(i))).collect::<Vec<_>>()
+        };
+        let run = |a: Input, b: Input, before: &[f32]| {
+            let mut y = before.to_vec();
+            binary(kind, a, b, dims, &mut y);
+            y
+        };
+        let old = values(len, seed ^ 2);
+        let (left, right) = (Input::Strided(&a, a_strides), Input::Strided(&b, b_strides));
+        let (a, b) = (|i| at(&a, a_strides, i), |i| at(&b, b_strides, i));
+        let own = |i: usize| old[i];
+        close(&run(left, right, &old), &expected(&a, &b), 2e-6);
+        close(&run(Input::Output, right, &old), &expected(&own, &b), 2e-6);
+        close(&run(left, Input::Output, &old), &expected(&a, &own), 2e-6);
+        close(&run(Input::Output, Input::Output, &old), &expected(&own, &own), 2e-6);
+    }
+
+    #[test]
+    fn copy_equals_its_twin(
+        dims in prop::array::uniform4(1_usize..5),
+        x_keeps in any::<[bool; 4]>(),
+        order in Just([0_usize, 1, 2, 3]).prop_shuffle(),
+        gap in 1_usize..4,
+        seed in any::<u64>(),
+    ) {
+        // A permutation of the dimensions with gaps: a transposition into a larger tensor.
+        let mut y_strides = [0; 4];
+        let mut stride = gap;
+        for i in order {
+            y_strides[i] = stride;
+            stride *= dims[i];
+        }
+        let copy = StridedCopy { dims, x_strides: strides(dims, x_keeps, 2), y_strides };
+        let x = values(2 * dims.iter().product::<usize>(), seed);
+        let mut y = values(stride, seed ^ 1);
+        let mut expected = y.clone();
+        copy.run(&x, &mut y);
+        naive::copy(&copy, &x, &mut expected);
+        prop_assert_eq!(y, expected);
+    }
+
+    #[test]
+    fn reduce_equals_its_twin(
+        kind in select(REDUCE.to_vec()),
+        (outer, len, inner) in (1_usize..4, 1_usize..50, 1_usize..6),
+        seed in any::<u64>(),
+    ) {
+        let x = values(outer * len * inner, seed);
+        let axis = Axis { len, inner };
+        let (mut y, mut expected) = (vec![f32::NAN; outer * inner], vec![0.0; outer * inner]);
+        reduce(kind, &x, axis, &mut y);
+        naive::reduce(kind, &x, axis, &mut expected);
+        close(&y, &expected, 1e-5);
+    }
+
+    #[test]
+    fn matmul_equals_its_twin(
+        (batch, m, k, n) in (1_usize..4, 1_usize..5, 1_usize..20, 1_usize..20),
+        (a_transposed, b_transposed, broadcast) in any::<(bool, bool, bool)>(),
+        seed in any::<u64>(),
+    ) {
+        let product = MatMul {
+            batch,
+            m,
+            k,
+            n,
+            a_strides: if a_transposed { [m * k, 1, m] } else { [m * k, k, 1] },
+            b_strides: match (b_transposed, broadcast) {
+                (true, _) => [k * n, 1, k],
+                (false, true) => [0, n, 1],
+                (false, false) => [k * n, n, 1],
+            },
+        };
+        let (a, b) = (values(batch * m * k, seed), values(batch * k * n, seed ^ 1));
+        let (mut y, mut expected) = (vec![f32::NAN; batch * m * n], vec![0.0; batch * m * n]);
+        product.run(&a, &b, &mut y);
+        naive::matmul(&product, &a, &b, &mut expected);
+        close(&y, &expected, 1e-5);
+    }
+
+    #[test]
+    fn the_best_element_is_the_first_of_equal_ones(x in prop::collection::vec(-3_i8..4, 1..40)) {
+        let x: Vec<f32> = x.into_iter().map(f32::from).collect();
+        let first = |best: f32| x.iter().position(|&x| x == best);
+        prop_assert_eq!(Some(arg_max(&x)), first(x.iter().copied().fold(f32::MIN, f32::max)));
+        prop_assert_eq!(Some(arg_min(&x)), first(x.iter().copied().fold(f32::MAX, f32::min)));
+    }
+}
+
+/// Strides of a contiguous layout with `gap` between elements, 0 in the dimensions that are not kept.
+fn strides(dims: [usize; 4], keeps: [bool; 4], gap: usize) -> [usize; 4] {
+    let mut strides = [0; 4];
+    let mut stride = gap;
+    for i in (0..4).rev() {
+        if keeps[i] {
+            strides[i] = stride;
+            stride *= dims[i];
+        }
+    }
+    strides
+}
+
+#[test]
+fn what_is_not_a_number_is_passed_over_by_the_best_element() {
+    assert_eq!(arg_max(&[f32::NAN, 1.0, 2.0, f32::NAN]), 2);
+    assert_eq!(arg_min(&[f32::NAN, 1.0, 2.0]), 1);
+    assert_eq!((arg_max(&[f32::NAN]), arg_max(&[])), (0, 0));
+}
+
+#[test]
+fn weights_are_packed_in_panels_of_sixteen_outputs() {
+    // [k, n] = [2, 17]: two panels, the second with one output and zeros.
+    let w: Vec<f32> = (1..=34_u8).map(f32::from).collect();
+    let mut packed = vec![f32::NAN; packed_len(2, 17)];
+    pack(&w, 2, 17, &mut packed);
+    assert_eq!(packed.len(), 64);
+    assert_eq!(packed[..16], w[..16]);
+    assert_eq!(packed[16..32], w[17..33]);
+    assert_eq!((packed[32], packed[48]), (w[16], w[33]));
+    assert!(
+        packed[33..48]
+            .iter()
+            .chain(&packed[49..])
+            .all(|&w| w == 0.0)
+    );
+}
+
+/// Bits that must never change, on any target or at any optimisation level.
+#[test]
+fn results_have_the_same_bits_everywhere() {
+    fn digest(x: &[f32]) -> u64 {
+        x.iter().fold(0xcbf2_9ce4_8422_2325, |hash, x| {
+            (hash ^ u64::from(x.to_bits())).wrapping_mul(0x0100_0000_01b3)
+        })
+    }
+    let (k, n) = (128, 40);
+    let mut packed = vec![0.0; packed_len(k, n)];
+    pack(&values(k * n, 1), k, n, &mut packed);
+    let bias = values(n, 2);
+    let layer = Linear {
+        k,
+        n,
+        w: &packed,
+        bias: &bias,
+        activation: Activation::Tanh,
+        accumulate: false,
+    };
+    let mut y = vec![0.0; 3 * n];
+    layer.run(&values(3 * k, 3), &mut y);
+    let mut z = vec![0.0; 3 * n];
+    layer_norm(&y, &bias, &bias, 1e-5, &mut z);
+    let mut p = vec![0.0; 3 * n];
+    softmax(&z, n, &mut p);
+    let cache = values(50 * 64, 4);
+    let attention = Attention {
+        heads: 2,
+        head_dim: 32,
+        scale: 0.25,
+        q_stride: 64,
+        visible: 49,
+        cache_k: &cache,
+        cache_v: &cache,
+    };
+    let mut attended = vec![0.0; 128];
+    attention.run(&values(128, 5), &mut attended, &mut [0.0; 50]);
+    let digests = [&y, &z, &p, &attended].map(|x| digest(x));
+    let expected = [
+        0x05e1_b773_fda2_c929,
+        0xddf6_4acd_014e_4f1e,
+        0x370e_3ea7_0ba2_cda6,
+        0x52c6_1ccb_bf23_7a75,
+    ];
+    assert_eq!(digests, expected, "{digests:#x?}");
+}
