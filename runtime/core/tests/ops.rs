@@ -35,6 +35,7 @@ fn activation() -> impl Strategy<Value = Activation> {
     ]
 }
 
+#[expect(clippy::too_many_lines, reason = "one strategy per op")]
 fn op() -> impl Strategy<Value = Op> {
     use BinaryKind::{Add, Div, Max, Min, Mul, Pow, Sub};
     use UnaryKind::{
