@@ -23,6 +23,7 @@ class Segments:
     executed: torch.Tensor  # [N, H, A]
     lengths: torch.Tensor  # [N] valid steps
     rows: torch.Tensor  # [N] row of the batch it belongs to
+    starts: torch.Tensor  # [N] the step it starts at
     places: torch.Tensor  # [N] its number in that trajectory
     low_level_observations: torch.Tensor  # [N, H, O] what the low level is shown; see `Corpus.shown`
 
@@ -49,6 +50,7 @@ class Corpus:
         self.std = torch.from_numpy(np.maximum(seen.std(0, dtype=np.float64), config.data.std_floor).astype(np.float32))
         normed = lambda array: (torch.from_numpy(array) - self.mean) / self.std
         self.lengths = torch.from_numpy(dataset.lengths())
+        self.steps = int(self.lengths.max()) + self.horizon
         self.observations = self._padded(normed(dataset.observations), dataset)
         self.actions = self._padded(torch.from_numpy(dataset.actions), dataset)
         self.executed = self._padded(torch.from_numpy(dataset.executed), dataset)
@@ -65,8 +67,7 @@ class Corpus:
         self.weights = torch.tensor(weights)[self.instruction]
 
     def _padded(self, rows, dataset):
-        steps = int(self.lengths.max()) + self.horizon
-        out = rows.new_zeros(len(dataset), steps, rows.shape[1])
+        out = rows.new_zeros(len(dataset), self.steps, rows.shape[1])
         for episode in range(len(dataset)):
             out[episode, : self.lengths[episode]] = rows[dataset.rows(episode)]
         return out.to(self.device)
@@ -110,7 +111,7 @@ class Corpus:
         lengths = (self.lengths[episodes] - starts).clamp(max=self.horizon).to(self.device)
         at = episodes.to(self.device)[:, None], steps
         tensors = (table[at] for table in (self.observations, self.actions, self.executed))
-        return Segments(*tensors, lengths, rows.to(self.device), places.to(self.device), self.shown(*at))
+        return Segments(*tensors, lengths, rows.to(self.device), steps[:, 0], places.to(self.device), self.shown(*at))
 
     def every_window(self, episode):
         """The windows that start at each step of an episode."""
@@ -118,10 +119,9 @@ class Corpus:
         return self._windows(torch.full_like(starts, episode), starts, torch.zeros_like(starts), starts)
 
     @torch.no_grad()
-    def codes(self, encode):
-        """The code of the window that starts at each step, [E, T], -1 beyond an episode's end."""
-        out = torch.full(self.observations.shape[:2], -1, dtype=torch.long, device=self.device)
-        for episode in range(len(self.lengths)):
-            index = encode(self.every_window(episode))
-            out[episode, : len(index)] = index
+    def codes(self, encode, episodes):
+        """The code of the window that starts at each step of the episodes, [B, T], -1 beyond an episode's end."""
+        out = torch.full((len(episodes), self.steps), -1, dtype=torch.long, device=self.device)
+        for row, episode in enumerate(episodes):
+            out[row, : self.lengths[episode]] = encode(self.every_window(episode))
         return out

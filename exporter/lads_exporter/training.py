@@ -52,7 +52,10 @@ class Losses:
         return torch.randint(self.corpus.horizon, (len(episodes),), generator=generator)
 
     def plans(self, episodes, offsets):
-        """L_BC, the commitment term of L_VQ and L_align (equations 5, 6, 10), and the codes used."""
+        """L_BC, the commitment term of L_VQ and L_align (equations 5, 6, 10); and the segments' codes [B, T].
+
+        The code of a segment stands at the step at which it starts, -1 at all other steps.
+        """
         lads, segments = self.lads, self.corpus.segments(episodes, offsets)
         latents = lads.encoder(segments.observations, segments.executed, segments.lengths)
         plans, index, commitment = lads.codebook(latents)
@@ -61,7 +64,9 @@ class Losses:
         actions = lads.low_level(segments.low_level_observations[valid], each)
         losses = {"bc": F.mse_loss(actions, segments.actions[valid]), "commitment": commitment}
         losses["align"] = self._align(plans, segments, episodes)
-        return losses, index
+        codes = torch.full((len(episodes), self.corpus.steps), -1, dtype=torch.long, device=self.corpus.device)
+        codes[segments.rows, segments.starts] = index
+        return losses, codes
 
     def _align(self, plans, segments, episodes):
         if self.config.alignment.weight == 0:
@@ -74,24 +79,16 @@ class Losses:
         instruction = self.corpus.instruction[episodes].to(plans.device)
         return self.lads.alignment(sequence, valid, self.corpus.sentences[instruction], instruction)
 
-    def low_level(self, episodes, steps, plans):
-        """L_BC of single transitions [N] under given plans [N, D]."""
-        shown = self.corpus.shown(episodes, steps)
-        return {"bc": F.mse_loss(self.lads.low_level(shown, plans), self.corpus.actions[episodes, steps])}
-
-    def high_level(self, episodes, codes, counted):
-        """L_CE (equation 8): codes [B, T] of the windows that start at each step, `counted` [B, T] those that count.
-
-        Returns the loss and the accuracy.
-        """
+    def high_level(self, episodes, codes):
+        """L_CE (equation 8) and the accuracy; codes [B, T] are the targets, -1 where there is none."""
         corpus = self.corpus
         length = int(corpus.lengths[episodes].max())
         at = episodes.to(corpus.device)
         words = [self._some_words(corpus.words[i]) for i in corpus.instruction[episodes]]
         with torch.autocast(corpus.device.type, torch.bfloat16, enabled=self.autocast):
             logits = self.lads.high_level(words, corpus.observations[at, :length], corpus.executed[at, :length])
-        counted = counted[:, :length] & (codes[:, :length] >= 0)
-        logits, targets = logits[counted], codes[:, :length][counted]
+        codes = codes[:, :length]
+        logits, targets = logits[codes >= 0], codes[codes >= 0]
         return F.cross_entropy(logits, targets), (logits.argmax(-1) == targets).float().mean()
 
     def _some_words(self, words):
@@ -102,11 +99,6 @@ class Losses:
         keep = torch.rand(len(words), device=words.device) >= rate
         keep[-1] = True
         return words[keep]
-
-    def decisions(self, episodes, offsets, steps):
-        """[B, T]: the steps offset + kH at which a window of the segmentation starts."""
-        step = torch.arange(steps)
-        return ((step >= offsets[:, None]) & ((step - offsets[:, None]) % self.corpus.horizon == 0)).to(self.corpus.device)
 
     @torch.no_grad()
     def encode(self, segments):
@@ -152,7 +144,9 @@ class Stage:
         self.codes = None
         if name in ("low_level", "high_level"):
             self.lads.eval()
-            self.codes = self.corpus.codes(self.losses.encode)
+            self.codes = self.corpus.codes(self.losses.encode, range(len(self.corpus.lengths)))
+        if name == "high_level" and self.training.ce_at == "decisions":
+            self.codes[:, torch.arange(self.corpus.steps) % self.corpus.horizon > 0] = -1
         if name == "low_level":
             self._list_transitions()
 
@@ -176,9 +170,7 @@ class Stage:
             return self._low_level_loss(generator_of(step))
         if self.name == "high_level":
             episodes = self.corpus.draw_alike(self.settings.batch, step, generator_of)
-            offsets = torch.zeros(len(episodes), dtype=torch.long)
-            codes = self.codes[episodes.to(self.corpus.device)]
-            ce, _ = self.losses.high_level(episodes, codes, self._counted(episodes, offsets))
+            ce, _ = self.losses.high_level(episodes, self.codes[episodes.to(self.corpus.device)])
             return ce, {"ce": ce}
         return self._plans_loss(step, generator_of(step))
 
@@ -189,43 +181,26 @@ class Stage:
         episodes, steps = self.episodes[drawn], self.steps[drawn]
         starts = (steps - torch.randint(corpus.horizon, (batch,), generator=generator)).clamp(min=0)
         episodes, steps, starts = (x.to(corpus.device) for x in (episodes, steps, starts))
-        parts = self.losses.low_level(episodes, steps, self.lads.codebook.codes[self.codes[episodes, starts]])
-        return self.training.bc_weight * parts["bc"], parts
-
-    def _counted(self, episodes, offsets):
-        steps = self.corpus.observations.shape[1]
-        if self.training.ce_at == "all":
-            return torch.ones(len(episodes), steps, dtype=torch.bool, device=self.corpus.device)
-        return self.losses.decisions(episodes, offsets, steps)
+        plans = self.lads.codebook.codes[self.codes[episodes, starts]]
+        bc = F.mse_loss(self.lads.low_level(corpus.shown(episodes, steps), plans), corpus.actions[episodes, steps])
+        return self.training.bc_weight * bc, {"bc": bc}
 
     def _plans_loss(self, step, generator):
         if step == self.trainer.config.encoder.kmeans_step:
             self._start_codebook(generator)
         episodes = self.corpus.draw(self.settings.batch, generator)
         offsets = self.losses.offsets(episodes, generator)
-        parts, index = self.losses.plans(episodes, offsets)
+        parts, codes = self.losses.plans(episodes, offsets)
         total = self.training.bc_weight * parts["bc"] + parts["commitment"]
         total = total + self.trainer.config.alignment.weight * parts["align"]
         if self.lads.codebook.started:
-            parts["perplexity"] = perplexity(index, len(self.lads.codebook.codes))
+            parts["perplexity"] = perplexity(codes[codes >= 0], len(self.lads.codebook.codes))
             if self.name == "joint":
-                parts["ce"], _ = self.losses.high_level(episodes, *self._joint_targets(episodes, offsets))
+                if self.training.ce_at == "all":
+                    codes = self.corpus.codes(self.losses.encode, episodes.tolist())
+                parts["ce"], _ = self.losses.high_level(episodes, codes)
                 total = total + parts["ce"]
         return total, parts
-
-    def _joint_targets(self, episodes, offsets):
-        """Codes by the encoder as it stands, without gradient, at the steps that count."""
-        counted = self._counted(episodes, offsets)
-        codes = torch.full(counted.shape, -1, dtype=torch.long, device=counted.device)
-        if self.training.ce_at == "all":
-            for row, episode in enumerate(episodes.tolist()):
-                index = self.losses.encode(self.corpus.every_window(episode))
-                codes[row, : len(index)] = index
-        else:
-            segments = self.corpus.segments(episodes, offsets)
-            steps = offsets.to(codes.device)[segments.rows] + segments.places * self.corpus.horizon
-            codes[segments.rows, steps] = self.losses.encode(segments)
-        return codes, counted
 
     @torch.no_grad()
     def _start_codebook(self, generator):
@@ -238,19 +213,15 @@ class Stage:
     @torch.no_grad()
     def validate(self):
         """Losses on the held-out episodes, segmented from step 0."""
-        corpus, episodes, out = self.corpus, self.corpus.validation, {}
-        zeros = torch.zeros(len(episodes), dtype=torch.long)
+        episodes = self.corpus.validation
         self.lads.eval()
-        parts, index = self.losses.plans(episodes, zeros)
-        out["val_bc"] = float(parts["bc"])
+        parts, codes = self.losses.plans(episodes, torch.zeros(len(episodes), dtype=torch.long))
+        out = {"val_bc": float(parts["bc"])}
         if self.lads.codebook.started:
-            out["val_perplexity"] = perplexity(index, len(self.lads.codebook.codes))
-        if self.name in ("joint", "high_level") and self.lads.codebook.started:
-            codes = torch.full(corpus.observations[episodes].shape[:2], -1, dtype=torch.long, device=corpus.device)
-            segments = corpus.segments(episodes, zeros)
-            codes[segments.rows, segments.places * corpus.horizon] = index
-            ce, accuracy = self.losses.high_level(episodes, codes, codes >= 0)
-            out |= {"val_ce": float(ce), "val_accuracy": float(accuracy)}
+            out["val_perplexity"] = perplexity(codes[codes >= 0], len(self.lads.codebook.codes))
+            if self.name in ("joint", "high_level"):
+                ce, accuracy = self.losses.high_level(episodes, codes)
+                out |= {"val_ce": float(ce), "val_accuracy": float(accuracy)}
         return out
 
     def advance(self, step):
@@ -400,7 +371,7 @@ class Trainer:
 
     def _summarise(self, names):
         self.lads.eval()
-        codes = self.corpus.codes(self.losses.encode)
+        codes = self.corpus.codes(self.losses.encode, range(len(self.corpus.lengths)))
         starts = codes[:, :: self.corpus.horizon]
         last = {}
         for row in self.curves:
