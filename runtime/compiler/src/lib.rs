@@ -1,2 +1,43 @@
-//! ONNX bundle to program image.
+//! Compiles an ONNX bundle to a program image.
+//!
+//! ```text
+//! bundle ─► import ─► graph ─► fuse ─► lower ─► plan ─► verify ─► image
+//! ```
+//!
+//! A [`Bundle`] is one ONNX file that holds a whole policy: the entry graphs, a contract and a golden episode. [`compile`] makes it
+//! an [`Image`] that `lads-core` runs without allocating. Runs on the host and may allocate; what it reads may be hostile, so
+//! every error is a value that names the thing and the remedy.
+//!
+//! Operators of the default ONNX domain that are compiled (operator sets 13 to 21): Abs, Add, ArgMax, ArgMin, BatchNormalization,
+//! Cast, Clip, Concat, Constant, ConstantOfShape, Div, Dropout, Erf, Exp, Expand, Flatten, Gather, Gelu, Gemm, Identity, LSTM,
+//! LayerNormalization, LeakyRelu, Log, LogSoftmax, MatMul, Max, Min, Mul, Neg, Pow, Reciprocal, ReduceL1, ReduceL2, ReduceMax,
+//! ReduceMean, ReduceMin, ReduceProd, ReduceSum, ReduceSumSquare, Relu, Reshape, Shape, Sigmoid, Slice, Softmax, Split, Sqrt,
+//! Squeeze, Sub, Sum, Tanh, Transpose, Unsqueeze. Anything else is an error that names the operator, the node and the entry.
 #![forbid(unsafe_code)]
+
+mod access;
+mod bundle;
+mod compile;
+pub mod contract;
+mod entries;
+mod error;
+mod fuse;
+mod golden;
+mod graph;
+mod image;
+mod import;
+mod lower;
+mod onnx;
+mod plan;
+mod report;
+mod tensor;
+mod verify;
+
+pub use bundle::Bundle;
+pub use compile::compile;
+pub use contract::Contract;
+pub use error::{BundleError, CompileError};
+pub use golden::Golden;
+pub use image::Image;
+pub use report::{CompileReport, ProgramReport};
+pub use verify::PlanFault;

@@ -1,0 +1,161 @@
+//! Opening a bundle: one ONNX file with its contract, its golden episode and the entry graphs of a policy.
+//!
+//! A [`Bundle`] is checked as a whole before anything is compiled: the file is an ONNX model, its contract reads, every entry that
+//! a policy of its kind needs is there, and the shapes that the entries declare are those of the contract. Nothing is written.
+
+use std::path::Path;
+
+use bytes::Bytes;
+use prost::Message;
+use sha2::{Digest, Sha256};
+
+use crate::contract::Contract;
+use crate::entries;
+use crate::error::BundleError;
+use crate::golden::Golden;
+use crate::onnx::{self, GraphProto, ModelProto};
+
+/// How many instructions are offered when one is not known.
+const NEAREST: usize = 3;
+
+/// A policy as the exporter wrote it.
+#[derive(Debug, Clone)]
+pub struct Bundle {
+    contract: Contract,
+    golden: Golden,
+    sha256: String,
+    bytes: usize,
+    pub(crate) model: ModelProto,
+}
+
+impl Bundle {
+    /// Reads a file. Errors name it.
+    pub fn open(path: &Path) -> Result<Self, BundleError> {
+        let read = || Self::from_owned(std::fs::read(path)?.into());
+        read().map_err(|source| BundleError::File { path: path.into(), source: Box::new(source) })
+    }
+
+    /// Reads a file's content.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, BundleError> {
+        Self::from_owned(Bytes::copy_from_slice(bytes))
+    }
+
+    fn from_owned(bytes: Bytes) -> Result<Self, BundleError> {
+        let model = onnx::decode(&bytes)?;
+        let property = |key: &str| model.metadata_props.iter().find(|pair| pair.key == key).map(|pair| pair.value.as_str());
+        let contract = Contract::parse(property("lads.contract").ok_or(BundleError::NoContract)?)?;
+        let golden = property("lads.golden").ok_or_else(|| BundleError::Golden { problem: "missing from the model's metadata".into() })?;
+        let golden = Golden::parse(golden, &contract)?;
+        let graph = model.graph.as_ref().ok_or_else(|| BundleError::NotOnnx { problem: "it has no graph".into() })?;
+        entries::check(graph, &contract)?;
+        let sha256 = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+        Ok(Self { contract, golden, sha256, bytes: bytes.len(), model })
+    }
+
+    /// What the policy expects and promises.
+    pub fn contract(&self) -> &Contract {
+        &self.contract
+    }
+
+    /// The recorded episode.
+    pub fn golden(&self) -> &Golden {
+        &self.golden
+    }
+
+    /// SHA-256 of the file, hexadecimal.
+    pub fn sha256(&self) -> &str {
+        &self.sha256
+    }
+
+    /// Size of the file.
+    pub fn len_bytes(&self) -> usize {
+        self.bytes
+    }
+
+    /// The value of a metadata key, for example `action_scale`.
+    pub fn metadata(&self, key: &str) -> Option<&str> {
+        self.model.metadata_props.iter().find(|pair| pair.key == key).map(|pair| pair.value.as_str())
+    }
+
+    /// The entry graphs of the file, in the order of their first input.
+    pub fn entries(&self) -> Vec<&str> {
+        let mut found: Vec<&str> = vec![];
+        for value in &self.graph().input {
+            if let Some(entry) = entries::entry_of(&value.name)
+                && !found.contains(&entry)
+            {
+                found.push(entry);
+            }
+        }
+        found
+    }
+
+    /// One entry as an ONNX model of its own, the names as in the bundle: to run it with another runtime.
+    pub fn entry_onnx(&self, entry: &str) -> Result<Vec<u8>, BundleError> {
+        let graph = self.graph();
+        let prefix = format!("{entry}/");
+        let outputs: Vec<_> = graph.output.iter().filter(|value| value.name.starts_with(&prefix)).cloned().collect();
+        if outputs.is_empty() {
+            let problem = format!("entry {entry} is missing; the file has {}", self.entries().join(", "));
+            return Err(BundleError::Entry { problem });
+        }
+        let roots = outputs.iter().map(|value| value.name.as_str());
+        let node: Vec<_> = entries::needed(graph, roots).into_iter().cloned().collect();
+        let read: std::collections::HashSet<&str> = node.iter().flat_map(|node| &node.input).map(String::as_str).collect();
+        let own = GraphProto {
+            name: entry.into(),
+            initializer: graph.initializer.iter().filter(|tensor| read.contains(tensor.name.as_str())).cloned().collect(),
+            sparse_initializer: vec![],
+            input: graph.input.iter().filter(|value| value.name.starts_with(&prefix)).cloned().collect(),
+            output: outputs,
+            node,
+        };
+        let model = ModelProto { graph: Some(own), metadata_props: vec![], ..self.model.clone() };
+        Ok(model.encode_to_vec())
+    }
+
+    /// Index of the instruction with this id, or with this text up to case and white space.
+    pub fn instruction_index(&self, text_or_id: &str) -> Option<usize> {
+        let wanted = plain(text_or_id);
+        let known = &self.contract.instructions;
+        known
+            .iter()
+            .position(|known| known.id == text_or_id.trim())
+            .or_else(|| known.iter().position(|known| plain(&known.text) == wanted))
+    }
+
+    /// The known instructions that are most like a text, the best first.
+    pub fn nearest_instructions(&self, text: &str) -> Vec<&str> {
+        let wanted = plain(text);
+        let mut scored: Vec<(f64, &str)> = self
+            .contract
+            .instructions
+            .iter()
+            .map(|known| {
+                let by_text = strsim::normalized_damerau_levenshtein(&wanted, &plain(&known.text));
+                let by_id = strsim::normalized_damerau_levenshtein(&wanted, &plain(&known.id));
+                (by_text.max(by_id), known.text.as_str())
+            })
+            .collect();
+        scored.sort_by(|a, b| b.0.total_cmp(&a.0));
+        scored.into_iter().take(NEAREST).map(|(_, text)| text).collect()
+    }
+
+    pub(crate) fn graph(&self) -> &GraphProto {
+        static NONE: GraphProto = GraphProto {
+            node: vec![],
+            name: String::new(),
+            initializer: vec![],
+            sparse_initializer: vec![],
+            input: vec![],
+            output: vec![],
+        };
+        // Always there: opening the bundle asked for it.
+        self.model.graph.as_ref().unwrap_or(&NONE)
+    }
+}
+
+/// Lower case, single spaces.
+fn plain(text: &str) -> String {
+    text.to_lowercase().split_whitespace().collect::<Vec<_>>().join(" ")
+}

@@ -1,0 +1,106 @@
+//! What can go wrong with a bundle: one line that names the thing and says what to do about it.
+
+use std::path::PathBuf;
+
+use lads_core::PolicyError;
+
+/// Why a file is not a bundle that can be used.
+#[derive(Debug, thiserror::Error)]
+pub enum BundleError {
+    /// The file cannot be read.
+    #[error("cannot be read: {0}; check the path")]
+    Read(#[from] std::io::Error),
+    /// The file is something else.
+    #[error("not an ONNX model: {problem}; give the .onnx bundle that the exporter wrote")]
+    NotOnnx {
+        /// What does not fit.
+        problem: String,
+    },
+    /// The file ends too early.
+    #[error("truncated: {needed} bytes are needed, the file has {got}; copy or export it again")]
+    Truncated {
+        /// Bytes that the part before the end announces.
+        needed: u64,
+        /// Bytes that there are.
+        got: u64,
+    },
+    /// An ONNX model without a policy's contract.
+    #[error("no `lads.contract` in the model's metadata, so it is not a policy bundle; export it with the exporter of this project")]
+    NoContract,
+    /// A contract that another version of this crate reads.
+    #[error("the contract has version {found}, this program reads version {supported}; export the bundle again or use the matching release")]
+    ContractVersion {
+        /// Version in the file.
+        found: String,
+        /// Version that is read.
+        supported: u32,
+    },
+    /// A contract that misses something or contradicts itself.
+    #[error("contract: {problem}; export the bundle again")]
+    Contract {
+        /// The field and what is wrong with it.
+        problem: String,
+    },
+    /// A graph that contradicts the contract, or misses an entry.
+    #[error("{problem}; export the bundle again")]
+    Entry {
+        /// The value and the field.
+        problem: String,
+    },
+    /// The recorded episode does not read.
+    #[error("`lads.golden`: {problem}; export the bundle again")]
+    Golden {
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// One of the above, in a file.
+    #[error("{path}: {source}", path = path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: Box<BundleError>,
+    },
+}
+
+/// Why a bundle does not compile.
+#[derive(Debug, thiserror::Error)]
+pub enum CompileError {
+    /// An operator that the compiler does not know, or uses of a known one that it does not.
+    #[error("entry {entry}, node `{node}`: operator {operator} {problem}")]
+    Operator {
+        /// The entry, for example `high_level/step`.
+        entry: String,
+        /// The ONNX operator.
+        operator: String,
+        /// The node's name, or its first output's.
+        node: String,
+        /// What is not supported, and instead of what.
+        problem: String,
+    },
+    /// A value that is missing or has another shape than the contract says.
+    #[error("entry {entry}: {problem}; export the bundle again")]
+    Entry {
+        /// The entry.
+        entry: String,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// A memory plan that the verifier refused: a defect of this compiler.
+    #[error("program {program}: the memory plan is wrong ({fault}); this is a defect of the compiler, please report it with the bundle")]
+    Plan {
+        /// The program.
+        program: &'static str,
+        /// What the verifier found.
+        fault: crate::verify::PlanFault,
+    },
+    /// The policy is too large for an image, whose offsets have 32 bits.
+    #[error("{what} is too large for a program image, whose offsets have 32 bits; use a smaller network")]
+    TooLarge {
+        /// What is too large.
+        what: String,
+    },
+    /// The image that was made does not load: a defect of this compiler.
+    #[error("the compiled image does not load ({0}); this is a defect of the compiler, please report it with the bundle")]
+    Image(PolicyError),
+}

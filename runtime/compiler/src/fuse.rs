@@ -1,0 +1,82 @@
+//! Passes over the graph, each of which makes a new graph: attention over the cache, rows that nobody reads, linear layers.
+//!
+//! A pass changes how a value is computed, never which value it is, up to the rounding of folded scales.
+
+mod attention;
+mod linear;
+mod rows;
+
+use crate::entries::Signature;
+use crate::error::CompileError;
+use crate::graph::{Graph, Id, Op, topological};
+use crate::import::Entry;
+
+/// One entry, ready to be lowered.
+#[derive(Debug)]
+pub(crate) struct Fused {
+    pub graph: Graph,
+    /// All inputs, also those that nothing reads any more.
+    pub inputs: Vec<(String, Id)>,
+    /// The outputs that were asked for.
+    pub outputs: Vec<(String, Id)>,
+    /// `Record` nodes of the layers whose attention is not computed.
+    pub records: Vec<Id>,
+    /// Tokens that a run appends to the cache.
+    pub tokens: usize,
+}
+
+/// Fuses an entry of which only some outputs are wanted, besides the cache.
+pub(crate) fn fuse(entry: Entry, signature: &Signature, wanted: &[&str]) -> Result<Fused, CompileError> {
+    let name = signature.entry;
+    let refused = |problem| CompileError::Entry { entry: name.into(), problem };
+    let Entry { graph, inputs, outputs } = entry;
+    let cached = attention::fuse(graph, &inputs, &outputs).map_err(|fault| fault.named(name))?;
+    let kept: Vec<(String, Id)> = outputs.into_iter().filter(|(output, _)| wanted.contains(&output.as_str())).collect();
+    // The constants that a value needs are part of it; inputs are kept so that their ports stay known.
+    let mut fused = Fused { graph: cached.graph, inputs: cached.inputs, outputs: vec![], records: vec![], tokens: cached.tokens };
+    for (output, old) in kept {
+        let id = cached.copies.get(&old).copied().ok_or_else(|| refused(format!("output {output} reads the cache outside an attention")))?;
+        fused.outputs.push((output, id));
+    }
+    let roots: Vec<Id> = fused.outputs.iter().map(|&(_, id)| id).collect();
+    let live = live_attentions(&fused.graph, &roots, &cached.layers);
+    fused.records = cached.layers.iter().zip(live).filter(|(_, live)| !live).map(|(layer, _)| layer.record).collect();
+    let fused = rows::narrow(fused).map_err(refused)?;
+    let fused = linear::fuse(fused).map_err(refused)?;
+    attention::no_past_left(&fused, name)?;
+    Ok(fused)
+}
+
+/// Which layers' attention the roots and the recording of the other layers need.
+fn live_attentions(graph: &Graph, roots: &[Id], layers: &[attention::Layer]) -> Vec<bool> {
+    // A layer that only records needs the layers before it, so this is found from the last layer on.
+    let mut live = vec![false; layers.len()];
+    let mut roots = roots.to_vec();
+    for (i, layer) in layers.iter().enumerate().rev() {
+        let order = topological(graph, &roots, &std::collections::HashMap::new());
+        live[i] = order.iter().any(|&id| matches!(graph.op(id), Op::Attention { layer, .. } if *layer == i));
+        if !live[i] {
+            roots.push(layer.record);
+        }
+    }
+    live
+}
+
+impl Fused {
+    /// Everything that has to be computed.
+    pub fn roots(&self) -> Vec<Id> {
+        self.outputs.iter().map(|&(_, id)| id).chain(self.records.iter().copied()).collect()
+    }
+
+    /// The same entry in another graph; the ids are mapped.
+    fn mapped(self, graph: Graph, of: impl Fn(Id) -> Id) -> Self {
+        let named = |values: Vec<(String, Id)>| values.into_iter().map(|(name, id)| (name, of(id))).collect();
+        Self {
+            graph,
+            inputs: named(self.inputs),
+            outputs: named(self.outputs),
+            records: self.records.into_iter().map(&of).collect(),
+            tokens: self.tokens,
+        }
+    }
+}

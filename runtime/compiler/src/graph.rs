@@ -1,0 +1,277 @@
+//! The compiler's own graph: one node per value, in single assignment, built through constructors that simplify.
+//!
+//! Invariants:
+//! - a node's operands have smaller ids than the node itself, so a graph has no cycles;
+//! - equal nodes are the same node (constants excepted), so two spellings of one value compare equal by id;
+//! - whatever depends on constants only is itself a constant;
+//! - a reshape never follows a reshape, a transpose never a transpose, and transposes that move no element are reshapes.
+//!
+//! The only symbolic axis is the context length `P`, and a length is `n` or `P + n`.
+//! What can fail: constructors report a shape that does not fit as text, the importer adds the node.
+
+mod build;
+mod eval;
+mod rewrite;
+
+use std::collections::HashMap;
+use std::fmt;
+use std::hash::{Hash, Hasher};
+use std::sync::Arc;
+
+use lads_core::op::{BinaryKind, ReduceKind, UnaryKind};
+
+use crate::tensor::{Data, Tensor};
+
+pub(crate) use eval::evaluate;
+pub(crate) use rewrite::{Rewriter, topological};
+
+/// Length of an axis: `fixed`, or `P + fixed`.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+pub(crate) struct Dim {
+    pub fixed: usize,
+    pub past: bool,
+}
+
+impl Dim {
+    pub const fn of(fixed: usize) -> Self {
+        Self { fixed, past: false }
+    }
+
+    pub const fn past(fixed: usize) -> Self {
+        Self { fixed, past: true }
+    }
+
+    pub fn is_one(self) -> bool {
+        self == Self::of(1)
+    }
+
+    pub fn known(self) -> Option<usize> {
+        (!self.past).then_some(self.fixed)
+    }
+}
+
+impl fmt::Display for Dim {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match (self.past, self.fixed) {
+            (false, n) => write!(f, "{n}"),
+            (true, 0) => write!(f, "P"),
+            (true, n) => write!(f, "P+{n}"),
+        }
+    }
+}
+
+impl fmt::Debug for Dim {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        fmt::Display::fmt(self, f)
+    }
+}
+
+/// A shape for messages: `[1, P+2, 32]`.
+pub(crate) fn show(shape: &[Dim]) -> String {
+    format!("{shape:?}")
+}
+
+/// Element type of a value.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(crate) enum Type {
+    F32,
+    I64,
+}
+
+/// A node, and the value that it gives.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(crate) struct Id(u32);
+
+/// One of the core's enums as part of a key.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Kind<T>(pub T);
+
+impl Hash for Kind<BinaryKind> {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        (self.0 as u32).hash(state);
+    }
+}
+
+impl Hash for Kind<ReduceKind> {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        (self.0 as u32).hash(state);
+    }
+}
+
+impl Hash for Kind<UnaryKind> {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        (self.0 as u32).hash(state);
+    }
+}
+
+/// A non-linearity with its parameter, comparable bit for bit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(crate) struct Unary {
+    pub kind: Kind<UnaryKind>,
+    /// Slope of `LeakyRelu`, as bits.
+    pub alpha: u32,
+}
+
+impl Unary {
+    pub fn of(kind: UnaryKind) -> Self {
+        Self { kind: Kind(kind), alpha: 0 }
+    }
+}
+
+/// What a node computes. Floating-point attributes are kept as bits, so that nodes compare.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(crate) enum Op {
+    /// A value that the caller sets.
+    Input,
+    /// The constant of that number.
+    Const(usize),
+    /// Product over the last two axes, the others broadcast.
+    MatMul,
+    /// Elementwise, broadcast.
+    Binary(Kind<BinaryKind>),
+    /// Elementwise.
+    Unary(Unary),
+    /// Over the last axis.
+    Softmax,
+    /// Over one axis, which is removed.
+    Reduce(Kind<ReduceKind>, usize),
+    /// Of `x, gamma, beta` over the last axis.
+    LayerNorm { eps: u32 },
+    /// The same elements in another shape.
+    Reshape,
+    /// Axis `i` of the result is axis `perm[i]` of the operand.
+    Transpose(Vec<usize>),
+    /// `start..start + len` of an axis.
+    Slice { axis: usize, start: usize },
+    /// One operand after the other along an axis.
+    Concat { axis: usize },
+    /// Broadcast to a larger shape.
+    Expand,
+    /// Adds to an integer.
+    Shift(i64),
+    /// Rows of a constant `[rows, ..]` by an integer of one element; the result has shape `[..]`.
+    GatherRow,
+    /// Index of the first smallest or largest element of all, shape `[]`.
+    ArgMin,
+    /// See `ArgMin`.
+    ArgMax,
+    /// `x·W + b` over the last axis of `x`, operands `x, W [k, n]`, then `b [n]` if `bias`, then what it is added to if `residual`.
+    Linear { bias: bool, residual: bool, activation: Option<Unary> },
+    /// Causal attention of `q [queries, w]` over the cache of a layer after `k, v [tokens, w]` were appended; the result is `[queries, w]`.
+    Attention { layer: usize, heads: usize, scale: u32 },
+    /// Appends `k, v [tokens, w]` to the cache of a layer; gives nothing.
+    Record { layer: usize, heads: usize },
+}
+
+/// One node.
+#[derive(Debug, Clone)]
+pub(crate) struct Node {
+    pub op: Op,
+    pub inputs: Vec<Id>,
+    pub shape: Vec<Dim>,
+    pub ty: Type,
+    /// Index of the ONNX node that it came from, see [`Graph::origins`].
+    pub origin: usize,
+}
+
+type Key = (Op, Vec<Id>, Vec<Dim>, Type);
+
+/// A graph under construction; see the module.
+#[derive(Debug, Default)]
+pub(crate) struct Graph {
+    nodes: Vec<Node>,
+    consts: Vec<Arc<Tensor>>,
+    seen: HashMap<Key, Id>,
+    /// What the nodes came from: operator and name of ONNX nodes.
+    origins: Vec<(String, String)>,
+    /// The origin of the nodes that are built now.
+    current: usize,
+}
+
+impl Graph {
+    /// Says which ONNX node the nodes built from now on belong to.
+    pub fn set_origin(&mut self, operator: &str, name: &str) {
+        self.current = self.origins.len();
+        self.origins.push((operator.into(), name.into()));
+    }
+
+    /// Operator and name of the ONNX node that a node came from.
+    pub fn origin(&self, id: Id) -> (&str, &str) {
+        self.origins
+            .get(self.node(id).origin)
+            .map_or(("Input", ""), |(operator, name)| (operator, name))
+    }
+
+    pub fn node(&self, id: Id) -> &Node {
+        &self.nodes[id.0 as usize]
+    }
+
+    pub fn op(&self, id: Id) -> &Op {
+        &self.node(id).op
+    }
+
+    pub fn shape(&self, id: Id) -> &[Dim] {
+        &self.node(id).shape
+    }
+
+    pub fn ty(&self, id: Id) -> Type {
+        self.node(id).ty
+    }
+
+    /// The shape, if it does not depend on the context length.
+    pub fn known_shape(&self, id: Id) -> Option<Vec<usize>> {
+        self.shape(id).iter().map(|dim| dim.known()).collect()
+    }
+
+    /// The constant that a node is.
+    pub fn constant(&self, id: Id) -> Option<&Arc<Tensor>> {
+        match self.node(id).op {
+            Op::Const(number) => self.consts.get(number),
+            _ => None,
+        }
+    }
+
+    /// All ids, operands before users.
+    pub fn ids(&self) -> impl ExactSizeIterator<Item = Id> + use<> {
+        (0..self.nodes.len()).map(|i| Id(i as u32))
+    }
+
+    /// A value that the caller sets.
+    pub fn input(&mut self, name: &str, shape: &[Dim], ty: Type) -> Id {
+        self.set_origin("Input", name);
+        self.push(Op::Input, vec![], shape.to_vec(), ty)
+    }
+
+    /// A constant.
+    pub fn add_const(&mut self, tensor: Arc<Tensor>) -> Id {
+        let shape = tensor.shape.iter().map(|&dim| Dim::of(dim)).collect();
+        let ty = match tensor.data {
+            Data::F32(_) => Type::F32,
+            Data::I64(_) => Type::I64,
+        };
+        // The same initializer, read by several nodes, is one constant.
+        let number = self.consts.iter().position(|known| Arc::ptr_eq(known, &tensor)).unwrap_or_else(|| {
+            self.consts.push(tensor);
+            self.consts.len() - 1
+        });
+        self.add(Op::Const(number), vec![], shape, ty)
+    }
+
+    /// A node that is there already, or a new one.
+    fn add(&mut self, op: Op, inputs: Vec<Id>, shape: Vec<Dim>, ty: Type) -> Id {
+        let key = (op, inputs, shape, ty);
+        if let Some(&id) = self.seen.get(&key) {
+            return id;
+        }
+        let (op, inputs, shape, ty) = key.clone();
+        let id = self.push(op, inputs, shape, ty);
+        self.seen.insert(key, id);
+        id
+    }
+
+    fn push(&mut self, op: Op, inputs: Vec<Id>, shape: Vec<Dim>, ty: Type) -> Id {
+        let id = Id(self.nodes.len() as u32);
+        self.nodes.push(Node { op, inputs, shape, ty, origin: self.current });
+        id
+    }
+}

@@ -1,0 +1,193 @@
+//! ONNX to the compiler's graph: an entry is cut out of the bundle by its outputs and built node by node.
+//!
+//! Every attribute of every node is read or refused, and an operator without a translation is an error that names the
+//! operator, the node and the entry: nothing is ever dropped in silence. Shapes follow from the inputs; the only symbolic axis is
+//! the context length.
+
+mod attributes;
+mod operators;
+mod recurrent;
+mod shapes;
+
+use std::cell::RefCell;
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use crate::entries::{self, Signature};
+use crate::error::CompileError;
+use crate::graph::{Graph, Id, show};
+use crate::onnx::{GraphProto, ModelProto, NodeProto, TensorProto};
+use crate::tensor::Tensor;
+
+use attributes::Attributes;
+
+/// Operator sets that the translations were written for.
+const OPSETS: std::ops::RangeInclusive<i64> = 13..=21;
+
+/// The most nodes that an entry may have; an LSTM counts its steps.
+const MAX_NODES: usize = 1 << 16;
+
+/// The initializers of a model, read once each, so that entries share them.
+pub(crate) struct Model<'m> {
+    graph: &'m GraphProto,
+    opset: i64,
+    protos: HashMap<&'m str, &'m TensorProto>,
+    tensors: RefCell<HashMap<&'m str, Arc<Tensor>>>,
+}
+
+/// One entry as a graph.
+pub(crate) struct Entry {
+    pub graph: Graph,
+    /// By their short names, in the signature's order.
+    pub inputs: Vec<(String, Id)>,
+    pub outputs: Vec<(String, Id)>,
+}
+
+impl<'m> Model<'m> {
+    pub fn new(model: &'m ModelProto, graph: &'m GraphProto) -> Result<Self, CompileError> {
+        let refused = |problem| CompileError::Entry { entry: "(all)".into(), problem };
+        let default = model.opset_import.iter().find(|set| set.domain.is_empty() || set.domain == "ai.onnx");
+        let opset = default.map(|set| set.version).ok_or_else(|| refused("the model imports no ONNX operator set".into()))?;
+        if !OPSETS.contains(&opset) {
+            return Err(refused(format!("ONNX operator set {opset} is not supported, {} to {} are", OPSETS.start(), OPSETS.end())));
+        }
+        let protos = graph.initializer.iter().map(|tensor| (tensor.name.as_str(), tensor)).collect();
+        Ok(Self { graph, opset, protos, tensors: RefCell::default() })
+    }
+
+    fn initializer(&self, name: &str) -> Result<Option<Arc<Tensor>>, String> {
+        let Some((&name, &proto)) = self.protos.get_key_value(name) else {
+            return Ok(None);
+        };
+        if let Some(tensor) = self.tensors.borrow().get(name) {
+            return Ok(Some(tensor.clone()));
+        }
+        let tensor = Tensor::from_proto(proto).map_err(|problem| format!("initializer {name}: {problem}"))?;
+        self.tensors.borrow_mut().insert(name, tensor.clone());
+        Ok(Some(tensor))
+    }
+
+    /// Builds an entry. Inputs that are in `bindings` are constants.
+    pub fn import(&self, signature: &Signature, bindings: &HashMap<&str, Tensor>) -> Result<Entry, CompileError> {
+        let entry = signature.entry;
+        let refused = |problem| CompileError::Entry { entry: entry.into(), problem };
+        let full = |name: &str| format!("{entry}/{name}");
+        let mut builder = Builder { model: self, graph: Graph::default(), values: HashMap::new() };
+        let mut inputs = vec![];
+        for input in &signature.inputs {
+            let id = match bindings.get(input.name.as_str()) {
+                Some(tensor) => builder.graph.add_const(Arc::new(tensor.clone())),
+                None => builder.graph.input(&full(&input.name), &input.shape, input.ty),
+            };
+            builder.values.insert(full(&input.name), id);
+            inputs.push((input.name.clone(), id));
+        }
+        let roots: Vec<String> = signature.outputs.iter().map(|output| full(&output.name)).collect();
+        for node in entries::needed(self.graph, roots.iter().map(String::as_str)) {
+            builder.node(node).map_err(|problem| CompileError::Operator {
+                entry: entry.into(),
+                operator: node.op_type.clone(),
+                node: node_name(node).into(),
+                problem,
+            })?;
+            if builder.graph.ids().len() > MAX_NODES {
+                return Err(refused(format!("it has more than {MAX_NODES} operations")));
+            }
+        }
+        let mut outputs = vec![];
+        for output in &signature.outputs {
+            let name = full(&output.name);
+            let id = builder.value(&name).map_err(refused)?;
+            let (ty, shape) = (builder.graph.ty(id), builder.graph.shape(id));
+            if ty != output.ty || shape != output.shape {
+                let (found, wanted) = (show(shape), show(&output.shape));
+                return Err(refused(format!(
+                    "output {name} is {ty:?} {found}, by the contract's {} it is {:?} {wanted}",
+                    output.fields, output.ty
+                )));
+            }
+            outputs.push((output.name.clone(), id));
+        }
+        Ok(Entry { graph: builder.graph, inputs, outputs })
+    }
+}
+
+/// A node's name, or its first output's.
+fn node_name(node: &NodeProto) -> &str {
+    if node.name.is_empty() { node.output.first().map_or("", String::as_str) } else { &node.name }
+}
+
+/// The values of an entry that were built so far.
+struct Builder<'b, 'm> {
+    model: &'b Model<'m>,
+    graph: Graph,
+    values: HashMap<String, Id>,
+}
+
+impl Builder<'_, '_> {
+    fn value(&mut self, name: &str) -> Result<Id, String> {
+        if let Some(&id) = self.values.get(name) {
+            return Ok(id);
+        }
+        let tensor = self.model.initializer(name)?.ok_or_else(|| format!("value {name} is not computed by this entry"))?;
+        let id = self.graph.add_const(tensor);
+        self.values.insert(name.into(), id);
+        Ok(id)
+    }
+
+    fn node(&mut self, node: &NodeProto) -> Result<(), String> {
+        self.graph.set_origin(&node.op_type, node_name(node));
+        if !node.domain.is_empty() && node.domain != "ai.onnx" {
+            return Err(format!("of domain {} is not supported", node.domain));
+        }
+        let mut inputs = vec![];
+        for name in &node.input {
+            inputs.push(if name.is_empty() { None } else { Some(self.value(name)?) });
+        }
+        let attributes = Attributes::new(&node.attribute)?;
+        let given = node.output.iter().map(|name| !name.is_empty()).collect();
+        let operands = Operands { inputs, given, opset: self.model.opset };
+        let outputs = operators::translate(&mut self.graph, &node.op_type, &operands, &attributes)?;
+        attributes.all_read()?;
+        for (name, id) in node.output.iter().zip(outputs) {
+            if !name.is_empty() && self.values.insert(name.clone(), id).is_some() {
+                return Err(format!("gives {name}, which exists already"));
+            }
+        }
+        match node.output.iter().find(|name| !name.is_empty() && !self.values.contains_key(*name)) {
+            Some(missing) => Err(format!("does not support its output {missing}")),
+            None => Ok(()),
+        }
+    }
+}
+
+/// What a node reads.
+struct Operands {
+    inputs: Vec<Option<Id>>,
+    /// Which outputs have a name.
+    given: Vec<bool>,
+    opset: i64,
+}
+
+impl Operands {
+    fn get(&self, i: usize) -> Result<Id, String> {
+        self.optional(i).ok_or_else(|| format!("misses its input {i}"))
+    }
+
+    fn optional(&self, i: usize) -> Option<Id> {
+        self.inputs.get(i).copied().flatten()
+    }
+
+    /// All inputs, none of them left out.
+    fn all(&self) -> Result<Vec<Id>, String> {
+        (0..self.inputs.len()).map(|i| self.get(i)).collect()
+    }
+
+    /// Refuses inputs from `n` on.
+    fn at_most(&self, n: usize) -> Result<(), String> {
+        match self.inputs.iter().skip(n).any(Option::is_some) {
+            true => Err(format!("does not support its input {n}")),
+            false => Ok(()),
+        }
+    }
+}

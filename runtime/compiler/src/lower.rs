@@ -1,0 +1,323 @@
+//! Graph to ops: every value gets a place, every computing node its op.
+//!
+//! The arena is virtual here: each buffer has addresses of its own, so nothing overlaps by construction; the memory plan then
+//! moves the buffers together. Reshapes, transposes, slices and broadcasts are views and cost nothing where the op that reads
+//! them takes strides; the parts of a concatenation are computed where they belong.
+//!
+//! In place are: a residual that nobody else reads any more, and elementwise ops whose operand nobody else reads any more.
+
+mod compute;
+mod view;
+mod weights;
+
+use std::collections::{HashMap, HashSet};
+
+use lads_core::op::{self, IntSlot, Operand, Place, Port, Space, Span, StateSpan};
+
+use crate::contract::Contract;
+use crate::error::CompileError;
+use crate::fuse::Fused;
+use crate::graph::{Graph, Id, Op, Type, topological};
+
+use view::View;
+pub(crate) use weights::Weights;
+
+/// The largest virtual arena: 2 GiB.
+const MAX_VIRTUAL: u32 = 1 << 29;
+
+/// A program over a virtual arena.
+#[derive(Debug, Clone)]
+pub(crate) struct Lowered {
+    pub ops: Vec<op::Op>,
+    /// Spans of the virtual arena that move as a whole; together they cover every span of every op.
+    pub buffers: Vec<Span>,
+    pub inputs: Vec<(Port, Place)>,
+    pub outputs: Vec<(Port, Place)>,
+    pub tokens: usize,
+}
+
+/// Where the KV cache lies in the state: for each layer keys, then values, `[capacity, heads * head_dim]` each.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Cache {
+    capacity: usize,
+    layers: usize,
+    heads: usize,
+    head_dim: usize,
+}
+
+impl Cache {
+    /// Room for the longest instruction, the first observation and a pair of tokens for every later control step.
+    pub fn new(contract: &Contract) -> Self {
+        let network = contract.network;
+        let capacity = contract.context.words + 2 * contract.context.steps - 1;
+        Self { capacity, layers: network.layers, heads: network.heads, head_dim: network.head_dim }
+    }
+
+    fn width(&self) -> usize {
+        self.heads * self.head_dim
+    }
+
+    /// Elements of all layers.
+    pub fn len(&self) -> Option<u32> {
+        let layer = self.width().checked_mul(self.capacity)?.checked_mul(2)?;
+        u32::try_from(layer.checked_mul(self.layers)?).ok()
+    }
+
+    fn spans(&self, layer: usize) -> [StateSpan; 2] {
+        let len = (self.capacity * self.width()) as u32;
+        let offset = 2 * layer as u32 * len;
+        [StateSpan { offset, len }, StateSpan { offset: offset + len, len }]
+    }
+}
+
+/// Lowers an entry. `ports` names the ports of its inputs and outputs.
+pub(crate) fn lower(
+    entry: &str,
+    fused: &Fused,
+    ports: &[(&str, Port)],
+    cache: Cache,
+    weights: &mut Weights,
+) -> Result<Lowered, CompileError> {
+    let order = topological(&fused.graph, &fused.roots(), &HashMap::new());
+    let mut lowering = Lowering::new(fused, &order, cache, weights);
+    lowering.place_concatenations(&order);
+    lowering.inputs(&order, fused, ports);
+    for &id in &order {
+        lowering.node(id).map_err(|problem| {
+            let (operator, node) = fused.graph.origin(id);
+            CompileError::Operator { entry: entry.into(), operator: operator.into(), node: node.into(), problem }
+        })?;
+        for &input in &fused.graph.node(id).inputs {
+            if let Some(pending) = lowering.pending.get_mut(&input) {
+                *pending -= 1;
+            }
+        }
+    }
+    lowering.outputs(fused, ports).map_err(|problem| CompileError::Entry { entry: entry.into(), problem })?;
+    if lowering.end > MAX_VIRTUAL {
+        return Err(CompileError::TooLarge { what: format!("the working memory of {entry}") });
+    }
+    let Lowering { ops, buffers, input_ports, output_ports, .. } = lowering;
+    Ok(Lowered { ops, buffers, inputs: input_ports, outputs: output_ports, tokens: fused.tokens })
+}
+
+/// The port of a value at the edge.
+fn port_of(ports: &[(&str, Port)], name: &str) -> Option<Port> {
+    ports.iter().find(|(known, _)| *known == name).map(|&(_, port)| port)
+}
+
+/// An entry on its way to ops.
+struct Lowering<'a> {
+    g: &'a Graph,
+    weights: &'a mut Weights,
+    cache: Cache,
+    ops: Vec<op::Op>,
+    buffers: Vec<Span>,
+    /// End of the virtual arena; saturates.
+    end: u32,
+    views: HashMap<Id, View>,
+    /// Integers: slot, and what is added to it.
+    ints: HashMap<Id, (IntSlot, i64)>,
+    slots: u8,
+    /// Uses that are still to come; outputs count as one that never comes.
+    pending: HashMap<Id, usize>,
+    /// The nodes whose views lie in a buffer.
+    residents: Vec<Vec<Id>>,
+    /// Values that are computed inside a concatenation: buffer and offset.
+    placed: HashMap<Id, (usize, usize)>,
+    input_ports: Vec<(Port, Place)>,
+    output_ports: Vec<(Port, Place)>,
+}
+
+impl<'a> Lowering<'a> {
+    fn new(fused: &'a Fused, order: &[Id], cache: Cache, weights: &'a mut Weights) -> Self {
+        let mut pending: HashMap<Id, usize> = HashMap::new();
+        let uses = order.iter().flat_map(|&id| fused.graph.node(id).inputs.iter().copied());
+        for id in uses.chain(fused.outputs.iter().map(|&(_, id)| id)) {
+            *pending.entry(id).or_default() += 1;
+        }
+        Self {
+            g: &fused.graph,
+            weights,
+            cache,
+            ops: vec![],
+            buffers: vec![],
+            end: 0,
+            views: HashMap::new(),
+            ints: HashMap::new(),
+            slots: 0,
+            pending,
+            residents: vec![],
+            placed: HashMap::new(),
+            input_ports: vec![],
+            output_ports: vec![],
+        }
+    }
+
+    /// A buffer of its own.
+    fn buffer(&mut self, len: usize) -> usize {
+        let len = u32::try_from(len).unwrap_or(u32::MAX);
+        self.buffers.push(Span { offset: self.end, len });
+        self.residents.push(vec![]);
+        self.end = self.end.saturating_add(len);
+        self.buffers.len() - 1
+    }
+
+    /// The shape of a value; all are static by now.
+    fn shape(&self, id: Id) -> Result<Vec<usize>, String> {
+        self.g.known_shape(id).ok_or_else(|| "depends on the context length".into())
+    }
+
+    /// Decides which values are computed inside the buffer of a concatenation.
+    fn place_concatenations(&mut self, order: &[Id]) {
+        for &id in order {
+            let (Op::Concat { axis }, Type::F32) = (self.g.op(id), self.g.ty(id)) else { continue };
+            let Ok(shape) = self.shape(id) else { continue };
+            // The parts lie one after the other only if the axis is the first that is longer than one.
+            if shape[..*axis].iter().any(|&dim| dim != 1) || self.placed.contains_key(&id) {
+                continue;
+            }
+            let buffer = self.buffer(shape.iter().product());
+            self.placed.insert(id, (buffer, 0));
+            let mut offset = 0;
+            for &part in &self.g.node(id).inputs {
+                let len: usize = self.shape(part).map_or(0, |shape| shape.iter().product());
+                let mut source = part;
+                while *self.g.op(source) == Op::Reshape {
+                    source = self.g.node(source).inputs[0];
+                }
+                if self.computes(source) {
+                    self.placed.entry(source).or_insert((buffer, offset));
+                }
+                offset += len;
+            }
+        }
+    }
+
+    /// Whether a value is written by an op of its own or by the caller, and so can be written anywhere.
+    fn computes(&self, id: Id) -> bool {
+        let moves = matches!(
+            self.g.op(id),
+            Op::Const(_) | Op::Reshape | Op::Transpose(_) | Op::Slice { .. } | Op::Expand | Op::Concat { .. } | Op::Record { .. }
+        );
+        !moves && self.g.ty(id) == Type::F32
+    }
+
+    /// Gives a value a place: inside a concatenation, or a buffer of its own.
+    fn allocate(&mut self, id: Id, shape: &[usize]) -> View {
+        let (buffer, offset) = match self.placed.get(&id) {
+            Some(&place) => place,
+            None => (self.buffer(shape.iter().product()), 0),
+        };
+        View::contiguous(buffer, offset, shape)
+    }
+
+    /// Says where a value lies.
+    fn set(&mut self, id: Id, view: View) {
+        if let Some(buffer) = view.buffer() {
+            self.residents[buffer].push(id);
+        }
+        self.views.insert(id, view);
+    }
+
+    /// True when no later node reads the buffer, the node that is being lowered aside.
+    fn dies_here(&self, buffer: usize, at: Id) -> bool {
+        let reads = |id: Id| self.g.node(at).inputs.iter().filter(|&&input| input == id).count();
+        self.residents[buffer].iter().all(|&id| self.pending.get(&id).copied().unwrap_or(0) <= reads(id))
+    }
+
+    fn inputs(&mut self, order: &[Id], fused: &Fused, ports: &[(&str, Port)]) {
+        let needed: HashSet<Id> = order.iter().copied().collect();
+        for (name, id) in &fused.inputs {
+            let Some(port) = port_of(ports, name).filter(|_| needed.contains(id)) else { continue };
+            let place = if port.is_int() {
+                let slot = self.slot();
+                self.ints.insert(*id, (slot, 0));
+                Place::Int(slot)
+            } else {
+                let shape = self.g.known_shape(*id).unwrap_or_default();
+                let view = self.allocate(*id, &shape);
+                let place = Place::Span(self.span(&view, shape.iter().product()));
+                self.set(*id, view);
+                place
+            };
+            self.input_ports.push((port, place));
+        }
+    }
+
+    fn slot(&mut self) -> IntSlot {
+        self.slots += 1;
+        IntSlot(self.slots - 1)
+    }
+
+    fn outputs(&mut self, fused: &Fused, ports: &[(&str, Port)]) -> Result<(), String> {
+        for (name, id) in &fused.outputs {
+            let Some(port) = port_of(ports, name) else { continue };
+            let place = if port.is_int() {
+                match self.ints.get(id) {
+                    Some(&(slot, 0)) => Place::Int(slot),
+                    _ => return Err(format!("output {name} is no index that an operation gives")),
+                }
+            } else {
+                // A value that is an input or a constant is copied, so that outputs are the program's own.
+                let computed = self.views.get(id).is_some_and(|view| view.buffer().is_some()) && *self.g.op(*id) != Op::Input;
+                let span = if computed { self.contiguous(*id)? } else { self.copied(*id)? };
+                Place::Span(span)
+            };
+            self.output_ports.push((port, place));
+        }
+        if usize::from(self.slots) > op::INT_SLOTS {
+            return Err(format!("more than {} indices are computed", op::INT_SLOTS));
+        }
+        Ok(())
+    }
+
+    /// Elements of the arena, from the first of a view.
+    fn span(&self, view: &View, len: usize) -> Span {
+        let base = view.buffer().map_or(0, |buffer| self.buffers[buffer].offset);
+        Span { offset: base.saturating_add(view.offset as u32), len: len as u32 }
+    }
+
+    /// The view of a value; constants are put into the weights.
+    fn view(&mut self, id: Id) -> Result<View, String> {
+        if let Some(view) = self.views.get(&id) {
+            return Ok(view.clone());
+        }
+        let tensor = self.g.constant(id).cloned().ok_or("reads a value that was not computed")?;
+        let shape = self.shape(id)?;
+        if shape.contains(&0) {
+            return Err("reads an empty constant".into());
+        }
+        let span = self.weights.plain(&tensor)?;
+        let view = View::weights(span.offset as usize, &shape);
+        self.views.insert(id, view.clone());
+        Ok(view)
+    }
+
+    /// An operand of `len` elements from the first of a view.
+    fn operand(&self, view: &View, len: usize) -> Operand {
+        match view.buffer() {
+            Some(_) => self.span(view, len).into(),
+            None => Operand { space: Space::Weights, offset: view.offset as u32, len: len as u32 },
+        }
+    }
+
+    /// A value as contiguous elements of the arena: copied if it is not.
+    fn contiguous(&mut self, id: Id) -> Result<Span, String> {
+        let shape = self.shape(id)?;
+        let view = self.view(id)?;
+        if view.buffer().is_some() && view.is_contiguous(&shape) {
+            return Ok(self.span(&view, shape.iter().product()));
+        }
+        self.copied(id)
+    }
+
+    /// A contiguous copy in a buffer of its own.
+    fn copied(&mut self, id: Id) -> Result<Span, String> {
+        let shape = self.shape(id)?;
+        let buffer = self.buffer(shape.iter().product());
+        let to = View::contiguous(buffer, 0, &shape);
+        self.copy(id, &to, &shape)?;
+        Ok(self.span(&to, shape.iter().product()))
+    }
+}

@@ -1,0 +1,47 @@
+//! Sizes of what was compiled.
+
+use std::fmt;
+
+/// One program of an image.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ProgramReport {
+    /// For example `step_decide`.
+    pub name: &'static str,
+    /// The entry it was compiled from.
+    pub entry: &'static str,
+    /// Number of ops.
+    pub ops: usize,
+    /// Elements of arena that the memory plan needs.
+    pub arena_len: usize,
+    /// Largest sum of values that live at the same time: no plan needs less.
+    pub arena_lower_bound: usize,
+}
+
+/// What a compilation made.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CompileReport {
+    /// The programs, in the image's order.
+    pub programs: Vec<ProgramReport>,
+    /// Bytes of weights, tables and word embeddings, each content once.
+    pub weight_bytes: usize,
+    /// Elements of state that the KV cache takes.
+    pub cache_len: usize,
+}
+
+impl CompileReport {
+    /// Elements of arena that the largest program needs.
+    pub fn arena_len(&self) -> usize {
+        self.programs.iter().map(|program| program.arena_len).max().unwrap_or(0)
+    }
+}
+
+/// A table, one line per program.
+impl fmt::Display for CompileReport {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        writeln!(f, "{:<12} {:>5} {:>8} {:>8}", "program", "ops", "arena", "at least")?;
+        for program in &self.programs {
+            writeln!(f, "{:<12} {:>5} {:>8} {:>8}", program.name, program.ops, program.arena_len, program.arena_lower_bound)?;
+        }
+        write!(f, "weights {} bytes, KV cache {} elements", self.weight_bytes, self.cache_len)
+    }
+}

@@ -1,0 +1,170 @@
+//! Proves a memory plan, element by element, knowing nothing of how it was made.
+//!
+//! The program over the virtual arena, in which nothing overlaps, and the placed one are run side by side without computing:
+//! every write says which virtual element, in which generation, an element of the arena now holds; every read asks whether it
+//! still is the one meant. So if two values that are both still read overlapped, or something was read that nobody had written,
+//! some read would find something else. The ops themselves must be the same but for their offsets.
+
+use lads_core::op::{INT_SLOTS, Op, Place, Port, Span};
+
+use crate::access::{self, Access, each_span};
+use crate::lower::Lowered;
+use crate::plan::Placed;
+
+/// What is wrong with a memory plan.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum PlanFault {
+    /// The plan changed more of an op than its offsets, or the number of ops or ports.
+    #[error("op {op} is not the op that was planned")]
+    Changed {
+        /// Index of the op; the number of ops for a port.
+        op: usize,
+    },
+    /// An element outside the arena.
+    #[error("op {op} reaches element {element}, beyond the arena")]
+    Bounds {
+        /// Index of the op; the number of ops for a port.
+        op: usize,
+        /// The element.
+        element: usize,
+    },
+    /// An element is read that nobody wrote.
+    #[error("op {op} reads element {element}, which was never written")]
+    Unwritten {
+        /// Index of the op; the number of ops for an output.
+        op: usize,
+        /// The element.
+        element: usize,
+    },
+    /// An element is read after something else was written over it.
+    #[error("op {op} reads element {element} after it was overwritten")]
+    Overwritten {
+        /// Index of the op; the number of ops for an output.
+        op: usize,
+        /// The element.
+        element: usize,
+    },
+    /// An integer is read that nobody set.
+    #[error("op {op} reads an integer that was never set")]
+    Unset {
+        /// Index of the op; the number of ops for an output.
+        op: usize,
+    },
+}
+
+/// What an element of the arena holds: a virtual element and its generation. Generation 0 is nothing.
+type Content = (usize, u32);
+
+struct State {
+    /// How often each virtual element was written.
+    generations: Vec<u32>,
+    arena: Vec<Content>,
+    ints: [bool; INT_SLOTS],
+}
+
+/// Proves that the placed program computes what the program over the virtual arena does.
+pub(crate) fn verify(planned: &Lowered, placed: &Placed) -> Result<(), PlanFault> {
+    let end = planned.buffers.iter().map(|buffer| buffer.offset as usize + buffer.len as usize).max().unwrap_or(0);
+    let mut state = State { generations: vec![0; end], arena: vec![(0, 0); placed.arena_len as usize], ints: [false; INT_SLOTS] };
+    let last = planned.ops.len();
+    if placed.ops.len() != last {
+        return Err(PlanFault::Changed { op: last });
+    }
+    for (from, to) in ports(&planned.inputs, &placed.inputs, last)? {
+        state.port(from, to, last, State::write, &mut |ints, slot| {
+            ints[slot] = true;
+            Ok(())
+        })?;
+    }
+    for (i, (from, to)) in planned.ops.iter().zip(&placed.ops).enumerate() {
+        state.op(i, from, to)?;
+    }
+    for (from, to) in ports(&planned.outputs, &placed.outputs, last)? {
+        state.port(from, to, last, State::read, &mut |ints, slot| if ints[slot] { Ok(()) } else { Err(PlanFault::Unset { op: last }) })?;
+    }
+    Ok(())
+}
+
+/// The places of the same ports.
+fn ports(planned: &[(Port, Place)], placed: &[(Port, Place)], op: usize) -> Result<Vec<(Place, Place)>, PlanFault> {
+    let same = planned.len() == placed.len() && planned.iter().zip(placed).all(|(from, to)| from.0 == to.0);
+    if !same {
+        return Err(PlanFault::Changed { op });
+    }
+    Ok(planned.iter().zip(placed).map(|(from, to)| (from.1, to.1)).collect())
+}
+
+/// An op with all its offsets zero.
+fn without_offsets(op: &Op) -> Op {
+    let mut op = *op;
+    each_span(&mut op, &mut |span| span.offset = 0);
+    op
+}
+
+type Touch = fn(&mut State, usize, usize, usize) -> Result<(), PlanFault>;
+
+impl State {
+    fn read(&mut self, op: usize, planned: usize, element: usize) -> Result<(), PlanFault> {
+        let generation = self.generations.get(planned).copied().unwrap_or(0);
+        let content = *self.arena.get(element).ok_or(PlanFault::Bounds { op, element })?;
+        match generation {
+            0 => Err(PlanFault::Unwritten { op, element }),
+            _ if content == (planned, generation) => Ok(()),
+            _ => Err(PlanFault::Overwritten { op, element }),
+        }
+    }
+
+    fn write(&mut self, op: usize, planned: usize, element: usize) -> Result<(), PlanFault> {
+        let generation = self.generations.get_mut(planned).ok_or(PlanFault::Changed { op })?;
+        *generation += 1;
+        *self.arena.get_mut(element).ok_or(PlanFault::Bounds { op, element })? = (planned, *generation);
+        Ok(())
+    }
+
+    fn pairs(&mut self, op: usize, from: Access, to: Access, touch: Touch) -> Result<(), PlanFault> {
+        from.elements().zip(to.elements()).try_for_each(|(planned, element)| touch(self, op, planned, element))
+    }
+
+    fn op(&mut self, i: usize, from: &Op, to: &Op) -> Result<(), PlanFault> {
+        if without_offsets(from) != without_offsets(to) {
+            return Err(PlanFault::Changed { op: i });
+        }
+        let (reads_int, writes_int) = access::slots(from);
+        if reads_int.is_some_and(|slot| !self.ints[usize::from(slot.0)]) {
+            return Err(PlanFault::Unset { op: i });
+        }
+        for (from, to) in access::reads(from).into_iter().zip(access::reads(to)) {
+            self.pairs(i, from, to, Self::read)?;
+        }
+        let written: Vec<(Access, Access)> = access::writes(from).into_iter().zip(access::writes(to)).collect();
+        for &(from, to) in &written {
+            self.pairs(i, from, to, Self::write)?;
+        }
+        // What one op writes to two places must not be the same place.
+        for (from, to) in written {
+            self.pairs(i, from, to, Self::read)?;
+        }
+        if let Some(slot) = writes_int {
+            self.ints[usize::from(slot.0)] = true;
+        }
+        Ok(())
+    }
+
+    fn port(
+        &mut self,
+        from: Place,
+        to: Place,
+        last: usize,
+        touch: Touch,
+        int: &mut dyn FnMut(&mut [bool; INT_SLOTS], usize) -> Result<(), PlanFault>,
+    ) -> Result<(), PlanFault> {
+        match (from, to) {
+            (Place::Span(from), Place::Span(to)) if from.len == to.len => {
+                let elements = |span: Span| span.offset as usize..span.offset as usize + span.len as usize;
+                elements(from).zip(elements(to)).try_for_each(|(planned, element)| touch(self, last, planned, element))
+            }
+            (Place::Int(from), Place::Int(to)) if from == to => int(&mut self.ints, usize::from(to.0)),
+            _ => Err(PlanFault::Changed { op: last }),
+        }
+    }
+}
