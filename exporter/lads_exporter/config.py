@@ -130,11 +130,6 @@ def _build(kind, table, where):
     return kind(**values)
 
 
-def _one_of(value, allowed, name):
-    if value not in allowed:
-        raise UserError(f"{name} = {value!r}: must be one of {', '.join(allowed)}")
-
-
 def find(path):
     """The file itself, or the one of that name beside the package (so `configs/kitchen.toml` works anywhere)."""
     path = Path(path)
@@ -159,7 +154,7 @@ class Setting:
     config: Config
     environment: dict
     instructions: list  # of {id, text, sub_tasks, split}; seen first
-    atomic: dict  # sub-task -> phrase
+    tables: list  # what `from_tables` read, as plain data; stored in checkpoints
 
     @property
     def observation_len(self):
@@ -173,10 +168,14 @@ class Setting:
 def from_tables(table, environment, instructions, where):
     """Checks the three tables of a setting against each other."""
     config = _build(Config, table, str(where))
-    _one_of(config.decision, ("argmax", "sample"), "decision")
-    _one_of(config.beyond_context, ("restart", "refuse"), "beyond_context")
-    _one_of(config.training.schedule, ("joint", "staged"), "training.schedule")
-    _one_of(config.training.ce_at, ("all", "decisions"), "training.ce_at")
+    for name, value, allowed in (
+        ("decision", config.decision, ("argmax", "sample")),
+        ("beyond_context", config.beyond_context, ("restart", "refuse")),
+        ("training.schedule", config.training.schedule, ("joint", "staged")),
+        ("training.ce_at", config.training.ce_at, ("all", "decisions")),
+    ):
+        if value not in allowed:
+            raise UserError(f"{where}: {name} = {value!r}: must be one of {', '.join(allowed)}")
     if config.high_level.hidden % config.high_level.heads:
         raise UserError("high_level.hidden must be a multiple of high_level.heads")
     for key in ("id", "version", "control_period_s", "quaternion_order", "observation", "action"):
@@ -189,7 +188,7 @@ def from_tables(table, environment, instructions, where):
     for name in config.data.weights:
         if name not in known:
             raise UserError(f"data.weights names {name!r}, which is no instruction id of {config.instructions}")
-    return Setting(config, environment, rows, instructions.get("atomic", {}))
+    return Setting(config, environment, rows, [table, environment, instructions])
 
 
 def load(path):
@@ -203,12 +202,3 @@ def load(path):
             raise UserError(f"{path}: key {key!r} is missing")
         beside[key] = _parse(find(path.parent / name), parser)
     return from_tables(table, beside["environment"], beside["instructions"], path)
-
-
-def to_tables(setting):
-    """What `from_tables` reads, as plain JSON-able data; stored in checkpoints."""
-    strip = lambda row: {key: value for key, value in row.items() if key != "split"}
-    instructions = {"atomic": setting.atomic}
-    for split in ("seen", "unseen"):
-        instructions[split] = [strip(row) for row in setting.instructions if row["split"] == split]
-    return [dataclasses.asdict(setting.config), setting.environment, instructions]

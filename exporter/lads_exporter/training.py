@@ -249,7 +249,7 @@ class Trainer:
     def __init__(self, setting, dataset, encoded, out, device, seed):
         self.setting, self.config, self.out, self.seed = setting, setting.config, Path(out), seed
         self.identity = {
-            "tables": configuration.to_tables(setting),
+            "tables": setting.tables,
             "dataset_sha256": dataset.sha256,
             "language_sha256": encoded.sha256,
             "seed": seed,

@@ -1,5 +1,6 @@
 """Training on a tiny synthetic dataset: losses fall, a resumed run equals an uninterrupted one, the commands work."""
 
+import copy
 import csv
 import json
 import os
@@ -20,7 +21,7 @@ STEPS = {"joint": 150, "plans": 120, "low_level": 60, "high_level": 60}
 
 
 def setting_for(schedule, **training):
-    tables = config.to_tables(config.load("configs/tiny.toml"))
+    tables = copy.deepcopy(config.load("configs/tiny.toml").tables)
     tables[0]["training"] |= {"schedule": schedule, **training}
     tables[0]["encoder"]["kmeans_step"] = 30
     for name, steps in STEPS.items():
@@ -132,7 +133,7 @@ def test_fresh_noise_and_word_dropout(tmp_path):
     first, second = corpus.shown(*at), corpus.shown(*at)
     assert not torch.equal(first, second)
     assert ((first - corpus.states[at]).abs() <= corpus.noise + 1e-6).all()
-    tables = config.to_tables(trainer.setting)
+    tables = copy.deepcopy(trainer.setting.tables)
     tables[0]["data"]["word_dropout"] = 0.5
     losses = trainer.losses
     losses.config = config.from_tables(*tables, "test").config
@@ -162,7 +163,7 @@ def run_command(*arguments, folder=None):
 def test_commands_from_dataset_to_bundle(tmp_path):
     setting = config.load("configs/tiny.toml")
     data = synthetic.write(tmp_path / "tiny.safetensors", setting)
-    tables = config.to_tables(setting)
+    tables = setting.tables
     folder = config.find("configs/tiny.toml").resolve().parent
     short = (folder / "tiny.toml").read_text().replace("tiny.", f"{folder}/tiny.")
     for name in ("plans", "low_level", "high_level"):
@@ -212,7 +213,7 @@ def test_bad_input_ends_with_one_line(tmp_path, arguments, message):
 
 
 def test_unknown_and_missing_keys_are_named():
-    tables = config.to_tables(config.load("configs/tiny.toml"))
+    tables = copy.deepcopy(config.load("configs/tiny.toml").tables)
     tables[0]["encoder"]["horizn"] = 5
     with pytest.raises(UserError, match="horizn"):
         config.from_tables(*tables, "test")
