@@ -73,21 +73,6 @@ def _curves(folder):
     return lines
 
 
-def _plain(tables):
-    """A configuration as TOML-like lines, without the environment and the instructions."""
-    lines = []
-    for key, value in tables.items():
-        if isinstance(value, dict):
-            nested = [(name, inner) for name, inner in value.items() if isinstance(inner, dict) and key == "training"]
-            flat = {name: inner for name, inner in value.items() if (name, inner) not in nested}
-            lines += ["", f"[{key}]", *(f"{name} = {json.dumps(inner)}" for name, inner in flat.items())]
-            for name, inner in nested:
-                lines += [f"[{key}.{name}]", *(f"{k} = {json.dumps(v)}" for k, v in inner.items())]
-        else:
-            lines.append(f"{key} = {json.dumps(value)}")
-    return lines
-
-
 def write(folder, saved, sha256, results=None, beside=()):
     """The card as Markdown. `folder` is the run's, `saved` its checkpoint."""
     summary = json.loads((Path(folder) / SUMMARY).read_text(encoding="utf-8"))
@@ -117,8 +102,8 @@ def write(folder, saved, sha256, results=None, beside=()):
         "",
         "## Configuration",
         "",
-        "```toml",
-        *_plain(tables),
+        "```json",
+        json.dumps(tables, indent=1),
         "```",
         "",
     ]
