@@ -103,22 +103,22 @@ fn an_episode_through_c_is_the_controllers_episode() {
         .set_instruction(Instruction::Words(&words))
         .expect("two words are enough");
     // SAFETY: the controller and the words are alive.
-    assert_eq!(
-        unsafe { lads_set_words(c, words.as_ptr(), words.len()) },
-        Status::Ok
-    );
+    let status = unsafe { lads_set_words(c, words.as_ptr(), words.len()) };
+    assert_eq!(status, Status::Ok);
     for t in 0..30 {
         if t == 10 {
             expected
                 .set_instruction(Instruction::Id(1))
                 .expect("the instruction is known");
             // SAFETY: the controller is alive.
-            assert_eq!(unsafe { lads_set_instruction(c, 1) }, Status::Ok);
+            let status = unsafe { lads_set_instruction(c, 1) };
+            assert_eq!(status, Status::Ok);
         }
         if t == 20 {
             expected.reset();
             // SAFETY: the controller is alive.
-            assert_eq!(unsafe { lads_reset(c) }, Status::Ok);
+            let status = unsafe { lads_reset(c) };
+            assert_eq!(status, Status::Ok);
         }
         let observation = random.vec(3, 1.0);
         let (mut action, mut other, mut report) = ([0.0; 2], [0.0; 2], Report::default());
@@ -138,10 +138,8 @@ fn an_episode_through_c_is_the_controllers_episode() {
         let executed = random.vec(2, 1.0);
         expected.executed(&executed).expect("the action is sound");
         // SAFETY: the controller and the action are alive.
-        assert_eq!(
-            unsafe { lads_executed(c, executed.as_ptr(), 2) },
-            Status::Ok
-        );
+        let status = unsafe { lads_executed(c, executed.as_ptr(), 2) };
+        assert_eq!(status, Status::Ok);
     }
     // A null report is one that nobody wants.
     assert_eq!(step(c, &[0.0; 3], &mut [0.0; 2], null_mut()), Status::Ok);
@@ -202,17 +200,13 @@ fn the_self_test_passes_and_fails() {
     episode.actions[3] += 0.5;
     let mut host = Host::new(parts.image());
     // SAFETY: the controller is alive.
-    assert_eq!(
-        unsafe { lads_self_test(host.controller(), null_mut()) },
-        Status::SelfTestAction
-    );
+    let status = unsafe { lads_self_test(host.controller(), null_mut()) };
+    assert_eq!(status, Status::SelfTestAction);
     parts.golden = None;
     let mut host = Host::new(parts.image());
     // SAFETY: the controller is alive.
-    assert_eq!(
-        unsafe { lads_self_test(host.controller(), null_mut()) },
-        Status::NoGolden
-    );
+    let status = unsafe { lads_self_test(host.controller(), null_mut()) };
+    assert_eq!(status, Status::NoGolden);
 }
 
 #[test]
@@ -422,11 +416,10 @@ fn sampling_follows_the_seed() {
 
 #[test]
 fn every_status_has_a_text_of_its_own() {
-    // SAFETY: the text is a static string that ends in zero.
     let text = |status| {
-        unsafe { CStr::from_ptr(lads_status_text(status)) }
-            .to_str()
-            .expect("the text is ASCII")
+        // SAFETY: the text is a static string that ends in zero.
+        let text = unsafe { CStr::from_ptr(lads_status_text(status)) };
+        text.to_str().expect("the text is ASCII")
     };
     let mut texts: Vec<_> = Status::ALL
         .iter()
