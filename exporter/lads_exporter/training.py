@@ -360,14 +360,14 @@ class Trainer:
             self.stop = True
 
         try:
-            before = signal.signal(signal.SIGINT, handler)
-        except ValueError:  # not the main thread: nobody can press Ctrl-C here
-            yield
-            return
+            before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+        except ValueError:  # not the main thread: signals are somebody else's
+            before = {}
         try:
             yield
         finally:
-            signal.signal(signal.SIGINT, before)
+            for number, previous in before.items():
+                signal.signal(number, previous)
 
     def _summarise(self, names):
         self.lads.eval()

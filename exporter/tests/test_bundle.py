@@ -161,6 +161,12 @@ def test_golden_episode_replays_in_onnx_runtime(tiny):
     assert largest(actions, golden["actions"]) <= bundle.GOLDEN_TOLERANCE
 
 
+def test_the_same_policy_gives_the_same_bytes(tiny):
+    setting, encoded, _, model = tiny
+    again = random_policy.export(setting, encoded, 0)[1]
+    assert again.SerializeToString(deterministic=True) == model.SerializeToString(deterministic=True)
+
+
 def test_close_decisions_make_no_golden_episode(tiny):
     setting, encoded, lads, model = tiny
     contract = json.loads(properties(model)["lads.contract"])

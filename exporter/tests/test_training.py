@@ -4,6 +4,7 @@ import copy
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
 
@@ -116,6 +117,25 @@ def test_resumed_run_equals_an_uninterrupted_one(tmp_path, schedule, stop_at):
     assert resumed.run(resume=True, quiet=True)
     for (name, a), b in zip(whole.lads.state_dict().items(), resumed.lads.state_dict().values()):
         assert torch.equal(a, b), name
+
+
+def test_a_signal_ends_in_a_checkpoint(tmp_path):
+    trainer = trainer_for(tmp_path / "run", setting_for("joint"))
+    original = Stage.advance
+
+    def interrupted(stage, step):
+        if step == 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return original(stage, step)
+
+    Stage.advance = interrupted
+    try:
+        assert not trainer.run(quiet=True)
+    finally:
+        Stage.advance = original
+    saved = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
+    assert saved["position"] == {"stage": 0, "step": 4}
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
 def test_resume_refuses_another_configuration(tmp_path):
