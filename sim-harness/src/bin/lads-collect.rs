@@ -32,7 +32,7 @@ struct Arguments {
     #[arg(long, default_value = "v0")]
     noise: Noise,
     /// Largest standard deviation of the recovery noise on executed actions; 0 for none.
-    #[arg(long, default_value_t = 0.2)]
+    #[arg(long, default_value_t = 0.25)]
     recovery_noise: f64,
     /// Worker threads; all cores if not given.
     #[arg(long)]

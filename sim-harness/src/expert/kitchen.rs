@@ -224,7 +224,7 @@ impl Performer<'_> {
             let arm = handle(this) - anchor;
             pose(
                 handle(this) + 0.07 * vector(arm.y, -arm.x, 0.0).normalize(),
-                turned(0.5) * grasp(),
+                turned(0.8) * grasp(),
             )
         };
         self.grip_and_pull(
@@ -233,7 +233,7 @@ impl Performer<'_> {
                 contact: &|this| pose(handle(this) - 0.012 * inwards, rotation),
                 goal: &pull,
                 turned: &|this| -this.position(MICROWAVE),
-                done: &|this| this.position(MICROWAVE) < -0.70,
+                done: &|this| this.position(MICROWAVE) < -0.64,
                 width: 0.02,
             },
         )?;
@@ -277,7 +277,7 @@ impl Performer<'_> {
         };
         let progress = Progress::new(10);
         self.follow(Move::new(CLOSED, 0.02, 60), push, |this| {
-            kettle(this).y > 0.66 || progress.stalled(kettle(this).y)
+            kettle(this).y > 0.64 || progress.stalled(kettle(this).y)
         })?;
         self.retreat(CLOSED, vector(0.0, -0.15, 0.10))
     }
@@ -288,7 +288,7 @@ impl Performer<'_> {
         let turn = |this: &Self| -this.position(element);
         let start = centre + vector(0.0, -0.13, -0.13 * pitch.tan()) + 0.7 * self.jitter();
         self.transit(&pose(start, rolled(turn(self)) * rotation), OPEN, 0.15, 45)?;
-        let at = |angle: f64| pose(centre + vector(0.0, -0.033, 0.0), rolled(angle) * rotation);
+        let at = |angle: f64| pose(centre + vector(0.0, -0.02, 0.0), rolled(angle) * rotation);
         self.grip_and_pull(
             0.5,
             &Grip {
@@ -307,11 +307,11 @@ impl Performer<'_> {
         let centre = self.site("light_site") + 0.7 * self.jitter();
         let at = |x: f64, y: f64| pose(centre + vector(x, y, 0.0), grasp());
         self.transit(&at(0.075, -0.13), CLOSED, 0.15, 45)?;
-        self.approach(CLOSED, 0.025, 20, |_| at(0.060, -0.04))?;
+        self.approach(CLOSED, 0.02, 30, |_| at(0.05, -0.02))?;
         let progress = Progress::new(10);
         self.follow(
             Move::new(CLOSED, 0.0, 40),
-            |_| at(-0.12, -0.04),
+            |_| at(-0.12, -0.02),
             |this| {
                 let missed =
                     this.hand().position.x < centre.x - 0.03 && this.position(SWITCH) > -0.1;
@@ -322,11 +322,10 @@ impl Performer<'_> {
     }
 
     fn slide_cabinet(&mut self) -> Result<(), OutOfTime> {
-        let pitch = 30_f64.to_radians();
-        let rotation = pitched(pitch);
-        let backwards = vector(0.0, -pitch.cos(), -pitch.sin());
+        let rotation = grasp();
+        let backwards = vector(0.0, -1.0, 0.0);
         let site = self.site("slide_site");
-        let contact = vector(site.x - 0.07, site.y, 2.49) + 0.045 * backwards + self.jitter();
+        let contact = vector(site.x - 0.07, site.y, 2.49) + 0.03 * backwards + self.jitter();
         self.transit(
             &pose(contact + 0.15 * backwards, rotation),
             CLOSED,
@@ -342,7 +341,7 @@ impl Performer<'_> {
         };
         let progress = Progress::new(12);
         self.follow(Move::new(CLOSED, 0.0, 60).linear(0.8), push, |this| {
-            this.position(SLIDE) > 0.30 || progress.stalled(this.position(SLIDE))
+            this.position(SLIDE) > 0.24 || progress.stalled(this.position(SLIDE))
         })?;
         self.retreat(CLOSED, vector(-0.03, -0.13, 0.0))
     }
@@ -358,10 +357,10 @@ impl Performer<'_> {
         self.transit(&pose(start, rotation), OPEN, 0.15, 45)?;
         let pull = |this: &Self| {
             let ahead = anchor + turned(16_f64.to_radians()) * (handle(this) - anchor);
-            pose(ahead, turned(-0.4 + 0.8 * this.position(HINGE)) * rotation)
+            pose(ahead, turned(-0.8 + 0.8 * this.position(HINGE)) * rotation)
         };
         self.grip_and_pull(
-            0.7,
+            0.9,
             &Grip {
                 contact: &|this| {
                     let yaw = 0.5 * this.position(HINGE);
@@ -372,7 +371,7 @@ impl Performer<'_> {
                 },
                 goal: &pull,
                 turned: &|this| this.position(HINGE),
-                done: &|this| this.position(HINGE) > 1.22,
+                done: &|this| this.position(HINGE) > 1.19,
                 width: 0.02,
             },
         )?;
