@@ -1,3 +1,197 @@
-//! The `lads` command.
+//! The `lads` command: looks into a policy, compiles it, tests it on this machine, and drives it from a pipe. No simulator, no Python.
+//!
+//! Whatever is refused ends with one line on stderr that names the thing and the remedy, and with exit code 2. Files are written to a
+//! temporary file in the same folder and renamed when complete.
 #![forbid(unsafe_code)]
-fn main() {}
+
+mod act;
+mod inspect;
+mod line;
+mod model;
+mod refusal;
+mod self_test;
+
+use std::io::{self, ErrorKind, Write};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+use crate::model::Model;
+use crate::refusal::Refusal;
+
+/// Exit code of everything that was refused.
+const REFUSED: u8 = 2;
+
+/// Looks into, compiles, tests and drives LADS policies.
+#[derive(Debug, Parser)]
+#[command(version, about)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Prints contract, programs, and the sizes of image, workspace and weights
+    Inspect {
+        /// Bundle (.onnx) or compiled image (.lads)
+        model: PathBuf,
+        /// As one JSON object
+        #[arg(long)]
+        json: bool,
+    },
+    /// Compiles a bundle to a program image
+    Compile {
+        /// Bundle (.onnx)
+        model: PathBuf,
+        /// The image to write
+        #[arg(short, long)]
+        output: PathBuf,
+    },
+    /// Replays the policy's golden episode on this machine and compares plans and actions
+    SelfTest {
+        /// Bundle (.onnx) or compiled image (.lads)
+        model: PathBuf,
+    },
+    /// Answers each observation (a line of stdin: CSV or JSON array) with an action (a line of stdout)
+    ///
+    /// An empty line starts a new episode of the same instruction.
+    Act {
+        /// Bundle (.onnx) or compiled image (.lads)
+        #[arg(long)]
+        model: PathBuf,
+        /// What to do: the text or the id of an instruction that the policy knows
+        #[arg(long)]
+        instruction: String,
+        /// Append the index of the latent plan in force to every action
+        #[arg(long)]
+        plans: bool,
+        /// Sample plans from the policy's distribution instead of taking the likeliest
+        #[arg(long)]
+        sample: bool,
+        /// Seed of the sampling
+        #[arg(long, default_value_t = 0, requires = "sample")]
+        seed: u64,
+    },
+}
+
+fn main() -> ExitCode {
+    let arguments = match Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        Err(error) if error.use_stderr() => {
+            let text = error.to_string();
+            // The first paragraph is what is wrong; the rest is the usage.
+            let wrong = text.split("\n\n").next().unwrap_or_default();
+            eprintln!("{}; see lads --help", refusal::one_line(wrong));
+            return ExitCode::from(REFUSED);
+        }
+        Err(help) => {
+            // Help or version; a closed pipe is no failure.
+            let _ = help.print();
+            return ExitCode::SUCCESS;
+        }
+    };
+    match run(arguments.command) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(refusal) => {
+            eprintln!("error: {refusal}");
+            ExitCode::from(REFUSED)
+        }
+    }
+}
+
+fn run(command: Command) -> Result<(), Refusal> {
+    match command {
+        Command::Inspect { model, json } => {
+            let model = Model::open(&model)?;
+            let report = inspect::Report::of(&model)?;
+            if json {
+                print(&format!("{:#}\n", report.json()))
+            } else {
+                print(&report.to_string())
+            }
+        }
+        Command::Compile { model, output } => {
+            let model = Model::open(&model)?;
+            if !model.is_bundle() {
+                return Err(Refusal::new(
+                    model.path.display(),
+                    "it is a compiled image already",
+                    "give the bundle (.onnx)",
+                ));
+            }
+            write_file(&output, model.image())?;
+            print(&format!(
+                "{}: {} bytes\n",
+                output.display(),
+                model.image().len()
+            ))
+        }
+        Command::SelfTest { model } => {
+            let line = self_test::self_test(&Model::open(&model)?)?;
+            print(&format!("{line}\n"))
+        }
+        Command::Act {
+            model,
+            instruction,
+            plans,
+            sample,
+            seed,
+        } => {
+            let sample = sample.then_some(seed);
+            let request = act::Request {
+                instruction: &instruction,
+                plans,
+                sample,
+            };
+            act::act(
+                &Model::open(&model)?,
+                &request,
+                io::stdin().lock(),
+                io::stdout().lock(),
+            )
+        }
+    }
+}
+
+/// Prints to stdout; a reader that has left is no failure.
+fn print(text: &str) -> Result<(), Refusal> {
+    let mut stdout = io::stdout().lock();
+    match stdout
+        .write_all(text.as_bytes())
+        .and_then(|()| stdout.flush())
+    {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(Refusal::new(
+            "stdout",
+            error,
+            "connect it to a reader or a place with room",
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// Writes `bytes` to a temporary file beside `path` and renames it, so that a failure leaves what was there.
+fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Refusal> {
+    let folder = match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    };
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".lads-").suffix(".tmp");
+    // As `File::create` would: readable by all whom the umask lets.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    let written = builder.tempfile_in(folder).and_then(|mut file| {
+        file.write_all(bytes)?;
+        file.as_file().sync_all()?;
+        file.persist(path).map_err(|error| error.error)
+    });
+    written.map(drop).map_err(|error| {
+        Refusal::new(
+            path.display(),
+            error,
+            "name a file in an existing, writable folder",
+        )
+    })
+}

@@ -1,0 +1,137 @@
+//! `lads act`: the controller on a pipe. One observation per line of input, one action per line of output, flushed, in the same form.
+//!
+//! An empty line starts a new episode of the same instruction and is not answered. An observation that is refused ends the command with
+//! the number of its line; the lines before it have been answered.
+
+use std::io::{BufRead, ErrorKind, Write};
+
+use lads_core::{Controller, Decision, Instruction, Policy};
+
+use crate::line;
+use crate::model::{Memory, Model};
+use crate::refusal::Refusal;
+use crate::self_test;
+
+/// What to act on.
+pub struct Request<'r> {
+    /// Text or id of an instruction that the policy knows.
+    pub instruction: &'r str,
+    /// Append the index of the plan in force to every action.
+    pub plans: bool,
+    /// Sample plans, from the stream with this seed, instead of following the contract's rule.
+    pub sample: Option<u64>,
+}
+
+/// Answers `input` on `output` until it ends or nobody reads any more.
+pub fn act(
+    model: &Model,
+    request: &Request<'_>,
+    input: impl BufRead,
+    output: impl Write,
+) -> Result<(), Refusal> {
+    let policy = model.policy()?;
+    let instruction = model.instruction(request.instruction)?;
+    let mut memory = Memory::of(&policy);
+    let mut controller = memory.controller(&policy)?;
+    // A policy that answers differently on this machine is not let near a motor.
+    self_test::replay(model, &policy, &mut controller)?;
+    if let Some(seed) = request.sample {
+        controller.set_decision(sampling(&policy, seed));
+    }
+    controller
+        .set_instruction(Instruction::Id(instruction))
+        .map_err(|error| Refusal::new(model.path.display(), error, "export the bundle again"))?;
+    let mut pipe = Pipe {
+        policy,
+        controller,
+        plans: request.plans,
+    };
+    pipe.answer_all(input, output)
+}
+
+/// Sampling at the contract's temperature, or at 1 where the contract's rule is argmax.
+fn sampling(policy: &Policy<'_>, seed: u64) -> Decision {
+    let temperature = match policy.contract().decision() {
+        Decision::Sample { temperature, .. } => temperature,
+        Decision::Argmax => 1.0,
+    };
+    Decision::Sample { temperature, seed }
+}
+
+/// A controller between a reader and a writer.
+struct Pipe<'p, 'm> {
+    policy: Policy<'p>,
+    controller: Controller<'p, 'm>,
+    plans: bool,
+}
+
+impl Pipe<'_, '_> {
+    fn answer_all(
+        &mut self,
+        mut input: impl BufRead,
+        mut output: impl Write,
+    ) -> Result<(), Refusal> {
+        let mut observation = vec![0.0; self.policy.contract().observation_len()];
+        let mut action = vec![0.0; self.policy.contract().action_len()];
+        let (mut asked, mut answered) = (String::new(), String::new());
+        for number in 1_u64.. {
+            asked.clear();
+            let read = input.read_line(&mut asked).map_err(|error| {
+                Refusal::new(
+                    format_args!("input line {number}"),
+                    error,
+                    "send lines of UTF-8 text",
+                )
+            })?;
+            if read == 0 {
+                break;
+            }
+            if asked.trim().is_empty() {
+                self.controller.reset();
+                continue;
+            }
+            let plan = self.answer(&asked, &mut observation, &mut action);
+            let (form, plan) = plan.map_err(|wrong| self.refuse(number, &wrong))?;
+            line::format(form, &action, plan, &mut answered);
+            match output
+                .write_all(answered.as_bytes())
+                .and_then(|()| output.flush())
+            {
+                Err(error) if error.kind() == ErrorKind::BrokenPipe => break,
+                Err(error) => {
+                    return Err(Refusal::new(
+                        "output",
+                        error,
+                        "connect it to a reader or a place with room",
+                    ));
+                }
+                Ok(()) => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// One control step; on success the form of the line, and the plan where it was asked for.
+    fn answer(
+        &mut self,
+        asked: &str,
+        observation: &mut [f32],
+        action: &mut [f32],
+    ) -> Result<(line::Form, Option<u32>), String> {
+        let form = line::parse(asked, observation).map_err(|error| error.to_string())?;
+        let report = self
+            .controller
+            .step(observation, action)
+            .map_err(|error| error.to_string())?;
+        Ok((form, self.plans.then_some(report.plan.0)))
+    }
+
+    fn refuse(&self, number: u64, wrong: &str) -> Refusal {
+        let contract = self.policy.contract();
+        let remedy = format!(
+            "send {} finite numbers inside the contract's limits, which `lads inspect` lists",
+            contract.observation_len()
+        );
+        Refusal::new(format_args!("input line {number}"), wrong, remedy)
+    }
+}

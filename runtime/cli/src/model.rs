@@ -1,0 +1,164 @@
+//! A policy from a file, whichever of its two forms: the bundle (ONNX), which is compiled on the way, or a compiled program image.
+//!
+//! What can fail: the file cannot be read, is neither of the two, or is broken; each is one line with the remedy. A `Model` that was
+//! opened holds an image that was checked.
+
+use std::path::{Path, PathBuf};
+
+use lads_compiler::{Bundle, Image, compile};
+use lads_core::{Controller, KnownInstruction, Policy, Workspace};
+
+use crate::refusal::{Refusal, chain};
+
+/// How many known instructions are shown to one who asked for an unknown one.
+const SUGGESTIONS: usize = 3;
+
+/// Where the image comes from, and the image.
+enum Bytes {
+    /// Compiled from a bundle just now.
+    Compiled(Image),
+    /// Read from a file, in words for their alignment.
+    Read(Vec<u128>, usize),
+}
+
+/// A policy that was read, with its compiled image.
+pub struct Model {
+    /// Where it was read from.
+    pub path: PathBuf,
+    bytes: Bytes,
+}
+
+impl Model {
+    /// Reads and, where it is a bundle, compiles the policy at `path`.
+    pub fn open(path: &Path) -> Result<Self, Refusal> {
+        let file = std::fs::read(path).map_err(|error| {
+            Refusal::new(
+                path.display(),
+                error,
+                "name a bundle (.onnx) or a compiled image (.lads)",
+            )
+        })?;
+        let bytes = if file.starts_with(&lads_core::image::MAGIC.to_le_bytes()) {
+            aligned(&file)
+        } else {
+            let about = |error: &dyn std::error::Error| {
+                Refusal::with_remedy_inside(path.display(), chain(error))
+            };
+            let bundle = Bundle::from_bytes(&file).map_err(|error| about(&error))?;
+            Bytes::Compiled(compile(&bundle).map_err(|error| about(&error))?)
+        };
+        let model = Self {
+            path: path.to_owned(),
+            bytes,
+        };
+        let intact = model.policy()?.checksum_matches();
+        if !intact {
+            return Err(Refusal::new(
+                path.display(),
+                "its checksum does not match: it was changed after it was compiled",
+                "compile it again from its bundle",
+            ));
+        }
+        Ok(model)
+    }
+
+    /// Whether it was read from a bundle and compiled, not read as an image.
+    pub fn is_bundle(&self) -> bool {
+        matches!(self.bytes, Bytes::Compiled(_))
+    }
+
+    /// The compiled image.
+    pub fn image(&self) -> &[u8] {
+        match &self.bytes {
+            Bytes::Compiled(image) => image.as_bytes(),
+            Bytes::Read(words, len) => bytemuck::cast_slice(words).get(..*len).unwrap_or_default(),
+        }
+    }
+
+    /// The checked view on the image.
+    pub fn policy(&self) -> Result<Policy<'_>, Refusal> {
+        Policy::new_checked(self.image()).map_err(|error| {
+            Refusal::new(
+                self.path.display(),
+                error,
+                "compile it again from its bundle",
+            )
+        })
+    }
+
+    /// The number of the instruction with this id, or with this text up to case and white space.
+    pub fn instruction(&self, wanted: &str) -> Result<u32, Refusal> {
+        let contract = self.policy()?.contract();
+        let text = plain(wanted);
+        let is_it =
+            |known: KnownInstruction<'_>| known.id == wanted.trim() || plain(known.text) == text;
+        if let Some(number) = contract.instructions().position(is_it) {
+            return Ok(number as u32);
+        }
+        let likeness = |known: &str| strsim::normalized_damerau_levenshtein(&text, &plain(known));
+        let mut nearest: Vec<_> = contract
+            .instructions()
+            .map(|known| (likeness(known.text).max(likeness(known.id)), known))
+            .collect();
+        nearest.sort_by(|(a, _), (b, _)| b.total_cmp(a));
+        let nearest: Vec<_> = nearest
+            .iter()
+            .take(SUGGESTIONS)
+            .map(|(_, known)| format!("'{}' ({})", known.text, known.id))
+            .collect();
+        Err(Refusal::new(
+            format_args!("instruction '{wanted}'"),
+            "the policy does not know it",
+            format_args!("the nearest that it knows: {}", nearest.join(", ")),
+        ))
+    }
+}
+
+/// A text as it is compared: lower case, single spaces.
+fn plain(text: &str) -> String {
+    text.split_whitespace()
+        .collect::<Vec<_>>()
+        .join(" ")
+        .to_lowercase()
+}
+
+fn aligned(file: &[u8]) -> Bytes {
+    let mut words = vec![0_u128; file.len().div_ceil(size_of::<u128>())];
+    let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
+    for (to, &from) in bytes.iter_mut().zip(file) {
+        *to = from;
+    }
+    Bytes::Read(words, file.len())
+}
+
+/// The memory of one controller, as long as the policy asks for.
+pub struct Memory {
+    arena: Vec<f32>,
+    state: Vec<f32>,
+}
+
+impl Memory {
+    /// Allocates it.
+    pub fn of(policy: &Policy<'_>) -> Self {
+        Self {
+            arena: vec![0.0; policy.arena_len()],
+            state: vec![0.0; policy.state_len()],
+        }
+    }
+
+    /// A controller that works in it.
+    pub fn controller<'p, 'm>(
+        &'m mut self,
+        policy: &Policy<'p>,
+    ) -> Result<Controller<'p, 'm>, Refusal> {
+        let workspace =
+            Workspace::new(policy, &mut self.arena, &mut self.state).map_err(|error| {
+                Refusal::new(
+                    "the policy's workspace",
+                    error,
+                    "compile it again from its bundle",
+                )
+            })?;
+        Ok(Controller::new(*policy, workspace))
+    }
+}

@@ -1,0 +1,45 @@
+//! `lads self-test`: replays the policy's golden episode on this machine and compares plans and actions.
+
+use lads_core::{Controller, Policy};
+
+use crate::model::{Memory, Model};
+use crate::refusal::Refusal;
+
+/// Replays the golden episode and says in one line how it went; a policy without one is refused.
+pub fn self_test(model: &Model) -> Result<String, Refusal> {
+    let policy = model.policy()?;
+    let mut memory = Memory::of(&policy);
+    let mut controller = memory.controller(&policy)?;
+    match replay(model, &policy, &mut controller)? {
+        Some(line) => Ok(line),
+        None => Err(Refusal::new(
+            model.path.display(),
+            "it carries no golden episode, so nothing can be tested",
+            "export the bundle with one",
+        )),
+    }
+}
+
+/// Replays the golden episode, if there is one, and leaves the controller fresh.
+pub fn replay(
+    model: &Model,
+    policy: &Policy<'_>,
+    controller: &mut Controller<'_, '_>,
+) -> Result<Option<String>, Refusal> {
+    let Some(golden) = policy.golden() else {
+        return Ok(None);
+    };
+    let test = controller.self_test().map_err(|error| {
+        Refusal::new(
+            model.path.display(),
+            format_args!("the self-test failed: {error}"),
+            "do not run it on this machine; export and compile it again",
+        )
+    })?;
+    Ok(Some(format!(
+        "self-test passed: {} steps, all plans equal, largest difference of an action {:.1e} (tolerance {:.0e})",
+        test.steps,
+        test.largest_error,
+        golden.tolerance()
+    )))
+}

@@ -1,0 +1,429 @@
+//! The program `lads` itself, on the small bundle of the compiler's tests: what it answers, and everything that it refuses.
+
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+
+use lads_compiler::{Bundle, compile};
+use lads_core::{Golden, Policy};
+use serde_json::Value;
+
+fn tiny() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../compiler/tests/data/tiny.onnx")
+}
+
+/// Runs `lads` with `input` on its stdin.
+fn lads(arguments: &[&str], input: &str) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_lads"));
+    command
+        .args(arguments)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped());
+    let mut child = command.spawn().unwrap();
+    // A program that refused its arguments has closed its end.
+    let _ = child.stdin.take().unwrap().write_all(input.as_bytes());
+    child.wait_with_output().unwrap()
+}
+
+/// What `lads` prints when it succeeds.
+fn answer(arguments: &[&str], input: &str) -> String {
+    let output = lads(arguments, input);
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+    assert!(output.stderr.is_empty());
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// Exit code 2 and one line on stderr with all `parts`; returns what was on stdout.
+fn refused(arguments: &[&str], input: &str, parts: &[&str]) -> String {
+    let output = lads(arguments, input);
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{errors}");
+    assert_eq!(errors.lines().count(), 1, "{errors}");
+    assert!(
+        errors.starts_with("error: ") && !errors.contains("panicked"),
+        "{errors}"
+    );
+    for part in parts {
+        assert!(errors.contains(part), "'{part}' is not in: {errors}");
+    }
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn act<'a>(model: &'a str, rest: &[&'a str]) -> Vec<&'a str> {
+    [&["act", "--model", model, "--instruction", "dl"], rest].concat()
+}
+
+fn with_golden(use_it: impl FnOnce(&Policy<'_>, Golden<'_>)) {
+    let image = compile(&Bundle::open(&tiny()).unwrap()).unwrap();
+    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    use_it(&policy, policy.golden().unwrap());
+}
+
+fn csv(values: &[f32]) -> String {
+    values
+        .iter()
+        .map(f32::to_string)
+        .collect::<Vec<_>>()
+        .join(",")
+        + "\n"
+}
+
+fn numbers(line: &str) -> Vec<f32> {
+    line.trim_matches(['[', ']'])
+        .split(',')
+        .map(|number| number.parse().unwrap())
+        .collect()
+}
+
+/// A copy of the small bundle in which one text of its metadata is another of the same length.
+fn altered(folder: &Path, from: &str, to: &str) -> String {
+    assert_eq!(from.len(), to.len());
+    let mut bytes = fs::read(tiny()).unwrap();
+    let place = bytes
+        .windows(from.len())
+        .position(|window| window == from.as_bytes())
+        .unwrap();
+    bytes[place..place + to.len()].copy_from_slice(to.as_bytes());
+    let path = folder.join("altered.onnx");
+    fs::write(&path, bytes).unwrap();
+    path.to_str().unwrap().to_owned()
+}
+
+#[test]
+fn act_answers_the_golden_episode_in_either_form() {
+    let model = tiny().to_str().unwrap().to_owned();
+    with_golden(|policy, golden| {
+        let instruction = policy
+            .contract()
+            .instruction(golden.instruction() as usize)
+            .unwrap();
+        let arguments = [
+            "act",
+            "--model",
+            &model,
+            "--instruction",
+            instruction.text,
+            "--plans",
+        ];
+        let asked: String = golden
+            .steps()
+            .map(|(observation, _, _)| csv(observation))
+            .collect();
+        let answered = answer(&arguments, &asked);
+        assert_eq!(answered.lines().count(), golden.len());
+        for (line, (_, plan, action)) in answered.lines().zip(golden.steps()) {
+            let (got_plan, got) = numbers(line)
+                .split_last()
+                .map(|(&plan, got)| (plan, got.to_vec()))
+                .unwrap();
+            assert_eq!(got_plan, plan as f32);
+            assert_eq!(got.len(), action.len());
+            assert!(
+                got.iter()
+                    .zip(action)
+                    .all(|(a, b)| (a - b).abs() <= golden.tolerance()),
+                "{line}"
+            );
+        }
+        let in_json = |lines: &str| format!("[{}]\n", lines.trim().replace('\n', "]\n["));
+        assert_eq!(answer(&arguments, &in_json(&asked)), in_json(&answered));
+    });
+}
+
+#[test]
+fn every_line_is_answered_before_the_next_is_sent() {
+    let model = tiny().to_str().unwrap().to_owned();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_lads"));
+    let mut child = command
+        .args(act(&model, &[]))
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut asked = child.stdin.take().unwrap();
+    let mut answered = std::io::BufReader::new(child.stdout.take().unwrap());
+    for _ in 0..3 {
+        asked.write_all(b"0,0,0,0,0\n").unwrap();
+        let mut line = String::new();
+        std::io::BufRead::read_line(&mut answered, &mut line).unwrap();
+        assert_eq!(numbers(line.trim()).len(), 3);
+    }
+    drop(asked);
+    assert!(child.wait().unwrap().success());
+}
+
+#[test]
+fn an_empty_line_starts_a_new_episode() {
+    let model = tiny().to_str().unwrap().to_owned();
+    let episode = "0,0,0,0,0\n0.1,0,0.2,0,0\n0.2,0,0.3,0.5,0\n";
+    let once = answer(&act(&model, &["--plans"]), episode);
+    let twice = answer(&act(&model, &["--plans"]), &format!("{episode}\n{episode}"));
+    assert_eq!(twice, once.repeat(2));
+    // Without it the episode goes on: three steps are less than a horizon, so the second plan is drawn later.
+    let sample = |seed: u32, asked: &str| {
+        let seed = seed.to_string();
+        answer(
+            &act(&model, &["--plans", "--sample", "--seed", &seed]),
+            asked,
+        )
+    };
+    let two = format!("{episode}\n{episode}");
+    assert!((0..8).any(|seed| sample(seed, &two) != sample(seed, &episode.repeat(2))));
+}
+
+#[test]
+fn sampling_follows_its_seed() {
+    let model = tiny().to_str().unwrap().to_owned();
+    let asked = "0,0,0,0,0\n".repeat(60);
+    let sample = |seed: &str| {
+        answer(
+            &act(&model, &["--plans", "--sample", "--seed", seed]),
+            &asked,
+        )
+    };
+    assert_eq!(sample("3"), sample("3"));
+    assert_ne!(sample("3"), sample("4"));
+}
+
+#[test]
+fn a_compiled_image_does_what_its_bundle_does() {
+    let folder = tempfile::tempdir().unwrap();
+    let (model, image) = (tiny(), folder.path().join("tiny.lads"));
+    let (model, image) = (model.to_str().unwrap(), image.to_str().unwrap());
+    let said = answer(&["compile", model, "-o", image], "");
+    assert!(
+        said.contains("tiny.lads") && said.contains("bytes"),
+        "{said}"
+    );
+    assert_eq!(
+        fs::read_dir(folder.path()).unwrap().count(),
+        1,
+        "no temporary file stays"
+    );
+
+    let asked = "0,0,0,0,0\n0.1,0,0.2,0,0\n";
+    assert_eq!(
+        answer(&act(image, &["--plans"]), asked),
+        answer(&act(model, &["--plans"]), asked)
+    );
+    assert_eq!(
+        answer(&["self-test", image], ""),
+        answer(&["self-test", model], "")
+    );
+    let inspected = |path: &str| {
+        serde_json::from_str::<Value>(&answer(&["inspect", path, "--json"], "")).unwrap()
+    };
+    let (mut of_bundle, mut of_image) = (inspected(model), inspected(image));
+    assert_eq!(
+        (of_bundle["form"].take(), of_image["form"].take()),
+        ("bundle".into(), "image".into())
+    );
+    assert_ne!(of_bundle["file"].take(), of_image["file"].take());
+    assert_eq!(of_bundle, of_image);
+    refused(
+        &["compile", image, "-o", "x.lads"],
+        "",
+        &["tiny.lads", "already", "bundle"],
+    );
+}
+
+#[test]
+fn inspect_tells_what_the_contract_and_the_image_hold() {
+    let model = tiny().to_str().unwrap().to_owned();
+    let text = answer(&["inspect", &model], "");
+    let json: Value = serde_json::from_str(&answer(&["inspect", &model, "--json"], "")).unwrap();
+    with_golden(|policy, golden| {
+        let contract = policy.contract();
+        let names = contract
+            .observations()
+            .chain(contract.actions())
+            .map(|element| element.name);
+        for name in names.chain(contract.instructions().map(|known| known.text)) {
+            assert!(text.contains(name), "{name} is not in: {text}");
+        }
+        let sizes = &json["sizes"];
+        assert_eq!(sizes["image_bytes"], policy.image_bytes());
+        assert_eq!(
+            sizes["workspace_bytes"],
+            4 * (policy.arena_len() + policy.state_len())
+        );
+        assert_eq!(sizes["weights_bytes"], size_of_val(policy.weights()));
+        assert_eq!(json["golden_steps"], golden.len());
+    });
+    assert_eq!(json["contract"]["environment"]["id"], "tiny-bench");
+    assert_eq!(json["contract"]["observation"][2]["min"], -0.1);
+    assert_eq!(json["contract"]["control_period_s"], 0.05);
+    assert_eq!(json["entries"].as_array().unwrap().len(), 7);
+    for entry in [
+        "high_level/instruct",
+        "low_level/act",
+        "trajectory_encoder/encode",
+    ] {
+        assert!(text.contains(entry), "{entry} is not in: {text}");
+    }
+}
+
+#[test]
+fn self_test_passes_and_a_changed_golden_episode_fails() {
+    let model = tiny().to_str().unwrap().to_owned();
+    let said = answer(&["self-test", &model], "");
+    assert!(said.starts_with("self-test passed: 24 steps"), "{said}");
+
+    let folder = tempfile::tempdir().unwrap();
+    let image = folder.path().join("tiny.lads");
+    answer(&["compile", &model, "-o", image.to_str().unwrap()], "");
+    let mut bytes = fs::read(&image).unwrap();
+    // The last word of the image is the last action's last element.
+    let last = bytes.len() - 1;
+    bytes[last] ^= 0x40;
+    fs::write(&image, &bytes).unwrap();
+    refused(
+        &["self-test", image.to_str().unwrap()],
+        "",
+        &["tiny.lads", "checksum", "compile it again"],
+    );
+}
+
+#[test]
+fn bad_observations_are_refused_by_line() {
+    let model = tiny().to_str().unwrap().to_owned();
+    let arguments = act(&model, &[]);
+    let good = "0,0,0,0,0\n";
+    for (bad, parts) in [
+        ("0,0,0\n", ["line 3", "3 values", "5 finite"]),
+        ("0,0,0,nan,0\n", ["line 3", "value 4 is 'nan'", "inspect"]),
+        (
+            "[0,0,null,0,0]\n",
+            ["line 3", "value 3 is 'null'", "inspect"],
+        ),
+        ("0,0,0,0,inf\n", ["line 3", "value 5 is 'inf'", "inspect"]),
+        ("0,0,0,99,0\n", ["line 3", "99", "inspect"]),
+        ("hello\n", ["line 3", "1 values", "inspect"]),
+    ] {
+        let answered = refused(&arguments, &format!("{good}{good}{bad}{good}"), &parts);
+        assert_eq!(
+            answered.lines().count(),
+            2,
+            "the lines before it are answered"
+        );
+    }
+}
+
+#[test]
+fn unknown_instructions_show_the_nearest() {
+    let model = tiny().to_str().unwrap().to_owned();
+    let arguments = ["act", "--model", &model, "--instruction", "open the drower"];
+    refused(
+        &arguments,
+        "",
+        &["'open the drower'", "nearest", "'open the drawer' (d)"],
+    );
+    // Case and white space do not matter.
+    let arguments = [
+        "act",
+        "--model",
+        &model,
+        "--instruction",
+        " Open  the drawer",
+    ];
+    assert_eq!(answer(&arguments, "0,0,0,0,0\n").lines().count(), 1);
+}
+
+#[test]
+fn bad_files_are_refused_by_every_command() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let bytes = fs::read(tiny()).unwrap();
+    fs::write(path("text.onnx"), "no model at all\n").unwrap();
+    fs::write(path("half.onnx"), &bytes[..bytes.len() / 2]).unwrap();
+    fs::write(path("empty.onnx"), "").unwrap();
+    answer(
+        &[
+            "compile",
+            tiny().to_str().unwrap(),
+            "-o",
+            &path("whole.lads"),
+        ],
+        "",
+    );
+    let image = fs::read(path("whole.lads")).unwrap();
+    fs::write(path("half.lads"), &image[..image.len() / 2]).unwrap();
+    let cases = [
+        (path("none.onnx"), ["none.onnx", "No such file", "bundle"]),
+        (path("text.onnx"), ["text.onnx", "ONNX", "exporter"]),
+        (path("empty.onnx"), ["empty.onnx", "ONNX", "exporter"]),
+        (path("half.onnx"), ["half.onnx", "truncated", "again"]),
+        (
+            path("half.lads"),
+            ["half.lads", "bytes", "compile it again"],
+        ),
+        (
+            altered(folder.path(), "lads.contract", "some.contract"),
+            ["altered.onnx", "lads.contract", "export"],
+        ),
+    ];
+    for (model, parts) in cases {
+        let output = path("out.lads");
+        refused(&["inspect", &model], "", &parts);
+        refused(&["self-test", &model], "", &parts);
+        refused(&["compile", &model, "-o", &output], "", &parts);
+        refused(&act(&model, &[]), "", &parts);
+        assert!(!Path::new(&output).exists());
+    }
+    let newer = altered(
+        folder.path(),
+        r#"{"version": 1, "kind""#,
+        r#"{"version": 7, "kind""#,
+    );
+    refused(
+        &["inspect", &newer],
+        "",
+        &["altered.onnx", "version 7", "version 1"],
+    );
+}
+
+#[test]
+fn a_failed_compile_overwrites_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let output = folder.path().join("out.lads");
+    fs::write(&output, "from before").unwrap();
+    let broken = altered(folder.path(), "lads.contract", "some.contract");
+    refused(
+        &["compile", &broken, "-o", output.to_str().unwrap()],
+        "",
+        &["altered.onnx"],
+    );
+    assert_eq!(fs::read_to_string(&output).unwrap(), "from before");
+    let nowhere = folder.path().join("no/folder/out.lads");
+    let tiny = tiny();
+    for place in [nowhere.as_path(), folder.path()] {
+        let place = place.to_str().unwrap();
+        refused(
+            &["compile", tiny.to_str().unwrap(), "-o", place],
+            "",
+            &[place, "writable folder"],
+        );
+    }
+}
+
+#[test]
+fn bad_arguments_are_one_line() {
+    refused(
+        &["act", "--model", "m.onnx"],
+        "",
+        &["--instruction", "--help"],
+    );
+    refused(&["dance"], "", &["dance", "--help"]);
+    refused(
+        &["act", "--model", "m", "--instruction", "x", "--seed", "3"],
+        "",
+        &["--sample"],
+    );
+    assert!(answer(&["--help"], "").contains("self-test"));
+}
