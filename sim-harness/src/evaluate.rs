@@ -2,7 +2,7 @@
 //!
 //! Each thread has its own environment and its own controller and takes the next episode from one queue. Every episode draws from streams
 //! of its own (seed, instruction, episode), and results are put in the order of the queue, so scheduling cannot show. What can fail: an
-//! environment that does not open, an episode that does not finish; then all threads stop after their current episode.
+//! episode that does not finish; then all threads stop after their current episode.
 
 use std::panic::resume_unwind;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -45,10 +45,7 @@ pub struct Evaluation<'e> {
 
 /// Why an evaluation gave no result.
 #[derive(Debug, Error)]
-pub enum EvaluationError<E> {
-    /// An environment could not be opened.
-    #[error("{0}")]
-    Environment(E),
+pub enum EvaluationError {
     /// The policy's own numbers do not add up.
     #[error("the policy's workspace is too small: {0}")]
     Workspace(WorkspaceTooSmall),
@@ -94,16 +91,12 @@ impl Evaluation<'_> {
     }
 
     /// Runs all episodes. `open` makes one environment per thread, `finished` is called after each episode, `stop` ends the work early.
-    pub fn run<E, O>(
+    pub fn run(
         &self,
-        open: O,
+        open: &(dyn Fn() -> Box<dyn Environment> + Sync),
         stop: &AtomicBool,
         finished: &(dyn Fn() + Sync),
-    ) -> Result<Evaluated, EvaluationError<E>>
-    where
-        E: Send,
-        O: Fn() -> Result<Box<dyn Environment>, E> + Sync,
-    {
+    ) -> Result<Evaluated, EvaluationError> {
         let queue = AtomicUsize::new(0);
         // Raised by a thread that failed, so that the others do not work for nothing.
         let failed = AtomicBool::new(false);
@@ -113,7 +106,7 @@ impl Evaluation<'_> {
             (place < self.len()).then_some(place)
         };
         let work = || {
-            let done = self.worker(&open, &next, finished);
+            let done = self.worker(open, &next, finished);
             failed.fetch_or(done.is_err(), Ordering::Relaxed);
             done
         };
@@ -146,19 +139,16 @@ impl Evaluation<'_> {
         Ok(Evaluated { episodes, timing })
     }
 
-    fn worker<E, O>(
+    fn worker(
         &self,
-        open: &O,
+        open: &dyn Fn() -> Box<dyn Environment>,
         next: &dyn Fn() -> Option<usize>,
         finished: &dyn Fn(),
-    ) -> Result<Share, EvaluationError<E>>
-    where
-        O: Fn() -> Result<Box<dyn Environment>, E>,
-    {
-        let mut environment = open().map_err(EvaluationError::Environment)?;
+    ) -> Result<Share, EvaluationError> {
+        let mut environment = open();
         let mut memory = Memory::of(&self.policy);
         let controller = memory
-            .controller(self.policy)
+            .controller(&self.policy)
             .map_err(EvaluationError::Workspace)?;
         let mut driver = Driver::new(controller, environment.as_mut());
         let mut episodes = Vec::new();

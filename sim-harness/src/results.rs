@@ -1,4 +1,4 @@
-//! What `lads-run` reports: rollouts summed up per instruction and per split, and their JSON form (documented in RESULTS.md).
+//! What `lads-run` reports: rollouts summed up per instruction and per split, and their JSON form (documented in results.schema.json).
 //!
 //! Invariants: the order is the contract's order of instructions and then of episodes, whatever the thread count; everything but
 //! `latency_us` and `time` depends only on bundle, seed, noise, decision and versions. Writing goes to a temporary file beside the target

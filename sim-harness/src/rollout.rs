@@ -112,10 +112,10 @@ impl Memory {
     /// A controller that works in this memory.
     pub fn controller<'p, 'm>(
         &'m mut self,
-        policy: Policy<'p>,
+        policy: &Policy<'p>,
     ) -> Result<Controller<'p, 'm>, WorkspaceTooSmall> {
-        let workspace = Workspace::new(&policy, &mut self.arena, &mut self.state)?;
-        Ok(Controller::new(policy, workspace))
+        let workspace = Workspace::new(policy, &mut self.arena, &mut self.state)?;
+        Ok(Controller::new(*policy, workspace))
     }
 }
 

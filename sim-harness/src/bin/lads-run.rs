@@ -1,0 +1,325 @@
+//! `lads-run`: drives a bundle's policy through the simulated environment that its contract names, and reports success rates and latency.
+//!
+//! Everything that can be wrong is looked at before the first episode: arguments, the place for the JSON, the bundle, its golden episode,
+//! the instruction, the assets, and whether contract and environment fit. Any of it ends with one line on stderr and exit code 2; an
+//! interrupt ends with exit code 130. Files are written only after the last episode, to a temporary file that is then renamed.
+#![forbid(unsafe_code)]
+
+use std::collections::BTreeMap;
+use std::fmt::Display;
+use std::io::{ErrorKind, Write as _};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use clap::Parser;
+use indicatif::{ProgressBar, ProgressStyle};
+use lads_compiler::{Bundle, compile};
+use lads_core::{Decision, Policy};
+use lads_sim::environment::Environment;
+use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError};
+use lads_sim::results::{self, InstructionResult, Results};
+use lads_sim::rollout::Memory;
+use lads_sim::table::Table;
+use lads_sim::{assets, fit, registry};
+
+/// Exit code of everything that was refused.
+const REFUSED: u8 = 2;
+/// Exit code after an interrupt, as shells have it: 128 and the signal's number.
+const INTERRUPTED: u8 = 130;
+
+/// Runs a policy bundle in simulation over its instructions; prints success rates and control-step latency.
+#[derive(Debug, Parser)]
+#[command(version, about)]
+struct Arguments {
+    /// The policy bundle (ONNX)
+    #[arg(long)]
+    model: PathBuf,
+    /// Run only this instruction, by its text or its id
+    #[arg(long)]
+    instruction: Option<String>,
+    /// Episodes of each instruction
+    #[arg(long, default_value_t = 2)]
+    episodes: u32,
+    /// Seed of all random streams; the same seed gives the same episodes on any number of threads
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Observation noise: v0 (D4RL's), v1 (Gymnasium-Robotics') or none
+    #[arg(long, default_value = "v0")]
+    noise: String,
+    /// Threads; left out, one per core
+    #[arg(long)]
+    threads: Option<usize>,
+    /// Sample plans from the policy's distribution instead of taking the likeliest
+    #[arg(long)]
+    sample: bool,
+    /// Write the results to this file as JSON (its form: sim-harness/results.schema.json)
+    #[arg(long)]
+    json: Option<PathBuf>,
+}
+
+/// How a run ends early.
+enum End {
+    /// With a line that names the thing and the remedy.
+    Refused(String),
+    /// By an interrupt.
+    Interrupted,
+}
+
+fn refused(line: impl Display) -> End {
+    End::Refused(line.to_string())
+}
+
+fn main() -> ExitCode {
+    let arguments = match Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        Err(error) if error.use_stderr() => {
+            let text = error.to_string();
+            // The first paragraph is what is wrong; the rest is the usage.
+            let wrong = text.split("\n\n").next().unwrap_or_default();
+            eprintln!("{}; see lads-run --help", one_line(wrong));
+            return ExitCode::from(REFUSED);
+        }
+        Err(help) => {
+            // Help or version; a closed pipe is no failure.
+            let _ = help.print();
+            return ExitCode::SUCCESS;
+        }
+    };
+    match run(&arguments) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(End::Interrupted) => {
+            eprintln!("interrupted: no results written");
+            ExitCode::from(INTERRUPTED)
+        }
+        Err(End::Refused(line)) => {
+            eprintln!("error: {}", one_line(&line));
+            ExitCode::from(REFUSED)
+        }
+    }
+}
+
+/// Whatever the errors underneath contain: one line.
+fn one_line(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+fn run(arguments: &Arguments) -> Result<(), End> {
+    let stop = stop_on_interrupt()?;
+    let threads = check_numbers(arguments)?;
+    if let Some(path) = &arguments.json {
+        drop(results::temporary_beside(path).map_err(|error| unwritable(path, &error))?);
+    }
+
+    let about = |wrong: &dyn Display| refused(format!("{}: {wrong}", arguments.model.display()));
+    let bundle = Bundle::open(&arguments.model).map_err(refused)?;
+    let image = compile(&bundle).map_err(|error| about(&error))?;
+    let policy = Policy::new_checked(image.as_bytes())
+        .map_err(|error| about(&format_args!("{error}; export the bundle again")))?;
+    let chosen = choose(&bundle, arguments.instruction.as_deref())?;
+    self_test(&policy).map_err(|wrong| about(&wrong))?;
+
+    let contract = policy.contract();
+    let open = registry::load(
+        contract.environment_id(),
+        &arguments.noise,
+        &assets::vendor_dir(),
+    )
+    .map_err(refused)?;
+    let environment = open();
+    let commanded = fit::check(&contract, environment.as_ref()).map_err(|misfit| {
+        about(&format_args!(
+            "{misfit}; use a bundle made for this environment"
+        ))
+    })?;
+    let assignments: Vec<_> = (0..)
+        .zip(commanded)
+        .filter(|(instruction, _)| chosen.is_none_or(|chosen| chosen == *instruction))
+        .map(|(instruction, commanded)| Assignment {
+            instruction,
+            commanded,
+        })
+        .collect();
+    let evaluation = Evaluation {
+        policy,
+        assignments: &assignments,
+        episodes: arguments.episodes,
+        seed: arguments.seed,
+        decision: decision(&policy, arguments.sample),
+        threads,
+    };
+    let start = Instant::now();
+    let evaluated = evaluate(&evaluation, &open, &stop)?;
+    let wall = start.elapsed();
+
+    let results = report(
+        &evaluation,
+        environment.as_ref(),
+        &arguments.noise,
+        &evaluated,
+        wall,
+    );
+    if let Some(path) = &arguments.json {
+        results::write_json(&results, path).map_err(|error| unwritable(path, &error))?;
+    }
+    print(&Table(&results))
+}
+
+/// A flag that an interrupt raises; a second interrupt ends the program at once.
+fn stop_on_interrupt() -> Result<Arc<AtomicBool>, End> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let raised = Arc::clone(&stop);
+    let handler = move || {
+        if raised.swap(true, Ordering::Relaxed) {
+            std::process::exit(i32::from(INTERRUPTED));
+        }
+    };
+    ctrlc::set_handler(handler).map_err(|error| {
+        refused(format!(
+            "interrupts cannot be handled ({error}); run it in another shell"
+        ))
+    })?;
+    Ok(stop)
+}
+
+/// Checks what needs no file; returns the number of threads.
+fn check_numbers(arguments: &Arguments) -> Result<usize, End> {
+    if arguments.episodes == 0 {
+        return Err(refused("--episodes 0: nothing to run; give at least 1"));
+    }
+    match arguments.threads {
+        Some(0) => Err(refused(
+            "--threads 0: nobody to run the episodes; give at least 1",
+        )),
+        Some(threads) => Ok(threads),
+        None => Ok(std::thread::available_parallelism().map_or(1, usize::from)),
+    }
+}
+
+fn unwritable(path: &Path, error: &std::io::Error) -> End {
+    refused(format!(
+        "--json {}: cannot be written ({error}); name a file in an existing, writable folder",
+        path.display()
+    ))
+}
+
+/// The number of the instruction that was asked for; `None` for all.
+fn choose(bundle: &Bundle, instruction: Option<&str>) -> Result<Option<u32>, End> {
+    let Some(wanted) = instruction else {
+        return Ok(None);
+    };
+    if let Some(index) = bundle.instruction_index(wanted) {
+        return Ok(Some(index as u32));
+    }
+    let nearest = bundle
+        .nearest_instructions(wanted)
+        .iter()
+        .map(|text| format!("'{text}'"))
+        .collect::<Vec<_>>();
+    Err(refused(format!(
+        "--instruction '{wanted}': the bundle does not know it; the nearest that it knows: {}",
+        nearest.join(", ")
+    )))
+}
+
+/// Replays the bundle's golden episode on this machine; a policy that answers differently is not run.
+fn self_test(policy: &Policy<'_>) -> Result<(), String> {
+    let mut memory = Memory::of(policy);
+    let mut controller = memory
+        .controller(policy)
+        .map_err(|error| error.to_string())?;
+    match controller.self_test() {
+        Ok(_) => Ok(()),
+        Err(error) => Err(format!(
+            "the self-test failed: {error}; export the bundle again"
+        )),
+    }
+}
+
+/// The contract's rule; where sampling was asked for, at the contract's temperature, or at 1 where its rule is argmax.
+fn decision(policy: &Policy<'_>, sample: bool) -> Decision {
+    match policy.contract().decision() {
+        Decision::Argmax if sample => Decision::Sample {
+            temperature: 1.0,
+            seed: 0,
+        },
+        rule => rule,
+    }
+}
+
+/// Runs all episodes behind a progress bar, until `stop` is raised.
+fn evaluate(
+    evaluation: &Evaluation<'_>,
+    open: &registry::Opener,
+    stop: &AtomicBool,
+) -> Result<Evaluated, End> {
+    // Hidden by indicatif where stderr is no terminal.
+    let bar = ProgressBar::new(evaluation.len() as u64);
+    let style = ProgressStyle::with_template(
+        "{bar:40} {pos}/{len} episodes, {elapsed} elapsed, {eta} left",
+    );
+    bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+    bar.enable_steady_tick(Duration::from_millis(200));
+    let evaluated = evaluation.run(open, stop, &|| bar.inc(1));
+    bar.finish_and_clear();
+    evaluated.map_err(|error| match error {
+        EvaluationError::Interrupted => End::Interrupted,
+        error => refused(format!(
+            "{error}; run this instruction alone with the same seed to look into it"
+        )),
+    })
+}
+
+fn report(
+    evaluation: &Evaluation<'_>,
+    environment: &dyn Environment,
+    noise: &str,
+    evaluated: &Evaluated,
+    wall: Duration,
+) -> Results {
+    let (contract, watched) = (evaluation.policy.contract(), environment.sub_tasks());
+    let of_each = evaluation.assignments.iter().zip(&evaluated.episodes);
+    let instructions: Vec<_> = of_each
+        .filter_map(|(assignment, episodes)| {
+            let known = contract.instruction(assignment.instruction as usize)?;
+            Some(InstructionResult::new(&known, watched, episodes))
+        })
+        .collect();
+    let threads = evaluation.threads.min(evaluation.len());
+    Results {
+        format: results::FORMAT,
+        format_version: results::FORMAT_VERSION,
+        environment: environment.into(),
+        bundle_sha256: contract.bundle_sha256().to_owned(),
+        seed: evaluation.seed,
+        noise: noise.to_owned(),
+        decision: evaluation.decision.into(),
+        episodes_per_instruction: evaluation.episodes,
+        versions: versions(),
+        splits: results::Splits::of(&instructions, watched),
+        instructions,
+        latency_us: results::LatencyByKind::of(&evaluated.timing),
+        time: results::TimeUse::of(&evaluated.timing, wall, threads),
+    }
+}
+
+/// What the numbers depend on besides the bundle.
+fn versions() -> BTreeMap<&'static str, String> {
+    BTreeMap::from([
+        ("lads-sim", env!("CARGO_PKG_VERSION").to_owned()),
+        ("mujoco", mujoco_rs::mujoco_version().to_owned()),
+    ])
+}
+
+/// Prints to stdout; a reader that has left is no failure.
+fn print(table: &Table<'_>) -> Result<(), End> {
+    let mut stdout = std::io::stdout().lock();
+    match write!(stdout, "{table}").and_then(|()| stdout.flush()) {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(refused(format!(
+            "stdout: cannot be written ({error}); connect it to a place with room"
+        ))),
+        _ => Ok(()),
+    }
+}

@@ -1,0 +1,137 @@
+//! A small environment that needs no simulator, for the small bundle that the compiler's tests use.
+
+use std::path::Path;
+
+use lads_compiler::{Bundle, Image, compile};
+use lads_sim::environment::{ActionError, Completion, Environment, EpisodeSeed};
+use lads_sim::random::Stream;
+
+/// The small bundle, compiled.
+pub fn tiny_image() -> Image {
+    let path =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../runtime/compiler/tests/data/tiny.onnx");
+    compile(&Bundle::open(&path).unwrap()).unwrap()
+}
+
+/// What the environment says of itself; tests change one field at a time.
+#[derive(Clone)]
+pub struct Says {
+    pub id: &'static str,
+    pub version: &'static str,
+    pub control_period_s: f64,
+    pub observation_names: &'static [&'static str],
+    pub action_names: &'static [&'static str],
+    pub sub_tasks: &'static [&'static str],
+}
+
+impl Default for Says {
+    fn default() -> Self {
+        Self {
+            id: "tiny-bench",
+            version: "1",
+            control_period_s: 0.05,
+            observation_names: &["joint1", "joint2", "drawer", "lamp", "lever"],
+            action_names: &["joint1_velocity", "joint2_velocity", "gripper"],
+            sub_tasks: &["drawer", "lamp", "lever"],
+        }
+    }
+}
+
+/// Five numbers that drift with the actions and with noise, inside the contract's limits; a sub-task is done once its number is high.
+pub struct Bench {
+    says: Says,
+    stream: Stream,
+    state: [f64; 5],
+    observation: [f64; 5],
+    steps: usize,
+    completions: Vec<Completion>,
+}
+
+impl Bench {
+    pub fn new(says: Says) -> Self {
+        let (state, observation) = ([0.0; 5], [0.0; 5]);
+        Self {
+            says,
+            stream: Stream::new(&[]),
+            state,
+            observation,
+            steps: 0,
+            completions: Vec::new(),
+        }
+    }
+
+    fn observe(&mut self) {
+        for (seen, truth) in self.observation.iter_mut().zip(self.state) {
+            *seen = truth + self.stream.uniform(-0.05, 0.05);
+        }
+    }
+}
+
+impl Environment for Bench {
+    fn id(&self) -> &'static str {
+        self.says.id
+    }
+    fn version(&self) -> &'static str {
+        self.says.version
+    }
+    fn observation_names(&self) -> &'static [&'static str] {
+        self.says.observation_names
+    }
+    fn action_names(&self) -> &'static [&'static str] {
+        self.says.action_names
+    }
+    fn sub_tasks(&self) -> &'static [&'static str] {
+        self.says.sub_tasks
+    }
+    fn control_period_s(&self) -> f64 {
+        self.says.control_period_s
+    }
+    fn max_steps(&self) -> usize {
+        40
+    }
+
+    fn reset(&mut self, seed: EpisodeSeed) -> &[f64] {
+        self.stream = Stream::new(&seed.entropy());
+        self.state = [0.0; 5];
+        self.steps = 0;
+        self.completions.clear();
+        self.observe();
+        &self.observation
+    }
+
+    fn step(&mut self, action: &[f64]) -> Result<&[f64], ActionError> {
+        assert!(action.len() == 3 && action.iter().all(|x| x.is_finite()));
+        self.steps += 1;
+        for (index, value) in self.state.iter_mut().enumerate() {
+            let drift = 0.02 * action[index % 3] + self.stream.uniform(0.0, 0.02);
+            *value = (*value + drift).clamp(-0.05, 0.5);
+        }
+        for (sub_task, value) in self.state[2..].iter().enumerate() {
+            let latched = self
+                .completions
+                .iter()
+                .any(|completion| completion.sub_task == sub_task);
+            if *value > 0.2 && !latched {
+                self.completions.push(Completion {
+                    sub_task,
+                    step: self.steps,
+                });
+            }
+        }
+        self.observe();
+        Ok(&self.observation)
+    }
+
+    fn observation(&self) -> &[f64] {
+        &self.observation
+    }
+    fn state(&self) -> &[f64] {
+        &self.state
+    }
+    fn steps(&self) -> usize {
+        self.steps
+    }
+    fn completions(&self) -> &[Completion] {
+        &self.completions
+    }
+}

@@ -1,0 +1,81 @@
+//! Checks a JSON value against the part of JSON Schema that `results.schema.json` uses; an unknown keyword is a failure, not a pass.
+
+use serde_json::Value;
+
+/// Panics with the path of the first value that does not fit.
+pub fn check(value: &Value, schema: &Value, root: &Value, path: &str) {
+    for (keyword, rule) in schema.as_object().unwrap() {
+        let fits = match keyword.as_str() {
+            "$schema" | "$defs" | "title" | "description" => true,
+            "$ref" => {
+                let pointer = rule.as_str().unwrap().strip_prefix('#').unwrap();
+                check(value, root.pointer(pointer).unwrap(), root, path);
+                true
+            }
+            "type" => match rule {
+                Value::Array(types) => types.iter().any(|one| is(value, one)),
+                one => is(value, one),
+            },
+            "const" => value == rule,
+            "enum" => rule.as_array().unwrap().contains(value),
+            // A bound says nothing about a value that is no number.
+            "minimum" => value
+                .as_f64()
+                .is_none_or(|number| number >= rule.as_f64().unwrap()),
+            "maximum" => value
+                .as_f64()
+                .is_none_or(|number| number <= rule.as_f64().unwrap()),
+            "minLength" => value.as_str().unwrap().len() as u64 >= rule.as_u64().unwrap(),
+            "maxLength" => value.as_str().unwrap().len() as u64 <= rule.as_u64().unwrap(),
+            "minItems" => value.as_array().unwrap().len() as u64 >= rule.as_u64().unwrap(),
+            "maxItems" => value.as_array().unwrap().len() as u64 <= rule.as_u64().unwrap(),
+            "required" => rule
+                .as_array()
+                .unwrap()
+                .iter()
+                .all(|key| value.get(key.as_str().unwrap()).is_some()),
+            "additionalProperties" => {
+                assert_eq!(
+                    rule,
+                    &Value::Bool(false),
+                    "{path}: only false is understood"
+                );
+                let known = schema["properties"].as_object().unwrap();
+                value
+                    .as_object()
+                    .unwrap()
+                    .keys()
+                    .all(|key| known.contains_key(key))
+            }
+            "properties" => {
+                for (key, of_key) in rule.as_object().unwrap() {
+                    if let Some(inner) = value.get(key) {
+                        check(inner, of_key, root, &format!("{path}.{key}"));
+                    }
+                }
+                true
+            }
+            "items" => {
+                for (index, inner) in value.as_array().unwrap().iter().enumerate() {
+                    check(inner, rule, root, &format!("{path}[{index}]"));
+                }
+                true
+            }
+            other => panic!("{path}: the schema uses {other}, which this checker does not know"),
+        };
+        assert!(fits, "{path}: {keyword} {rule} does not hold for {value}");
+    }
+}
+
+fn is(value: &Value, name: &Value) -> bool {
+    match name.as_str().unwrap() {
+        "object" => value.is_object(),
+        "array" => value.is_array(),
+        "string" => value.is_string(),
+        "boolean" => value.is_boolean(),
+        "number" => value.is_number(),
+        "integer" => value.is_u64() || value.is_i64(),
+        "null" => value.is_null(),
+        other => panic!("unknown type {other}"),
+    }
+}

@@ -1,0 +1,306 @@
+//! The program `lads-run` itself: its report, its JSON, and everything that it refuses.
+
+#[path = "common/schema.rs"]
+mod schema;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::time::Duration;
+
+use serde_json::Value;
+
+/// A file of the project, by its path from the root.
+fn project_file(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
+}
+
+/// The small bundle of the compiler's tests, for another environment.
+fn tiny_bundle() -> PathBuf {
+    project_file("runtime/compiler/tests/data/tiny.onnx")
+}
+
+/// The bundle that ships.
+fn kitchen_bundle() -> PathBuf {
+    project_file("models/kitchen.onnx")
+}
+
+fn lads_run(model: &Path, arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_lads-run"));
+    command.arg("--model").arg(model).args(arguments);
+    command
+}
+
+/// Runs, expects success, and reads the JSON.
+fn results(arguments: &[&str], json: &Path) -> (String, Value) {
+    let output = lads_run(&kitchen_bundle(), arguments)
+        .arg("--json")
+        .arg(json)
+        .output()
+        .unwrap();
+    let errors = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success(), "{errors}");
+    let results = serde_json::from_str(&fs::read_to_string(json).unwrap()).unwrap();
+    (String::from_utf8(output.stdout).unwrap(), results)
+}
+
+/// Without the fields that are measured times.
+fn timeless(mut results: Value) -> Value {
+    let fields = results.as_object_mut().unwrap();
+    assert!(fields.remove("latency_us").is_some() && fields.remove("time").is_some());
+    results
+}
+
+/// Exit code 2, nothing on stdout, and one line on stderr with all `parts`.
+fn assert_refused(output: &Output, parts: &[&str]) {
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{errors}");
+    assert!(output.stdout.is_empty());
+    assert_eq!(errors.lines().count(), 1, "{errors}");
+    assert!(
+        errors.starts_with("error: ") && !errors.contains("panicked"),
+        "{errors}"
+    );
+    for part in parts {
+        assert!(errors.contains(part), "'{part}' is not in: {errors}");
+    }
+}
+
+fn refused(model: &Path, arguments: &[&str], parts: &[&str]) {
+    assert_refused(&lads_run(model, arguments).output().unwrap(), parts);
+}
+
+/// A copy of a bundle in which one text of its metadata is another of the same length.
+fn altered(bundle: &Path, folder: &Path, from: &str, to: &str) -> PathBuf {
+    assert_eq!(from.len(), to.len());
+    let mut bytes = fs::read(bundle).unwrap();
+    let place = bytes
+        .windows(from.len())
+        .position(|window| window == from.as_bytes())
+        .unwrap();
+    bytes[place..place + to.len()].copy_from_slice(to.as_bytes());
+    let path = folder.join("altered.onnx");
+    fs::write(&path, bytes).unwrap();
+    path
+}
+
+#[test]
+fn every_instruction_runs_and_the_json_has_its_schema() {
+    let folder = tempfile::tempdir().unwrap();
+    let (table, results) = results(&["--episodes", "1"], &folder.path().join("r.json"));
+    let text = fs::read_to_string(project_file("sim-harness/results.schema.json")).unwrap();
+    let root: Value = serde_json::from_str(&text).unwrap();
+    schema::check(&results, &root, &root, "results");
+
+    let count = |split: &str| results["splits"][split]["episodes"].as_u64().unwrap();
+    assert_eq!((count("seen"), count("unseen")), (22, 3));
+    let instructions = results["instructions"].as_array().unwrap();
+    assert_eq!(instructions.len(), 25);
+    for instruction in instructions {
+        let id = instruction["id"].as_str().unwrap();
+        assert!(
+            table.lines().any(|line| line.starts_with(id)),
+            "{id} has a row"
+        );
+        assert_eq!(instruction["completions"].as_array().unwrap().len(), 4);
+        assert_eq!(instruction["runs"].as_array().unwrap().len(), 1);
+    }
+    for word in [
+        "K-rate 4",
+        "full success",
+        "ordinary step",
+        "decision step",
+        "instruct",
+        "inside MuJoCo",
+    ] {
+        assert!(table.contains(word), "{word} is not in the report");
+    }
+}
+
+#[test]
+fn the_number_of_threads_does_not_show() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = |threads: &str, rest: &[&str]| {
+        let arguments = [
+            &[
+                "--instruction",
+                "kbls",
+                "--episodes",
+                "3",
+                "--seed",
+                "5",
+                "--threads",
+                threads,
+            ],
+            rest,
+        ]
+        .concat();
+        let (_, results) = results(&arguments, &folder.path().join(format!("{threads}.json")));
+        timeless(results)
+    };
+    let sampled = run("1", &["--sample"]);
+    assert_eq!(run("3", &["--sample"]), sampled);
+    assert_eq!(sampled["decision"]["rule"], "sample");
+    // With neither noise nor sampling all episodes are one.
+    let same = run("2", &["--noise", "none"]);
+    let runs = same["instructions"][0]["runs"].as_array().unwrap();
+    for field in ["steps", "plans", "completions"] {
+        assert!(
+            runs.iter().all(|run| run[field] == runs[0][field]),
+            "{field}"
+        );
+    }
+}
+
+#[test]
+fn bad_arguments_are_refused() {
+    let model = kitchen_bundle();
+    refused(
+        &model,
+        &["--episodes", "0"],
+        &["--episodes 0", "at least 1"],
+    );
+    refused(&model, &["--threads", "0"], &["--threads 0", "at least 1"]);
+    refused(
+        &model,
+        &["--episodes", "many"],
+        &["many", "--episodes", "--help"],
+    );
+    refused(&model, &["--noise", "v7"], &["v7", "none, v0 or v1"]);
+    let known = "move kettle to top left burner and activate bottom burner and turn on light switch and open sliding cabinet";
+    let unknown = known.replace("bottom", "botom");
+    refused(
+        &model,
+        &["--instruction", &unknown],
+        &[&unknown, "the nearest", known],
+    );
+}
+
+#[test]
+fn bad_bundles_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    refused(&path("none.onnx"), &[], &["none.onnx", "check the path"]);
+    fs::write(path("text.onnx"), "no model at all\n").unwrap();
+    refused(&path("text.onnx"), &[], &["text.onnx", "ONNX"]);
+    let bytes = fs::read(tiny_bundle()).unwrap();
+    fs::write(path("half.onnx"), &bytes[..bytes.len() / 2]).unwrap();
+    refused(&path("half.onnx"), &[], &["half.onnx", "truncated"]);
+    let plain = altered(
+        &tiny_bundle(),
+        folder.path(),
+        "lads.contract",
+        "some.contract",
+    );
+    refused(&plain, &[], &["altered.onnx", "lads.contract", "export"]);
+    let newer = altered(
+        &tiny_bundle(),
+        folder.path(),
+        r#"{"version": 1, "kind""#,
+        r#"{"version": 7, "kind""#,
+    );
+    refused(&newer, &[], &["altered.onnx", "version 7", "version 1"]);
+}
+
+#[test]
+fn contracts_of_another_environment_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    refused(&tiny_bundle(), &[], &["tiny-bench", "franka-kitchen"]);
+    let cases = [
+        (
+            r#""control_period_s": 0.08"#,
+            r#""control_period_s": 0.07"#,
+            "control_period_s",
+        ),
+        (
+            r#"{"id": "franka-kitchen", "version": "1"}"#,
+            r#"{"id": "franka-kitchen", "version": "3"}"#,
+            "environment.version",
+        ),
+    ];
+    for (from, to, field) in cases {
+        let model = altered(&kitchen_bundle(), folder.path(), from, to);
+        refused(&model, &[], &["altered.onnx", field]);
+    }
+}
+
+#[test]
+fn missing_assets_are_refused() {
+    let mut command = lads_run(&kitchen_bundle(), &[]);
+    command.env("LADS_VENDOR", "/nonexistent");
+    assert_refused(&command.output().unwrap(), &["/nonexistent", "make setup"]);
+}
+
+#[test]
+fn places_that_cannot_be_written_are_refused_before_any_episode() {
+    let folder = tempfile::tempdir().unwrap();
+    let inside = folder.path().join("no/such/folder/r.json");
+    for place in [inside.as_path(), folder.path()] {
+        let place = place.to_str().unwrap();
+        refused(
+            &kitchen_bundle(),
+            &["--json", place],
+            &["--json", place, "writable folder"],
+        );
+    }
+}
+
+#[test]
+fn a_failure_overwrites_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let json = folder.path().join("r.json");
+    fs::write(&json, "from before").unwrap();
+    let place = json.to_str().unwrap();
+    refused(&tiny_bundle(), &["--json", place], &["tiny-bench"]);
+    refused(
+        &kitchen_bundle(),
+        &["--json", place, "--instruction", "dance"],
+        &["dance"],
+    );
+    assert_eq!(fs::read_to_string(&json).unwrap(), "from before");
+    assert_eq!(
+        fs::read_dir(folder.path()).unwrap().count(),
+        1,
+        "no temporary file stays"
+    );
+}
+
+#[cfg(unix)]
+#[test]
+fn an_interrupt_overwrites_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let json = folder.path().join("r.json");
+    fs::write(&json, "from before").unwrap();
+    let mut command = lads_run(
+        &kitchen_bundle(),
+        &["--episodes", "1000", "--json", json.to_str().unwrap()],
+    );
+    let mut child = command
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    // Long enough for the handler to be there, which is the first thing that the program does; far too short for 25,000 episodes.
+    std::thread::sleep(Duration::from_secs(2));
+    assert!(child.try_wait().unwrap().is_none(), "it is still at work");
+    assert!(
+        Command::new("kill")
+            .args(["-INT", &child.id().to_string()])
+            .status()
+            .unwrap()
+            .success()
+    );
+    let output = child.wait_with_output().unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(130), "{errors}");
+    assert!(
+        errors.contains("interrupted") && !errors.contains("panicked"),
+        "{errors}"
+    );
+    assert_eq!(fs::read_to_string(&json).unwrap(), "from before");
+    assert_eq!(
+        fs::read_dir(folder.path()).unwrap().count(),
+        1,
+        "no temporary file stays"
+    );
+}

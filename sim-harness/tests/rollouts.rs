@@ -1,0 +1,236 @@
+//! Rollouts with a compiled policy in an environment without a simulator: what they report, and that threads do not show.
+
+#[path = "common/bench.rs"]
+mod bench;
+
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+
+use bench::{Bench, Says, tiny_image};
+use lads_core::{Decision, Policy};
+use lads_sim::environment::Environment;
+use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError};
+use lads_sim::fit;
+use lads_sim::rollout::Episode;
+
+/// The seed is replaced by one per episode.
+const SAMPLE: Decision = Decision::Sample {
+    temperature: 1.0,
+    seed: 0,
+};
+
+fn open() -> Box<dyn Environment> {
+    Box::new(Bench::new(Says::default()))
+}
+
+fn assignments(policy: &Policy<'_>) -> Vec<Assignment> {
+    let commanded = fit::check(&policy.contract(), &Bench::new(Says::default())).unwrap();
+    (0..)
+        .zip(commanded)
+        .map(|(instruction, commanded)| Assignment {
+            instruction,
+            commanded,
+        })
+        .collect()
+}
+
+fn evaluate(policy: &Policy<'_>, seed: u64, decision: Decision, threads: usize) -> Evaluated {
+    let assignments = assignments(policy);
+    let evaluation = Evaluation {
+        policy: *policy,
+        assignments: &assignments,
+        episodes: 5,
+        seed,
+        decision,
+        threads,
+    };
+    evaluation
+        .run(&open, &AtomicBool::new(false), &|| {})
+        .unwrap()
+}
+
+#[test]
+fn the_number_of_threads_does_not_show() {
+    let image = tiny_image();
+    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    for decision in [Decision::Argmax, SAMPLE] {
+        let one = evaluate(&policy, 3, decision, 1).episodes;
+        assert_eq!(one.len(), 4);
+        assert!(one.iter().all(|episodes| episodes.len() == 5));
+        for threads in [2, 7] {
+            assert_eq!(
+                evaluate(&policy, 3, decision, threads).episodes,
+                one,
+                "{threads} threads, {decision:?}"
+            );
+        }
+        assert_ne!(
+            evaluate(&policy, 4, decision, 2).episodes,
+            one,
+            "another seed"
+        );
+    }
+}
+
+#[test]
+fn sampling_chooses_other_plans_and_episodes_differ() {
+    let image = tiny_image();
+    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let plans = |decision| {
+        let episodes = evaluate(&policy, 3, decision, 2).episodes;
+        episodes
+            .into_iter()
+            .flatten()
+            .map(|episode| episode.plans)
+            .collect::<Vec<_>>()
+    };
+    let sampled = plans(SAMPLE);
+    assert_ne!(sampled, plans(Decision::Argmax));
+    assert!(sampled.iter().any(|other| *other != sampled[0]));
+}
+
+#[test]
+fn episodes_end_when_the_commanded_sub_tasks_are_done() {
+    let image = tiny_image();
+    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let evaluated = evaluate(&policy, 0, Decision::Argmax, 2);
+    let horizon = policy.contract().horizon();
+    let mut early = 0;
+    for (assignment, episodes) in assignments(&policy).iter().zip(&evaluated.episodes) {
+        for Episode {
+            steps,
+            completions,
+            plans,
+        } in episodes
+        {
+            let of_commanded = completions
+                .iter()
+                .filter(|c| assignment.commanded.contains(&c.sub_task));
+            let times: Vec<_> = of_commanded.map(|c| c.step).collect();
+            if times.len() == assignment.commanded.len() {
+                assert_eq!(
+                    times.iter().max(),
+                    Some(steps),
+                    "the last completion ends the episode"
+                );
+                early += usize::from(*steps < 40);
+            } else {
+                assert_eq!(*steps, 40, "nothing else does");
+            }
+            // The context holds 24 steps, a multiple of the horizon, and restarts there.
+            assert_eq!(plans.len(), steps.div_ceil(horizon), "one plan per horizon");
+        }
+    }
+    assert!(early > 0, "the test has to see such an end");
+    let timing = &evaluated.timing;
+    assert_eq!(timing.instruct_ns.len(), 20);
+    let plans: usize = evaluated
+        .episodes
+        .iter()
+        .flatten()
+        .map(|episode| episode.plans.len())
+        .sum();
+    let steps: usize = evaluated
+        .episodes
+        .iter()
+        .flatten()
+        .map(|episode| episode.steps)
+        .sum();
+    assert_eq!(
+        (timing.decision_ns.len(), timing.ordinary_ns.len()),
+        (plans, steps - plans)
+    );
+    assert!(timing.simulator + timing.controller() <= timing.episodes);
+}
+
+#[test]
+fn a_stop_ends_the_work_without_a_result() {
+    let image = tiny_image();
+    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let assignments = assignments(&policy);
+    let evaluation = Evaluation {
+        policy,
+        assignments: &assignments,
+        episodes: 5,
+        seed: 0,
+        decision: Decision::Argmax,
+        threads: 2,
+    };
+    let (stop, finished) = (AtomicBool::new(false), AtomicUsize::new(0));
+    let count = || {
+        if finished.fetch_add(1, Ordering::Relaxed) == 3 {
+            stop.store(true, Ordering::Relaxed);
+        }
+    };
+    let stopped = evaluation.run(&open, &stop, &count);
+    assert!(matches!(stopped, Err(EvaluationError::Interrupted)));
+    assert!(finished.into_inner() < evaluation.len());
+}
+
+#[test]
+fn a_contract_that_does_not_fit_is_refused_by_name() {
+    let image = tiny_image();
+    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let refusal = |says: Says| {
+        fit::check(&policy.contract(), &Bench::new(says))
+            .unwrap_err()
+            .to_string()
+    };
+    let says = Says::default;
+    let cases = [
+        (
+            refusal(Says {
+                id: "other",
+                ..says()
+            }),
+            ["environment.id", "'tiny-bench'", "'other'"],
+        ),
+        (
+            refusal(Says {
+                version: "2",
+                ..says()
+            }),
+            ["environment.version", "'1'", "'2'"],
+        ),
+        (
+            refusal(Says {
+                control_period_s: 0.04,
+                ..says()
+            }),
+            ["control_period_s", "0.05", "0.04"],
+        ),
+        (
+            refusal(Says {
+                observation_names: &["joint1"],
+                ..says()
+            }),
+            ["observation", "5 elements", "has 1"],
+        ),
+        (
+            refusal(Says {
+                action_names: &[],
+                ..says()
+            }),
+            ["action", "3 elements", "has 0"],
+        ),
+        (
+            refusal(Says {
+                observation_names: &["joint2", "joint1", "drawer", "lamp", "lever"],
+                ..says()
+            }),
+            ["element 0", "'joint1'", "'joint2'"],
+        ),
+        (
+            refusal(Says {
+                sub_tasks: &["drawer", "lamp"],
+                ..says()
+            }),
+            ["'lv'", "'lever'", "does not know"],
+        ),
+    ];
+    for (line, parts) in cases {
+        assert!(
+            parts.iter().all(|part| line.contains(part)),
+            "{line}: {parts:?}"
+        );
+    }
+}
