@@ -1,2 +1,74 @@
-//! Suites that need more than one crate; the code is in `tests/`.
+//! What suites that need more than one crate share; the suites are in `tests/`.
 #![forbid(unsafe_code)]
+
+use std::path::{Path, PathBuf};
+
+use lads_compiler::{Bundle, Image, compile};
+use lads_core::{Controller, Policy, Workspace};
+
+/// A file or folder of the project, by its path from the root.
+pub fn project_path(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
+}
+
+/// The small bundle of the compiler's tests and every bundle that ships.
+///
+/// # Panics
+///
+/// When no bundle ships: then nothing would be tested.
+pub fn bundles() -> Vec<PathBuf> {
+    let folder = project_path("models");
+    let entries = std::fs::read_dir(&folder).expect("the project has a folder models");
+    let paths = entries.map(|entry| entry.expect("it can be read").path());
+    let mut bundles: Vec<_> = paths
+        .filter(|path| {
+            path.extension()
+                .is_some_and(|extension| extension == "onnx")
+        })
+        .collect();
+    assert!(!bundles.is_empty(), "{} holds no bundle", folder.display());
+    bundles.sort();
+    bundles.push(project_path("runtime/compiler/tests/data/tiny.onnx"));
+    bundles
+}
+
+/// Opens and compiles a bundle.
+///
+/// # Panics
+///
+/// When it does not compile.
+pub fn compiled(path: &Path) -> Image {
+    let bundle = Bundle::open(path).unwrap_or_else(|error| panic!("{error}"));
+    compile(&bundle).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+/// The memory of one controller.
+pub struct Memory {
+    /// Scratch.
+    pub arena: Vec<f32>,
+    /// What survives a control step.
+    pub state: Vec<f32>,
+}
+
+impl Memory {
+    /// As much as `policy` asks for.
+    pub fn of(policy: &Policy<'_>) -> Self {
+        Self {
+            arena: vec![0.0; policy.arena_len()],
+            state: vec![0.0; policy.state_len()],
+        }
+    }
+
+    /// A controller that works in it.
+    ///
+    /// # Panics
+    ///
+    /// When the memory is too small for the policy.
+    pub fn controller<'p, 'm>(&'m mut self, policy: &Policy<'p>) -> Controller<'p, 'm> {
+        let workspace = Workspace::new(policy, &mut self.arena, &mut self.state);
+        Controller::new(
+            *policy,
+            workspace.expect("the policy's own lengths are enough"),
+        )
+    }
+}

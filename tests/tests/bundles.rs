@@ -1,0 +1,138 @@
+//! Every bundle that ships, compiled and put to work on this machine.
+
+use lads_core::{Instruction, Policy, Workspace, WorkspaceTooSmall};
+use lads_tests::{Memory, bundles, compiled};
+
+#[test]
+fn golden_episodes_replay() {
+    for path in bundles() {
+        let image = compiled(&path);
+        let policy = Policy::new_checked(image.as_bytes()).unwrap();
+        let golden = policy.golden().unwrap();
+        // What the project promises, whatever a bundle asks of itself.
+        assert!(golden.tolerance() <= 1e-4, "{}", path.display());
+        assert!(
+            golden.len() > policy.contract().horizon(),
+            "{}: it decides more than once",
+            path.display()
+        );
+        let mut memory = Memory::of(&policy);
+        let passed = memory.controller(&policy).self_test();
+        let passed = passed.unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+        assert_eq!(passed.steps as usize, golden.len());
+    }
+}
+
+#[test]
+fn the_plans_of_a_golden_episode_differ_by_instruction() {
+    // Were the words lost on the way, every instruction would give the same logits.
+    for path in bundles() {
+        let image = compiled(&path);
+        let policy = Policy::new_checked(image.as_bytes()).unwrap();
+        let (observation, _, _) = policy.golden().unwrap().steps().next().unwrap();
+        let mut action = vec![0.0; policy.contract().action_len()];
+        let mut logits = Vec::new();
+        for instruction in 0..policy.contract().instruction_count() as u32 {
+            let mut memory = Memory::of(&policy);
+            let mut controller = memory.controller(&policy);
+            controller
+                .set_instruction(Instruction::Id(instruction))
+                .unwrap();
+            controller.step(observation, &mut action).unwrap();
+            logits.push(controller.logits().to_vec());
+        }
+        for (index, of_one) in logits.iter().enumerate() {
+            assert!(
+                !logits[..index].contains(of_one),
+                "{}: instruction {index}",
+                path.display()
+            );
+        }
+    }
+}
+
+#[test]
+fn a_controller_that_was_used_answers_like_a_fresh_one() {
+    for path in bundles() {
+        let image = compiled(&path);
+        let policy = Policy::new_checked(image.as_bytes()).unwrap();
+        let observations: Vec<_> = policy
+            .golden()
+            .unwrap()
+            .steps()
+            .map(|(observation, _, _)| observation)
+            .collect();
+        let mut action = vec![0.0; policy.contract().action_len()];
+        let mut episode = |controller: &mut lads_core::Controller<'_, '_>| {
+            let step = |observation: &&[f32]| {
+                let report = controller.step(observation, &mut action).unwrap();
+                (report.plan, action.clone())
+            };
+            observations[..50.min(observations.len())]
+                .iter()
+                .map(step)
+                .collect::<Vec<_>>()
+        };
+        let mut memory = Memory::of(&policy);
+        let mut controller = memory.controller(&policy);
+        controller.set_instruction(Instruction::Id(1)).unwrap();
+        let fresh = episode(&mut controller);
+        controller.reset();
+        assert_eq!(
+            episode(&mut controller),
+            fresh,
+            "{}: after a reset",
+            path.display()
+        );
+        controller.set_instruction(Instruction::Id(0)).unwrap();
+        episode(&mut controller);
+        controller.set_instruction(Instruction::Id(1)).unwrap();
+        assert_eq!(
+            episode(&mut controller),
+            fresh,
+            "{}: after another instruction",
+            path.display()
+        );
+    }
+}
+
+#[test]
+fn one_element_less_of_memory_is_refused() {
+    for path in bundles() {
+        let image = compiled(&path);
+        let policy = Policy::new_checked(image.as_bytes()).unwrap();
+        let Memory {
+            mut arena,
+            mut state,
+        } = Memory::of(&policy);
+        let (arena_len, state_len) = (arena.len(), state.len());
+        let short = Workspace::new(&policy, &mut arena[1..], &mut state).unwrap_err();
+        assert_eq!(
+            short,
+            WorkspaceTooSmall {
+                got: arena_len - 1,
+                needed: arena_len
+            }
+        );
+        let short = Workspace::new(&policy, &mut arena, &mut state[1..]).unwrap_err();
+        assert_eq!(
+            short,
+            WorkspaceTooSmall {
+                got: state_len - 1,
+                needed: state_len
+            }
+        );
+        assert!(Workspace::new(&policy, &mut arena, &mut state).is_ok());
+    }
+}
+
+#[test]
+fn compiling_twice_gives_the_same_image() {
+    for path in bundles() {
+        assert!(
+            compiled(&path).as_bytes() == compiled(&path).as_bytes(),
+            "{}",
+            path.display()
+        );
+    }
+}
