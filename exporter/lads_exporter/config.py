@@ -40,6 +40,7 @@ class LowLevel:
 @dataclass(frozen=True)
 class Encoder:
     hidden: int
+    observed: int  # the encoder sees the first so many observation elements; 0 is all of them (the paper's)
     horizon: int  # H, control steps per plan
     codebook_size: int  # M
     codebook_dim: int  # D
@@ -57,6 +58,7 @@ class Alignment:
     heads: int
     dropout: float
     out: int
+    segment_dropout: float  # probability with which a plan is left out of the sequence that is aligned; 0 is the paper's
 
 
 @dataclass(frozen=True)

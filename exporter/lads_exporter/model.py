@@ -162,10 +162,15 @@ class LowLevelPolicy(nn.Module):
 
 
 class TrajectoryEncoder(nn.Module):
-    """q: an LSTM over the encoded (s, a) of a segment, then a 3-layer MLP to the latent (before quantisation)."""
+    """q: an LSTM over the encoded (s, a) of a segment, then a 3-layer MLP to the latent (before quantisation).
 
-    def __init__(self, hidden, observation_len, action_len, plan_len):
+    It may be shown the first `observed` elements of the observation only, for instance the robot's joints: then
+    a plan says how the robot moves, whatever was done before.
+    """
+
+    def __init__(self, hidden, observation_len, action_len, plan_len, observed):
         super().__init__()
+        self.register_buffer("shown", (torch.arange(observation_len) < observed).float(), persistent=False)
         self.embed_observation = nn.Linear(observation_len, hidden)
         self.embed_action = nn.Linear(action_len, hidden)
         self.lstm = nn.LSTM(2 * hidden, hidden, batch_first=True)
@@ -176,7 +181,8 @@ class TrajectoryEncoder(nn.Module):
     def input_weights(self):
         """The two linear encoders multiplied into the LSTM's input weights: weight [4h, O+A], bias [4h]."""
         on_observation, on_action = self.lstm.weight_ih_l0.chunk(2, 1)
-        weight = torch.cat([on_observation @ self.embed_observation.weight, on_action @ self.embed_action.weight], 1)
+        from_observation = on_observation @ (self.embed_observation.weight * self.shown)
+        weight = torch.cat([from_observation, on_action @ self.embed_action.weight], 1)
         bias = self.lstm.bias_ih_l0 + on_observation @ self.embed_observation.bias + on_action @ self.embed_action.bias
         return weight, bias
 
@@ -204,6 +210,7 @@ class Alignment(nn.Module):
         self.phi = self._projector(hidden, hidden, config.out)
         self.psi = self._projector(sentence_dim, hidden, config.out)
         self.log_scale = nn.Parameter(torch.tensor(math.log(1 / 0.07)))
+        self.segment_dropout = config.segment_dropout
 
     @staticmethod
     def _projector(inputs, hidden, out):
@@ -216,6 +223,8 @@ class Alignment(nn.Module):
 
         Trajectories with the same instruction are neither positive nor negative to each other.
         """
+        if self.training and self.segment_dropout > 0:
+            valid = self.some(valid)
         x = self.embed(plans) + self.position[: plans.shape[1]]
         x = self.transformer(x, src_key_padding_mask=~valid)
         x = (x * valid[..., None]).sum(1) / valid.sum(1, keepdim=True)
@@ -227,6 +236,12 @@ class Alignment(nn.Module):
         logits = logits.masked_fill(same, -1e9)
         return F.cross_entropy(logits, itself) + F.cross_entropy(logits.T, itself)
 
+    def some(self, valid):
+        """Leaves out a random share of each sequence's plans, so that every plan alone has to tell of the instruction."""
+        draw = torch.rand(valid.shape, device=valid.device).masked_fill(~valid, -1.0)
+        last = draw == draw.max(1, keepdim=True).values  # no sequence becomes empty
+        return valid & ((draw >= self.segment_dropout) | last)
+
 
 class Lads(nn.Module):
     """All networks of one policy. `forward` is not defined: the parts are trained and exported separately."""
@@ -236,7 +251,7 @@ class Lads(nn.Module):
         config, o, a = setting.config, setting.observation_len, setting.action_len
         encoder = config.encoder
         self.normalizer = Normalizer(o)
-        self.encoder = TrajectoryEncoder(encoder.hidden, o, a, encoder.codebook_dim)
+        self.encoder = TrajectoryEncoder(encoder.hidden, o, a, encoder.codebook_dim, encoder.observed or o)
         self.codebook = Codebook(encoder)
         self.low_level = LowLevelPolicy(config.low_level, o, encoder.codebook_dim, a)
         self.high_level = HighLevelPolicy(config.high_level, encoded.dim, o, a, encoder.codebook_size)

@@ -81,7 +81,7 @@ def test_straight_through_and_commitment(setting):
 @torch.no_grad()
 def test_encoder_ignores_what_lies_beyond_a_short_segment():
     torch.manual_seed(0)
-    encoder = TrajectoryEncoder(16, 5, 3, 4)
+    encoder = TrajectoryEncoder(16, 5, 3, 4, 5)
     observations, actions = torch.randn(2, 6, 5), torch.randn(2, 6, 3)
     lengths = torch.tensor([6, 4])
     full = encoder(observations, actions, lengths)
@@ -94,7 +94,7 @@ def test_encoder_ignores_what_lies_beyond_a_short_segment():
 @torch.no_grad()
 def test_encoder_folded_inputs_equal_the_unfolded_networks():
     torch.manual_seed(0)
-    encoder = TrajectoryEncoder(16, 5, 3, 4)
+    encoder = TrajectoryEncoder(16, 5, 3, 4, 5)
     observations, actions = torch.randn(2, 6, 5), torch.randn(2, 6, 3)
     joined = torch.cat([encoder.embed_observation(observations), encoder.embed_action(actions)], -1)
     expected = encoder.mlp(encoder.lstm(joined)[0][:, -1])
@@ -171,6 +171,29 @@ def test_same_instruction_is_no_negative(setting):
     first = align(plans, masked, sentences, different)
     plans[1, 4:] = 50.0
     assert torch.allclose(first, align(plans, masked, sentences, different), atol=1e-5)
+
+
+@torch.no_grad()
+def test_encoder_sees_what_it_is_shown_only():
+    torch.manual_seed(0)
+    encoder = TrajectoryEncoder(16, 5, 3, 4, 2)
+    observations, actions, lengths = torch.randn(6, 7, 5), torch.randn(6, 7, 3), torch.full((6,), 7)
+    before = encoder(observations, actions, lengths)
+    observations[:, :, 2:] = 9.0
+    assert torch.equal(before, encoder(observations, actions, lengths))
+    observations[:, :, 1] += 1.0
+    assert (before - encoder(observations, actions, lengths)).abs().max() > 1e-3
+
+
+def test_segment_dropout_leaves_out_its_share_and_never_all(setting):
+    torch.manual_seed(0)
+    align = Alignment(dataclasses.replace(setting.alignment, segment_dropout=0.7), 4, 8, 20)
+    valid = torch.arange(20) < torch.randint(1, 21, (2000,))[:, None]
+    kept = align.some(valid)
+    assert not (kept & ~valid).any()
+    assert kept.any(1).all()
+    full = valid.all(1)
+    assert kept[full].float().mean().item() == pytest.approx(0.3, abs=0.03)
 
 
 def test_perplexity():
