@@ -364,6 +364,27 @@ fn sampling_is_a_function_of_the_seed() {
     };
     assert_eq!(sample(1), sample(1));
     assert!((2..6).any(|seed| sample(seed).0 != sample(1).0));
+    // Random numbers are used up: the first decision of each episode is another draw.
+    let policy = image.policy();
+    let mut memory = Memory::for_policy(&policy);
+    let mut controller = memory.controller(&policy);
+    controller.set_decision(Decision::Sample {
+        temperature: 10.0,
+        seed: 1,
+    });
+    controller
+        .set_instruction(Instruction::Id(0))
+        .expect("the instruction is known");
+    let mut draw = || {
+        controller.reset();
+        controller
+            .step(&[0.1; 3], &mut [0.0; 2])
+            .map(|report| report.plan.0)
+    };
+    let draws: Vec<_> = (0..30)
+        .map(|_| draw().expect("the step is sound"))
+        .collect();
+    assert!((0..5).all(|plan| draws.contains(&plan)), "{draws:?}");
     // The contract's own rule is what a new controller starts with.
     let mut parts = parts(&tiny());
     (

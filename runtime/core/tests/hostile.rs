@@ -80,6 +80,24 @@ fn every_truncation_is_refused() {
 }
 
 #[test]
+fn sections_that_overlap_or_change_places_are_refused() {
+    let image = sound().image();
+    let at = support::writer::section_start;
+    let refused = |edit: &dyn Fn(&mut Vec<u32>)| {
+        let mut changed = image.clone();
+        edit(&mut changed.0);
+        Policy::new_checked(changed.bytes()).map(|_| ())
+    };
+    // The golden section moved into the weights: all of it is still inside the image.
+    let moved = refused(&|words| words[at(Section::Golden)] -= 4);
+    assert_eq!(moved, Err(PolicyError::Section(Section::Golden)));
+    let header = refused(&|words| words[at(Section::Contract)] = 0);
+    assert_eq!(header, Err(PolicyError::Section(Section::Contract)));
+    let odd = refused(&|words| words[at(Section::Weights) + 1] -= 2);
+    assert_eq!(odd, Err(PolicyError::Section(Section::Weights)));
+}
+
+#[test]
 fn bytes_behind_the_image_are_ignored() {
     let mut image = sound().image();
     image.0.extend([u32::MAX; 5]);
@@ -290,6 +308,10 @@ fn each_rule_of_an_op_is_enforced() {
         ),
         shape
     );
+    let onto_keys = |ops: &mut Vec<Op>| {
+        edit_first!(ops, Attention, op => op.scratch.offset = op.k.offset);
+    };
+    assert_eq!(fault(StepDecide, onto_keys), overlap);
     let shrink = |ops: &mut Vec<Op>| {
         edit_first!(ops, Attention, op => {
             let width = op.heads * op.head_dim;
