@@ -16,7 +16,7 @@ use thiserror::Error;
 use crate::dataset::{Dataset, Demonstration, SUB_TASKS_PER_INSTRUCTION};
 use crate::environment::{Environment, EpisodeSeed};
 use crate::expert::Performer;
-use crate::instructions::{Instruction, Instructions};
+use crate::instructions::Instruction;
 use crate::kitchen::spec::{ACTION_NAMES, CONTROL_PERIOD_S, OBSERVATION_NAMES, SUB_TASK_NAMES};
 use crate::kitchen::{self, Kitchen, Noise, Scene};
 
@@ -74,9 +74,10 @@ pub enum CollectError {
     },
 }
 
-/// Demonstrates every seen instruction. `progress` is called on this thread after every attempt, with whether it succeeded.
+/// Demonstrates every instruction. `progress` is called on this thread after every attempt, with whether it succeeded.
 pub fn collect(
     scene: &Scene,
+    instructions: &[Instruction],
     settings: &Settings,
     mut progress: impl FnMut(bool),
 ) -> Result<(Dataset, Vec<Tally>), CollectError> {
@@ -86,13 +87,12 @@ pub fn collect(
     if !(0.0..=1.0).contains(&settings.recovery_noise) {
         return Err(CollectError::BadNoise);
     }
-    let instructions = Instructions::kitchen().seen;
     let next = AtomicUsize::new(0);
     let mut results: Vec<Option<(Vec<Demonstration>, Tally)>> = vec![None; instructions.len()];
     std::thread::scope(|scope| -> Result<(), CollectError> {
         let (sender, receiver) = mpsc::channel();
         for _ in 0..settings.threads.get().min(instructions.len()) {
-            let (sender, next, instructions) = (sender.clone(), &next, &instructions);
+            let (sender, next) = (sender.clone(), &next);
             scope.spawn(move || {
                 let mut kitchen = Kitchen::new(scene, settings.noise);
                 loop {
@@ -119,10 +119,10 @@ pub fn collect(
         Ok(())
     })?;
     let (demonstrations, tallies): (Vec<_>, Vec<_>) = results.into_iter().flatten().unzip();
-    let metadata = metadata(settings, &instructions, &tallies);
+    let metadata = metadata(settings, instructions, &tallies);
     let dataset = Dataset {
         metadata,
-        instructions,
+        instructions: instructions.to_vec(),
         demonstrations: demonstrations.into_iter().flatten().collect(),
     };
     Ok((dataset, tallies))

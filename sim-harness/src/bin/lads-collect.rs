@@ -10,6 +10,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use lads_sim::assets::vendor_dir;
 use lads_sim::collect::{Settings, Tally, collect};
 use lads_sim::dataset::Dataset;
+use lads_sim::instructions::Instructions;
 use lads_sim::kitchen::{Noise, Scene};
 
 /// Collects scripted demonstrations of an environment's seen instructions.
@@ -75,21 +76,23 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
         .into());
     }
     let scene = Scene::load(&vendor_dir())?;
-    let total = 22 * settings.episodes_per_instruction as u64;
+    let instructions = Instructions::kitchen().seen;
+    let total = instructions.len() as u64 * settings.episodes_per_instruction as u64;
     let bar = ProgressBar::new(total).with_style(ProgressStyle::with_template(
         "{bar:30} {pos}/{len} demonstrations, {msg} discarded [{elapsed} < {eta}]",
     )?);
     bar.enable_steady_tick(Duration::from_millis(200));
     let mut discarded = 0;
-    let (dataset, tallies) = collect(&scene, &settings, |success| {
+    let collected = collect(&scene, &instructions, &settings, |success| {
         if success {
             bar.inc(1);
         } else {
             discarded += 1;
         }
         bar.set_message(discarded.to_string());
-    })?;
+    });
     bar.finish_and_clear();
+    let (dataset, tallies) = collected?;
     dataset.write(&arguments.output)?;
     print_summary(&dataset, &tallies, &arguments.output);
     Ok(())

@@ -202,3 +202,33 @@ impl Environment for Kitchen {
         &self.completions
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::assets::vendor_dir;
+
+    const SLIDE: usize = 19;
+
+    #[test]
+    fn completions_are_latched_with_the_first_step() {
+        let mut kitchen = Kitchen::new(&Scene::load(&vendor_dir()).unwrap(), Noise::None);
+        let mut step_at = |slide: f64| {
+            kitchen.data.qpos_mut()[SLIDE] = slide;
+            kitchen.step(&[0.0; ACTION_LEN]).unwrap();
+            kitchen.completions().to_vec()
+        };
+        assert_eq!(step_at(0.0), []);
+        let once = [Completion {
+            sub_task: 5,
+            step: 2,
+        }];
+        assert_eq!(step_at(0.3), once);
+        assert_eq!(
+            step_at(0.0),
+            once,
+            "a sub-task that is undone later still counts"
+        );
+        assert_eq!(step_at(0.3), once, "and counts once");
+    }
+}
