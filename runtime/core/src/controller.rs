@@ -74,7 +74,7 @@ pub struct Controller<'a, 'm> {
 
 impl<'a, 'm> Controller<'a, 'm> {
     /// A controller with the contract's decision rule and no instruction yet. The workspace has to be one made for this policy:
-    /// with that of another policy, steps may fail.
+    /// with that of another policy, calls fail with [`ExecError::Span`].
     pub fn new(policy: Policy<'a>, workspace: Workspace<'m>) -> Self {
         let decider = Decider::new(policy.contract().decision());
         let clock = Clock {
@@ -261,6 +261,9 @@ impl<'a, 'm> Controller<'a, 'm> {
     /// A control step that leaves its action in the state.
     pub(crate) fn advance(&mut self, observation: &[f32]) -> Result<StepReport, StepError> {
         self.check(observation)?;
+        if self.workspace.bank_lens() != self.policy.bank_lens() {
+            return Err(StepError::Program(ExecError::Span));
+        }
         let clock = self.begin()?;
         let decides = clock
             .timestep

@@ -56,6 +56,11 @@ impl<'m> Workspace<'m> {
             next,
         })
     }
+
+    /// Elements of the plan, the action and the logits, as [`Policy::bank_lens`] has them.
+    pub(crate) fn bank_lens(&self) -> [usize; 3] {
+        [&self.now.plan, &self.now.action, &self.now.logits].map(|part| part.len())
+    }
 }
 
 /// The state: the cache, then both banks.

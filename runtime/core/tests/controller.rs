@@ -415,6 +415,7 @@ fn without_an_instruction_there_is_no_step() {
     let mut memory = Memory::for_policy(&policy);
     let mut controller = memory.controller(&policy);
     let mut action = [0.5; 2];
+    assert_eq!(controller.logits(), [0.0; 5]);
     assert_eq!(
         controller.step(&[0.0; 3], &mut action),
         Err(StepError::NoInstruction)
@@ -490,6 +491,36 @@ fn a_workspace_one_element_too_small_is_refused() {
         Err((state_len - 1, state_len))
     );
     assert_eq!(attempt(0, 0), Err((0, arena_len)));
+}
+
+#[test]
+fn a_workspace_of_another_policy_is_refused_by_the_calls() {
+    let (small, large) = (
+        parts(&tiny()).image(),
+        parts(&Model::random(
+            Spec {
+                steps: 3,
+                ..Spec::KITCHEN
+            },
+            1,
+        ))
+        .image(),
+    );
+    for (lender, user) in [(&small, &large), (&large, &small)] {
+        let (lender, user) = (lender.policy(), user.policy());
+        let mut memory = Memory::for_policy(&lender);
+        let workspace = Workspace::new(&lender, &mut memory.arena, &mut memory.state)
+            .expect("the memory suffices");
+        let mut controller = Controller::new(user, workspace);
+        let told = controller.set_instruction(Instruction::Id(0));
+        let (o, a) = (
+            user.contract().observation_len(),
+            user.contract().action_len(),
+        );
+        let stepped = controller.step(&vec![0.0; o], &mut vec![0.0; a]);
+        assert!(told.is_err() || stepped.is_err());
+        assert!(stepped.is_err());
+    }
 }
 
 #[test]
