@@ -23,15 +23,12 @@ fn main() {
         "cargo::rerun-if-changed={}",
         folder.join("libmujoco.so").display()
     );
-    let library = match versioned_library(&folder) {
-        Ok(library) => library,
-        Err(_) => {
-            println!(
-                "cargo::error=MuJoCo is missing from {}: run \"make setup\"",
-                folder.display()
-            );
-            return;
-        }
+    let Ok(library) = versioned_library(&folder) else {
+        println!(
+            "cargo::error=MuJoCo is missing from {}: run \"make setup\"",
+            folder.display()
+        );
+        return;
     };
     let out_dir = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
     if let Err(error) = link(&library, &out_dir) {

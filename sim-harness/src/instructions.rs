@@ -26,8 +26,10 @@ pub struct Instructions {
 
 impl Instructions {
     /// Franka Kitchen's 22 and 3, from models/kitchen.instructions.json.
+    ///
+    /// # Panics
+    /// If that file, which is compiled in, is malformed: a test reads it.
     pub fn kitchen() -> Self {
-        // The file is part of the build, and a test reads it.
         serde_json::from_str(KITCHEN)
             .unwrap_or_else(|error| panic!("models/kitchen.instructions.json: {error}"))
     }

@@ -118,7 +118,7 @@ fn the_dataset_does_not_depend_on_the_threads() {
     let instructions = &Instructions::kitchen().seen[8..11];
     let mut attempts = 0;
     let alone = collect(&SCENE, instructions, &settings(2, 0.25, 1), |_| {
-        attempts += 1
+        attempts += 1;
     })
     .unwrap();
     assert_eq!(

@@ -105,7 +105,7 @@ impl Arm {
                 (LIMIT_HIGH[joint] - angles[joint]).max(0.0),
             );
         }
-        self.limited_step(
+        limited_step(
             &self.jacobian(physics),
             &twist,
             &(NULL_SPACE_GAIN * (self.home - angles)),
@@ -140,45 +140,6 @@ impl Arm {
         joint_angles(&self.scratch)
     }
 
-    /// The damped least-squares step for a weighted twist, with the joints kept inside their `room`.
-    fn limited_step(
-        &self,
-        jacobian: &Jacobian,
-        twist: &Vector6<f64>,
-        posture: &Joints,
-        room: &[(f64, f64); JOINTS],
-    ) -> Joints {
-        let mut step = Joints::zeros();
-        let mut free = [true; JOINTS];
-        for _ in 0..ACTIVE_SET_ROUNDS {
-            let mask = Joints::from_fn(|joint, _| if free[joint] { 1.0 } else { 0.0 });
-            let fixed = step.component_mul(&mask.map(|m| 1.0 - m));
-            let open = jacobian * SMatrix::<f64, JOINTS, JOINTS>::from_diagonal(&mask);
-            let normal = open * open.transpose() + DAMPING * DAMPING * Matrix6::identity();
-            // Symmetric with eigenvalues of at least DAMPING^2, so the factorisation exists.
-            let Some(factor) = normal.cholesky() else {
-                return step;
-            };
-            let pull = posture.component_mul(&mask);
-            let residual = twist - jacobian * fixed - open * pull;
-            step = fixed + pull + open.transpose() * factor.solve(&residual);
-            let outside = |joint: usize, step: &Joints| {
-                step[joint] < room[joint].0 || step[joint] > room[joint].1
-            };
-            let violating: Vec<usize> = (0..JOINTS)
-                .filter(|&joint| free[joint] && outside(joint, &step))
-                .collect();
-            if violating.is_empty() {
-                break;
-            }
-            for joint in violating {
-                step[joint] = step[joint].clamp(room[joint].0, room[joint].1);
-                free[joint] = false;
-            }
-        }
-        step
-    }
-
     /// Jacobian of the site: three translation rows, three weighted rotation rows.
     fn jacobian(&self, physics: &Physics) -> Jacobian {
         let (translation, rotation) = physics.jac_site(true, true, self.site);
@@ -191,6 +152,44 @@ impl Arm {
             }
         })
     }
+}
+
+/// The damped least-squares step for a weighted twist, with the joints kept inside their `room`.
+fn limited_step(
+    jacobian: &Jacobian,
+    twist: &Vector6<f64>,
+    posture: &Joints,
+    room: &[(f64, f64); JOINTS],
+) -> Joints {
+    let mut step = Joints::zeros();
+    let mut free = [true; JOINTS];
+    for _ in 0..ACTIVE_SET_ROUNDS {
+        let mask = Joints::from_fn(|joint, _| if free[joint] { 1.0 } else { 0.0 });
+        let fixed = step.component_mul(&mask.map(|m| 1.0 - m));
+        let open = jacobian * SMatrix::<f64, JOINTS, JOINTS>::from_diagonal(&mask);
+        let normal = open * open.transpose() + DAMPING * DAMPING * Matrix6::identity();
+        // Symmetric with eigenvalues of at least DAMPING^2, so the factorisation exists.
+        let Some(factor) = normal.cholesky() else {
+            return step;
+        };
+        let pull = posture.component_mul(&mask);
+        let residual = twist - jacobian * fixed - open * pull;
+        step = fixed + pull + open.transpose() * factor.solve(&residual);
+        let outside = |joint: usize, step: &Joints| {
+            step[joint] < room[joint].0 || step[joint] > room[joint].1
+        };
+        let violating: Vec<usize> = (0..JOINTS)
+            .filter(|&joint| free[joint] && outside(joint, &step))
+            .collect();
+        if violating.is_empty() {
+            break;
+        }
+        for joint in violating {
+            step[joint] = step[joint].clamp(room[joint].0, room[joint].1);
+            free[joint] = false;
+        }
+    }
+    step
 }
 
 /// The action that displaces the arm's joints within one control step, scaled down as a whole where it asks for too much.

@@ -104,7 +104,7 @@ pub const SET_POINT_LOW: [f64; ACTION_LEN] = [-2.9, -1.8, -2.9, -3.1, -2.9, 0.0,
 /// See [`SET_POINT_LOW`].
 pub const SET_POINT_HIGH: [f64; ACTION_LEN] = [2.9, 1.8, 2.9, 0.0, 2.9, 3.8, 2.9, 0.04, 0.04];
 
-/// `pos_noise_amp` of franka_config.xml, the amplitude of each element's noise before the ratio of [`Noise`] is applied.
+/// `pos_noise_amp` of `franka_config.xml`, the amplitude of each element's noise before the ratio of [`Noise`] is applied.
 const NOISE_AMPLITUDES: [f64; OBSERVATION_LEN] = [
     0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.005, 0.005, 0.0005, 0.0005, 0.0005, 0.0005,
     0.0005, 0.0005, 0.005, 0.005, 0.005, 0.1, 0.1, 0.1, 0.005, 0.005, 0.005, 0.1, 0.1, 0.1, 0.005,
