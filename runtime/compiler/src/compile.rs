@@ -18,15 +18,15 @@ use crate::tensor::Tensor;
 use crate::verify::verify;
 
 /// One program of the image: what it is compiled from and which outputs it keeps.
-struct Recipe {
-    name: &'static str,
-    entry: &'static str,
-    outputs: &'static [&'static str],
-    ports: &'static [(&'static str, Port)],
+pub(crate) struct Recipe {
+    pub name: &'static str,
+    pub entry: &'static str,
+    pub outputs: &'static [&'static str],
+    pub ports: &'static [(&'static str, Port)],
 }
 
 /// In the order of `lads_core::image::ProgramKind`.
-const RECIPES: [Recipe; 7] = [
+pub(crate) const RECIPES: [Recipe; 7] = [
     Recipe { name: "instruct", entry: INSTRUCT, outputs: &[], ports: &[("words", Port::Words)] },
     Recipe {
         name: "start",

@@ -23,6 +23,8 @@ use lads_core::op::{BinaryKind, ReduceKind, UnaryKind};
 use crate::tensor::{Data, Tensor};
 
 pub(crate) use eval::evaluate;
+#[cfg(test)]
+pub(crate) use eval::apply;
 pub(crate) use rewrite::{Rewriter, topological};
 
 /// Length of an axis: `fixed`, or `P + fixed`.

@@ -33,6 +33,9 @@ mod report;
 mod tensor;
 mod verify;
 
+#[cfg(test)]
+mod tests;
+
 pub use bundle::Bundle;
 pub use compile::compile;
 pub use contract::Contract;

@@ -63,7 +63,7 @@ impl Cache {
         u32::try_from(layer.checked_mul(self.layers)?).ok()
     }
 
-    fn spans(&self, layer: usize) -> [StateSpan; 2] {
+    pub(crate) fn spans(&self, layer: usize) -> [StateSpan; 2] {
         let len = (self.capacity * self.width()) as u32;
         let offset = 2 * layer as u32 * len;
         [StateSpan { offset, len }, StateSpan { offset: offset + len, len }]

@@ -1,0 +1,156 @@
+//! The memory plan and the verifier that does not trust it.
+
+use lads_core::op::{Copy, Op, Operand, Place, Port, Space, Span, Unary, UnaryKind};
+use proptest::prelude::*;
+
+use super::compiled;
+use crate::access::each_span;
+use crate::bundle::Bundle;
+use crate::compile::RECIPES;
+use crate::entries;
+use crate::lower::{Cache, Lowered};
+use crate::plan::{Placed, plan};
+use crate::verify::{PlanFault, verify};
+
+/// All programs of the tiny bundle.
+fn programs() -> Vec<(Lowered, Placed)> {
+    let bundle = Bundle::from_bytes(include_bytes!("../../tests/data/tiny.onnx")).expect("a bundle");
+    let signatures = entries::signatures(bundle.contract());
+    let compile = |recipe: &crate::compile::Recipe| {
+        let signature = signatures.iter().find(|signature| signature.entry == recipe.entry).expect("an entry");
+        let program = compiled(&bundle.model, signature, recipe.outputs, recipe.ports, Cache::new(bundle.contract()));
+        let program = program.unwrap_or_else(|error| panic!("{error}"));
+        (program.lowered, program.placed)
+    };
+    RECIPES.iter().map(compile).collect()
+}
+
+fn offsets(op: &Op) -> Vec<u32> {
+    let mut offsets = vec![];
+    each_span(&mut op.clone(), &mut |span| offsets.push(span.offset));
+    offsets
+}
+
+/// Moving any one span of any op somewhere else is found, unless nothing was moved.
+#[test]
+fn every_moved_span_is_found() {
+    for (lowered, placed) in programs() {
+        for (i, op) in placed.ops.iter().enumerate() {
+            for which in 0..offsets(op).len() {
+                for to in [0, 7, 16, 64, placed.arena_len.saturating_sub(8)] {
+                    let mut wrong = placed.clone();
+                    let mut at = 0;
+                    each_span(&mut wrong.ops[i], &mut |span| {
+                        if at == which {
+                            span.offset = to;
+                        }
+                        at += 1;
+                    });
+                    let scratch = matches!(op, Op::Attention(op) if op.queries > 0) && which == 4;
+                    if offsets(&wrong.ops[i]) == offsets(op) || scratch {
+                        continue;
+                    }
+                    assert!(verify(&lowered, &wrong).is_err(), "op {i} {op:?}, span {which} to {to}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn two_live_buffers_in_one_place_are_found() {
+    for (lowered, placed) in programs() {
+        // Everything at the start of the arena: whatever lives beside something else clashes.
+        let mut wrong = placed.clone();
+        for op in &mut wrong.ops {
+            each_span(op, &mut |span| span.offset = 0);
+        }
+        if lowered.ops.len() > 1 {
+            assert!(verify(&lowered, &wrong).is_err());
+        }
+    }
+}
+
+#[test]
+fn a_smaller_arena_is_found() {
+    for (lowered, mut placed) in programs() {
+        placed.arena_len -= 1;
+        assert!(matches!(verify(&lowered, &placed), Err(PlanFault::Bounds { .. })));
+    }
+}
+
+#[test]
+fn a_changed_op_is_found() {
+    for (lowered, mut placed) in programs() {
+        let last = placed.ops.len() - 1;
+        placed.ops.swap(0, last);
+        if last > 0 {
+            assert!(matches!(verify(&lowered, &placed), Err(PlanFault::Changed { op: 0 })));
+        }
+        placed.ops.pop();
+        assert!(matches!(verify(&lowered, &placed), Err(PlanFault::Changed { .. })));
+    }
+}
+
+#[test]
+fn plans_are_near_their_lower_bound() {
+    for (recipe, (_, placed)) in RECIPES.iter().zip(programs()) {
+        let aligned = placed.lower_bound + 16 * placed.ops.len() as u32;
+        assert!(placed.arena_len >= placed.lower_bound && placed.arena_len <= aligned, "{}: {}", recipe.name, placed.arena_len);
+    }
+}
+
+fn unary(x: Span, y: Span) -> Op {
+    Unary { kind: UnaryKind::Neg, alpha: 0.0, x: x.into(), y }.into()
+}
+
+#[test]
+fn reads_of_nothing_are_found() {
+    let [a, b, c] = [0, 4, 8].map(|offset| Span { offset, len: 4 });
+    let program = |ops: Vec<Op>| Lowered {
+        ops,
+        buffers: vec![a, b, c],
+        inputs: vec![(Port::Observation, Place::Span(a))],
+        outputs: vec![(Port::Logits, Place::Span(c))],
+        tokens: 0,
+    };
+    let sound = program(vec![unary(a, b), unary(b, c)]);
+    assert_eq!(verify(&sound, &plan(&sound)), Ok(()));
+    let unwritten = program(vec![unary(b, c)]);
+    assert!(matches!(verify(&unwritten, &plan(&unwritten)), Err(PlanFault::Unwritten { op: 0, .. })));
+    let no_output = program(vec![unary(a, b)]);
+    assert!(matches!(verify(&no_output, &plan(&no_output)), Err(PlanFault::Unwritten { op: 1, .. })));
+    // Every other element of the output stays unwritten, though its span is named.
+    let x = Operand { space: Space::Arena, offset: 0, len: 2 };
+    let half = Copy { x, y: c, dims: [1, 1, 1, 2], x_strides: [0, 0, 0, 1], y_strides: [0, 0, 0, 2] };
+    let half = program(vec![half.into()]);
+    assert!(matches!(verify(&half, &plan(&half)), Err(PlanFault::Unwritten { op: 1, .. })));
+}
+
+proptest! {
+    /// Any chain of ops over any buffers: the plan is proven, and no smaller than its lower bound.
+    #[test]
+    fn random_programs_are_planned(steps in prop::collection::vec((0usize..6, 1u32..40), 1..40)) {
+        let mut buffers = vec![Span { offset: 0, len: 8 }];
+        let mut ops = vec![];
+        for (back, len) in steps {
+            let from = buffers[buffers.len().saturating_sub(1 + back)];
+            let to = Span { offset: buffers[buffers.len() - 1].offset + buffers[buffers.len() - 1].len, len };
+            buffers.push(to);
+            // One element, broadcast.
+            let x = Operand { space: Space::Arena, offset: from.offset + from.len - 1, len: 1 };
+            ops.push(Copy { x, y: to, dims: [1, 1, 1, len], x_strides: [0; 4], y_strides: [0, 0, 0, 1] }.into());
+        }
+        let output = buffers[buffers.len() / 2];
+        let lowered = Lowered {
+            ops,
+            inputs: vec![(Port::Observation, Place::Span(buffers[0]))],
+            outputs: if buffers.len() > 2 { vec![(Port::Logits, Place::Span(output))] } else { vec![] },
+            buffers,
+            tokens: 0,
+        };
+        let placed = plan(&lowered);
+        prop_assert_eq!(verify(&lowered, &placed), Ok(()));
+        prop_assert!(placed.arena_len >= placed.lower_bound);
+    }
+}
