@@ -241,37 +241,37 @@ impl LatencyByKind {
     }
 }
 
-/// Where the time went, summed over the threads unless it says `wall`.
+/// Where the time went; CPU times are summed over the threads and do not depend on what else the machine does.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TimeUse {
     /// Wall time from the first episode to the last, in seconds.
     pub wall_s: f64,
     /// Threads that ran episodes.
     pub threads: usize,
-    /// Time inside episodes, in seconds.
-    pub episodes_s: f64,
-    /// Time inside the environment's reset and step, in seconds, which is physics but for noise and task checks.
-    pub simulator_s: f64,
-    /// Time inside the controller, in seconds.
-    pub controller_s: f64,
-    /// `simulator_s` over `episodes_s`; `None` without episodes.
+    /// CPU time inside episodes, in seconds.
+    pub episodes_cpu_s: f64,
+    /// CPU time inside the environment's reset and step, in seconds: physics but for noise and task checks.
+    pub simulator_cpu_s: f64,
+    /// CPU time inside the controller, in seconds.
+    pub controller_cpu_s: f64,
+    /// `simulator_cpu_s` over `episodes_cpu_s`; `None` without episodes.
     pub simulator_share: Option<f64>,
 }
 
 impl TimeUse {
     /// Sums up what was measured.
     pub fn of(timing: &Timing, wall: std::time::Duration, threads: usize) -> Self {
-        let (simulator_s, episodes_s) = (
-            timing.simulator.as_secs_f64(),
-            timing.episodes.as_secs_f64(),
+        let (simulator_cpu_s, episodes_cpu_s) = (
+            timing.simulator_cpu.as_secs_f64(),
+            timing.episodes_cpu.as_secs_f64(),
         );
         Self {
             wall_s: wall.as_secs_f64(),
             threads,
-            episodes_s,
-            simulator_s,
-            controller_s: timing.controller().as_secs_f64(),
-            simulator_share: (episodes_s > 0.0).then(|| simulator_s / episodes_s),
+            episodes_cpu_s,
+            simulator_cpu_s,
+            controller_cpu_s: timing.controller_cpu.as_secs_f64(),
+            simulator_share: (episodes_cpu_s > 0.0).then(|| simulator_cpu_s / episodes_cpu_s),
         }
     }
 }

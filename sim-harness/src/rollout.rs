@@ -9,6 +9,7 @@ use lads_core::{
     Controller, Decision, Instruction, InstructionError, Policy, StepError, Workspace,
     WorkspaceTooSmall,
 };
+use rustix::time::{ClockId, clock_gettime};
 use thiserror::Error;
 
 use crate::environment::{ActionError, Completion, Environment, EpisodeSeed};
@@ -70,10 +71,12 @@ pub struct Timing {
     pub decision_ns: Vec<u64>,
     /// Every change of instruction, in nanoseconds.
     pub instruct_ns: Vec<u64>,
-    /// Inside the environment's reset and step, which is physics but for noise and task checks.
-    pub simulator: Duration,
-    /// Inside episodes as a whole.
-    pub episodes: Duration,
+    /// CPU time inside the environment's reset and step, which is physics but for noise and task checks.
+    pub simulator_cpu: Duration,
+    /// CPU time inside the controller.
+    pub controller_cpu: Duration,
+    /// CPU time inside episodes as a whole.
+    pub episodes_cpu: Duration,
 }
 
 impl Timing {
@@ -82,15 +85,21 @@ impl Timing {
         self.ordinary_ns.extend(other.ordinary_ns);
         self.decision_ns.extend(other.decision_ns);
         self.instruct_ns.extend(other.instruct_ns);
-        self.simulator += other.simulator;
-        self.episodes += other.episodes;
+        self.simulator_cpu += other.simulator_cpu;
+        self.controller_cpu += other.controller_cpu;
+        self.episodes_cpu += other.episodes_cpu;
     }
+}
 
-    /// Inside the controller, all kinds of calls together.
-    pub fn controller(&self) -> Duration {
-        let all = [&self.ordinary_ns, &self.decision_ns, &self.instruct_ns];
-        Duration::from_nanos(all.into_iter().flatten().sum())
-    }
+/// CPU time that this thread has used: unlike the wall clock's, its differences do not depend on what else the machine does.
+fn cpu_time() -> Duration {
+    // The clock starts at zero, so it always converts.
+    Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).unwrap_or_default()
+}
+
+/// CPU time that this thread has used since it was `earlier`.
+fn cpu_since(earlier: Duration) -> Duration {
+    cpu_time().saturating_sub(earlier)
 }
 
 /// The memory of one controller, allocated once.
@@ -147,20 +156,11 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
 
     /// Runs one episode to its end: all commanded sub-tasks completed, or the environment's number of steps.
     pub fn run(&mut self, task: &Task<'_>) -> Result<Episode, RolloutError> {
-        let start = Instant::now();
-        self.controller.set_decision(task.decision);
-        let instruct = Instant::now();
-        let known = self
-            .controller
-            .set_instruction(Instruction::Id(task.instruction));
-        self.timing
-            .instruct_ns
-            .push(nanoseconds(instruct.elapsed()));
-        known.map_err(RolloutError::Instruction)?;
-
-        let reset = Instant::now();
+        let episode_cpu = cpu_time();
+        self.instruct(task)?;
+        let reset_cpu = cpu_time();
         narrow(self.environment.reset(task.seed), &mut self.observation);
-        self.timing.simulator += reset.elapsed();
+        self.timing.simulator_cpu += cpu_since(reset_cpu);
 
         let mut plans = Vec::with_capacity(self.environment.max_steps());
         for step in 0..self.environment.max_steps() {
@@ -173,7 +173,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             }
             self.control_step(step, &mut plans)?;
         }
-        self.timing.episodes += start.elapsed();
+        self.timing.episodes_cpu += cpu_since(episode_cpu);
         Ok(Episode {
             steps: self.environment.steps(),
             completions: self.environment.completions().to_vec(),
@@ -181,10 +181,23 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         })
     }
 
+    fn instruct(&mut self, task: &Task<'_>) -> Result<(), RolloutError> {
+        self.controller.set_decision(task.decision);
+        let instruction = Instruction::Id(task.instruction);
+        let (start, start_cpu) = (Instant::now(), cpu_time());
+        let known = self.controller.set_instruction(instruction);
+        self.timing.controller_cpu += cpu_since(start_cpu);
+        self.timing.instruct_ns.push(nanoseconds(start.elapsed()));
+        known.map_err(RolloutError::Instruction)
+    }
+
     fn control_step(&mut self, step: usize, plans: &mut Vec<u32>) -> Result<(), RolloutError> {
+        let before_cpu = cpu_time();
         let start = Instant::now();
         let report = self.controller.step(&self.observation, &mut self.action);
         let elapsed_ns = nanoseconds(start.elapsed());
+        let controlled_cpu = cpu_time();
+        self.timing.controller_cpu += controlled_cpu.saturating_sub(before_cpu);
         let report = report.map_err(|error| RolloutError::Step { step, error })?;
         if report.decided {
             plans.push(report.plan.0);
@@ -196,13 +209,12 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         for (command, &action) in self.command.iter_mut().zip(&self.action) {
             *command = f64::from(action);
         }
-        let start = Instant::now();
         let observation = self
             .environment
             .step(&self.command)
             .map_err(|error| RolloutError::Action { step, error })?;
-        self.timing.simulator += start.elapsed();
         narrow(observation, &mut self.observation);
+        self.timing.simulator_cpu += cpu_since(controlled_cpu);
         Ok(())
     }
 }

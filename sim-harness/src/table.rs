@@ -171,10 +171,11 @@ fn time(results: &Results, f: &mut Formatter<'_>) -> fmt::Result {
     };
     write!(f, "\n{:.1} s on {} {threads}", time.wall_s, time.threads)?;
     if let Some(share) = time.simulator_share {
+        let controller = 100.0 * time.controller_cpu_s / time.episodes_cpu_s;
+        let simulator = 100.0 * share;
         write!(
             f,
-            "; {:.1} % of the episodes' time inside MuJoCo",
-            100.0 * share
+            "; CPU time of the episodes: {simulator:.1} % inside MuJoCo, {controller:.1} % in the controller"
         )?;
     }
     writeln!(f)

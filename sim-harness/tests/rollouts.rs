@@ -139,7 +139,7 @@ fn episodes_end_when_the_commanded_sub_tasks_are_done() {
         (timing.decision_ns.len(), timing.ordinary_ns.len()),
         (plans, steps - plans)
     );
-    assert!(timing.simulator + timing.controller() <= timing.episodes);
+    assert!(timing.simulator_cpu + timing.controller_cpu <= timing.episodes_cpu);
 }
 
 #[test]
