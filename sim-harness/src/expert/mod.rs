@@ -1,6 +1,6 @@
 //! Scripted experts: they see the true state, perform sub-tasks one after the other, and their actions are the demonstrations' labels.
 //!
-//! A [`Performer`] owns the episode while it lasts: every action goes through [`Performer::act`], which adds the recovery noise to what is
+//! A [`Performer`] owns the episode while it lasts: every action goes through one place, which adds the recovery noise to what is
 //! executed (never to the label), records the step and stops the performance when its time is up. Each sub-task is a loop that tries again
 //! from a fresh approach when a grip is lost or nothing moves, see [`kitchen`].
 
