@@ -4,7 +4,8 @@
 
 use std::fmt::{self, Display, Formatter};
 
-use lads_core::image::{Beyond, ProgramKind, Split};
+use lads_core::image::{Beyond, PolicyKind, ProgramKind, Split};
+use lads_core::op::Port;
 use lads_core::{Contract, Decision, Element, Policy, Program};
 use serde_json::{Value, json};
 
@@ -38,7 +39,7 @@ impl<'m> Report<'m> {
             "form": self.form(),
             "bundle_sha256": contract.bundle_sha256(),
             "contract": {
-                "kind": format!("{:?}", contract.kind()).to_lowercase(),
+                "kind": kind(contract),
                 "environment": { "id": contract.environment_id(), "version": contract.environment_version() },
                 "control_period_s": decimal(contract.control_period_s()),
                 "horizon": contract.horizon(),
@@ -195,10 +196,9 @@ impl Report<'_> {
             "\nentry                          ops  arena [B]  inputs → outputs"
         )?;
         for (name, program) in self.entries() {
-            let ports = |ports: Vec<String>| ports.join(", ");
-            let (inputs, outputs) = (ports(inputs(program)), ports(outputs(program)));
+            let (inputs, effects) = (inputs(program).join(", "), effects(program));
             let (ops, arena) = (program.ops().count(), bytes(program.arena_len()));
-            writeln!(f, "  {name:<26} {ops:>5} {arena:>10}  {inputs} → {outputs}")?;
+            writeln!(f, "  {name:<26} {ops:>5} {arena:>10}  {inputs} → {effects}")?;
         }
         Ok(())
     }
@@ -251,6 +251,28 @@ fn elements<'c>(
     Ok(())
 }
 
+fn kind(contract: &Contract<'_>) -> &'static str {
+    match contract.kind() {
+        PolicyKind::Lads => "lads",
+    }
+}
+
+fn port_name(port: Port) -> &'static str {
+    match port {
+        Port::Observation => "observation",
+        Port::Action => "action",
+        Port::Words => "words",
+        Port::Timestep => "timestep",
+        Port::Plan => "plan",
+        Port::PlanIndex => "plan_index",
+        Port::Logits => "logits",
+        Port::Latent => "latent",
+        Port::Observations => "observations",
+        Port::Actions => "actions",
+        Port::InstructionId => "instruction_id",
+    }
+}
+
 fn entry_name(kind: ProgramKind) -> &'static str {
     match kind {
         ProgramKind::Instruct => "high_level/instruct",
@@ -263,21 +285,20 @@ fn entry_name(kind: ProgramKind) -> &'static str {
     }
 }
 
-fn inputs(program: &Program<'_>) -> Vec<String> {
-    program
-        .inputs()
-        .map(|port| format!("{:?}", port.port).to_lowercase())
-        .collect()
+fn inputs(program: &Program<'_>) -> Vec<&'static str> {
+    program.inputs().map(|port| port_name(port.port)).collect()
 }
 
-/// The outputs; what a program leaves in the KV cache is none, but it is what recording programs are for.
-fn outputs(program: &Program<'_>) -> Vec<String> {
-    let cached = (program.tokens() > 0).then(|| format!("KV of {} tokens", program.tokens()));
-    program
-        .outputs()
-        .map(|port| format!("{:?}", port.port).to_lowercase())
-        .chain(cached)
-        .collect()
+fn outputs(program: &Program<'_>) -> Vec<&'static str> {
+    program.outputs().map(|port| port_name(port.port)).collect()
+}
+
+/// The outputs and, after them, what the program leaves in the KV cache.
+fn effects(program: &Program<'_>) -> String {
+    let tokens = program.tokens();
+    let cached = (tokens > 0).then(|| format!("KV of {tokens} tokens"));
+    let outputs = outputs(program).into_iter().map(str::to_owned);
+    outputs.chain(cached).collect::<Vec<_>>().join(", ")
 }
 
 fn entry_json(name: &str, program: &Program<'_>) -> Value {
@@ -287,7 +308,7 @@ fn entry_json(name: &str, program: &Program<'_>) -> Value {
         "arena_bytes": bytes(program.arena_len()),
         "tokens": program.tokens(),
         "inputs": inputs(program),
-        "outputs": program.outputs().map(|port| format!("{:?}", port.port).to_lowercase()).collect::<Vec<_>>(),
+        "outputs": outputs(program),
     })
 }
 

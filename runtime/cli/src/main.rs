@@ -25,7 +25,7 @@ const REFUSED: u8 = 2;
 
 /// Looks into, compiles, tests and drives LADS policies.
 #[derive(Debug, Parser)]
-#[command(version, about)]
+#[command(version, arg_required_else_help = false)]
 struct Arguments {
     #[command(subcommand)]
     command: Command,

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
 use lads_compiler::{Bundle, compile};
+use lads_core::image::{CRC_WORD, crc32};
 use lads_core::{Golden, Policy};
 use serde_json::Value;
 
@@ -278,16 +279,22 @@ fn self_test_passes_and_a_changed_golden_episode_fails() {
     let folder = tempfile::tempdir().unwrap();
     let image = folder.path().join("tiny.lads");
     answer(&["compile", &model, "-o", image.to_str().unwrap()], "");
-    let mut bytes = fs::read(&image).unwrap();
-    // The last word of the image is the last action's last element.
+    let image = image.to_str().unwrap();
+    let mut bytes = fs::read(image).unwrap();
+    // The last word of an image is the last element of the last recorded action.
     let last = bytes.len() - 1;
     bytes[last] ^= 0x40;
-    fs::write(&image, &bytes).unwrap();
-    refused(
-        &["self-test", image.to_str().unwrap()],
-        "",
-        &["tiny.lads", "checksum", "compile it again"],
-    );
+    fs::write(image, &bytes).unwrap();
+    let parts = ["tiny.lads", "checksum", "compile it again"];
+    refused(&["self-test", image], "", &parts);
+    // With the checksum put right, the comparison has to find it.
+    let crc = crc32(&bytes);
+    bytes[4 * CRC_WORD..4 * CRC_WORD + 4].copy_from_slice(&crc.to_le_bytes());
+    fs::write(image, &bytes).unwrap();
+    let parts = ["tiny.lads", "self-test failed", "step 23", "export"];
+    refused(&["self-test", image], "", &parts);
+    let answered = refused(&act(image, &[]), "0,0,0,0,0\n", &parts);
+    assert!(answered.is_empty(), "it is not let near a motor");
 }
 
 #[test]
@@ -420,6 +427,7 @@ fn bad_arguments_are_one_line() {
         &["--instruction", "--help"],
     );
     refused(&["dance"], "", &["dance", "--help"]);
+    refused(&[], "", &["subcommand", "self-test", "--help"]);
     refused(
         &["act", "--model", "m", "--instruction", "x", "--seed", "3"],
         "",

@@ -32,7 +32,7 @@ const INTERRUPTED: u8 = 130;
 
 /// Runs a policy bundle in simulation over its instructions; prints success rates and control-step latency.
 #[derive(Debug, Parser)]
-#[command(version, about)]
+#[command(version)]
 struct Arguments {
     /// The policy bundle (ONNX)
     #[arg(long)]
