@@ -13,6 +13,7 @@ pub mod fit;
 pub mod instructions;
 pub mod kitchen;
 pub mod metrics;
+pub mod output;
 pub mod random;
 pub mod registry;
 pub mod results;

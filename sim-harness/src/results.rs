@@ -1,12 +1,9 @@
 //! What `lads-run` reports: rollouts summed up per instruction and per split, and their JSON form (documented in results.schema.json).
 //!
 //! Invariants: the order is the contract's order of instructions and then of episodes, whatever the thread count; everything but
-//! `latency_us` and `time` depends only on bundle, seed, noise, decision and versions. Writing goes to a temporary file beside the target
-//! that is renamed when it is complete, so a failure leaves the target as it was.
+//! `latency_us` and `time` depends only on bundle, seed, noise, decision and versions.
 
 use std::collections::BTreeMap;
-use std::io::{self, Write as _};
-use std::path::Path;
 
 use lads_core::image::Split;
 use lads_core::{Decision, KnownInstruction};
@@ -355,36 +352,6 @@ pub struct Results {
     pub time: TimeUse,
 }
 
-/// Writes `results` to `path` as JSON: to a temporary file in the same folder, then renamed.
-pub fn write_json(results: &Results, path: &Path) -> io::Result<()> {
-    let mut file = temporary_beside(path)?;
-    serde_json::to_writer_pretty(&mut file, results)?;
-    file.write_all(b"\n")?;
-    file.as_file().sync_all()?;
-    file.persist(path).map_err(|error| error.error)?;
-    Ok(())
-}
-
-/// A temporary file in the folder of `path`, so that it can be renamed to it; also the check, made before any rollout, that this will work.
-pub fn temporary_beside(path: &Path) -> io::Result<tempfile::NamedTempFile> {
-    if path.is_dir() {
-        return Err(io::Error::new(
-            io::ErrorKind::IsADirectory,
-            "it is a folder",
-        ));
-    }
-    let folder = match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder,
-        _ => Path::new("."),
-    };
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(".lads-run-").suffix(".tmp");
-    // As `File::create` would: readable by all whom the umask lets.
-    #[cfg(unix)]
-    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-    builder.tempfile_in(folder)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -498,25 +465,6 @@ mod tests {
                 .completions
                 .iter()
                 .all(|of| of.rate.episodes == 2)
-        );
-    }
-
-    #[test]
-    fn a_failed_write_leaves_the_old_file() {
-        let folder = tempfile::tempdir().unwrap();
-        assert!(
-            temporary_beside(folder.path()).is_err(),
-            "a folder is no target"
-        );
-        assert!(temporary_beside(&folder.path().join("no/such/r.json")).is_err());
-        let target = folder.path().join("r.json");
-        std::fs::write(&target, "old").unwrap();
-        drop(temporary_beside(&target).unwrap());
-        assert_eq!(std::fs::read_to_string(&target).unwrap(), "old");
-        assert_eq!(
-            std::fs::read_dir(folder.path()).unwrap().count(),
-            1,
-            "no temporary file stays"
         );
     }
 }

@@ -23,7 +23,7 @@ use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError};
 use lads_sim::results::{self, InstructionResult, Results};
 use lads_sim::rollout::Memory;
 use lads_sim::table::Table;
-use lads_sim::{assets, fit, registry};
+use lads_sim::{assets, fit, output, registry};
 
 /// Exit code of everything that was refused.
 const REFUSED: u8 = 2;
@@ -110,7 +110,7 @@ fn run(arguments: &Arguments) -> Result<(), End> {
     let stop = stop_on_interrupt()?;
     let threads = check_numbers(arguments)?;
     if let Some(path) = &arguments.json {
-        drop(results::temporary_beside(path).map_err(|error| unwritable(path, &error))?);
+        drop(output::temporary_beside(path).map_err(|error| unwritable(path, &error))?);
     }
 
     let about = |wrong: &dyn Display| refused(format!("{}: {wrong}", arguments.model.display()));
@@ -162,7 +162,7 @@ fn run(arguments: &Arguments) -> Result<(), End> {
         wall,
     );
     if let Some(path) = &arguments.json {
-        results::write_json(&results, path).map_err(|error| unwritable(path, &error))?;
+        output::write_json(&results, path).map_err(|error| unwritable(path, &error))?;
     }
     print(&Table(&results))
 }
