@@ -68,6 +68,9 @@ class Data:
     weights: dict  # instruction id -> sampling weight; others 1
     renoise: bool  # draw fresh observation noise on the clean states while the low level trains
     word_dropout: float  # probability with which a word token is left out of the high level's prefix
+    ending_rate: float  # share of the high level's trajectories that get an instruction with another ending; 0 is the paper's
+    ending_variants: int  # other endings per beginning
+    ending_margin: float  # with k of n phrases kept, steps before (k - margin) / n of the trajectory count
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from .bundle import write_atomically
 from .codebook import nearest, perplexity
 from .config import UserError
 from .corpus import Corpus
+from .endings import Endings
 from .model import Lads
 
 STAGES = {"joint": ("joint",), "staged": ("plans", "low_level", "high_level")}
@@ -42,9 +43,10 @@ COLUMNS = ("stage", "step", "learning_rate", "ms_per_step", "loss", "bc", "commi
 class Losses:
     """The losses of Section 4 on a corpus, as functions of episodes."""
 
-    def __init__(self, lads, corpus, config):
-        self.lads, self.corpus, self.config = lads, corpus, config
-        self.autocast = config.training.bf16 and _fast_bfloat16(corpus.device)
+    def __init__(self, lads, corpus, setting):
+        self.lads, self.corpus, self.config = lads, corpus, setting.config
+        self.endings = Endings(setting, corpus.device)
+        self.autocast = setting.config.training.bf16 and _fast_bfloat16(corpus.device)
 
     def offsets(self, episodes, generator):
         if not self.config.training.random_offset:
@@ -84,17 +86,29 @@ class Losses:
         corpus = self.corpus
         length = int(corpus.lengths[episodes].max())
         at = episodes.to(corpus.device)
-        words = [self._some_words(corpus.words[i]) for i in corpus.instruction[episodes]]
+        words, codes = self._instructions(episodes, codes[:, :length])
         with torch.autocast(corpus.device.type, torch.bfloat16, enabled=self.autocast):
             logits = self.lads.high_level(words, corpus.observations[at, :length], corpus.executed[at, :length])
-        codes = codes[:, :length]
         logits, targets = logits[codes >= 0], codes[codes >= 0]
         return F.cross_entropy(logits, targets), (logits.argmax(-1) == targets).float().mean()
 
+    def _instructions(self, episodes, codes):
+        """The words of each episode's instruction and its targets; in training, some with another ending."""
+        words = [self.corpus.words[i] for i in self.corpus.instruction[episodes]]
+        if not self.lads.high_level.training:
+            return words, codes
+        codes = codes.clone()
+        for row, episode in enumerate(episodes.tolist()):
+            other = self.endings.draw(int(self.corpus.instruction[episode]), int(self.corpus.lengths[episode]))
+            if other is not None:
+                words[row], steps = other
+                codes[row, steps:] = -1
+        return [self._some_words(row) for row in words], codes
+
     def _some_words(self, words):
-        """The words less a random few, while training; the last token ([SEP]) always stays."""
+        """The words less a random few; the last token ([SEP]) always stays."""
         rate = self.config.data.word_dropout
-        if rate == 0 or not self.lads.high_level.training:
+        if rate == 0:
             return words
         keep = torch.rand(len(words), device=words.device) >= rate
         keep[-1] = True
@@ -259,7 +273,7 @@ class Trainer:
         self.corpus = Corpus(dataset, setting, encoded, device)
         self.lads.normalizer.mean.copy_(self.corpus.mean)
         self.lads.normalizer.std.copy_(self.corpus.std)
-        self.losses = Losses(self.lads, self.corpus, self.config)
+        self.losses = Losses(self.lads, self.corpus, setting)
         self.notes = dataset.notes
         self.golden = golden_candidates(dataset, self.corpus.validation.tolist())
         self.position = {"stage": 0, "step": 0}
