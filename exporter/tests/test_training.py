@@ -163,7 +163,10 @@ def test_fresh_noise_and_word_dropout(tmp_path):
     assert len(lengths) > 2 and max(lengths) <= len(words)
     assert all(torch.equal(losses._some_words(words)[-1], words[-1]) for _ in range(20))
     losses.lads.eval()
-    assert losses._some_words(words) is words
+    codes = torch.zeros(6, corpus.steps, dtype=torch.long)
+    shown, same = losses._instructions(corpus.train[:6], codes)
+    assert same is codes
+    assert all(row is corpus.words[i] for row, i in zip(shown, corpus.instruction[corpus.train[:6]]))
 
 
 def test_batches_of_similar_length_use_every_drawn_episode(tmp_path):
