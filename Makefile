@@ -47,7 +47,7 @@ test-exporter: setup $(VENV)/stamp
 
 ## collect: scripted demonstrations for the 22 seen instructions into data/kitchen.safetensors
 collect: setup
-	cargo run --release -p lads-sim --bin lads-collect -- --env kitchen -o data/kitchen.safetensors
+	cargo run --release -p lads-sim --bin lads-collect -- --env kitchen --episodes-per-instruction 50 -o data/kitchen.safetensors
 
 ## train: the shipped policy from data/kitchen.safetensors into runs/kitchen
 train: $(VENV)/stamp
