@@ -1,0 +1,77 @@
+"""The runtime (`lads act`) against ONNX Runtime on the same bundle: the same plans, actions within 1e-4, over whole episodes.
+
+Run with `python -m pytest tests/parity` in the exporter's environment, after `cargo build -p lads-cli`. Skipped where either is missing.
+"""
+
+import base64
+import json
+import os
+import pathlib
+import subprocess
+
+import pytest
+
+np = pytest.importorskip("numpy")
+onnx = pytest.importorskip("onnx")
+replay = pytest.importorskip("lads_exporter.replay")
+from safetensors.numpy import load  # noqa: E402
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
+BUNDLES = sorted((ROOT / "models").glob("*.onnx")) + [ROOT / "runtime/compiler/tests/data/tiny.onnx"]
+TOLERANCE = 1e-4
+
+
+def lads():
+    builds = [p for p in (TARGET / profile / "lads" for profile in ("release", "debug")) if p.is_file()]
+    if not builds:
+        pytest.skip("lads is not built: run `cargo build -p lads-cli`")
+    return max(builds, key=lambda path: path.stat().st_mtime)
+
+
+def act(bundle, instruction, observations):
+    """-> plans [T], actions [T, A] of the runtime."""
+    lines = "".join(json.dumps([float(x) for x in row]) + "\n" for row in observations)
+    command = [lads(), "act", "--model", bundle, "--instruction", instruction, "--plans"]
+    done = subprocess.run(command, input=lines, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(rows) == len(observations)
+    return np.array([row[-1] for row in rows]), np.array([row[:-1] for row in rows], np.float32)
+
+
+@pytest.fixture(params=BUNDLES, ids=lambda path: path.stem)
+def bundle(request):
+    model = onnx.load(request.param)
+    metadata = {entry.key: entry.value for entry in model.metadata_props}
+    golden = load(base64.b64decode(metadata["lads.golden"]))
+    return request.param, replay.Bundle(model), json.loads(metadata["lads.contract"]), golden
+
+
+def test_golden_episode(bundle):
+    path, reference, contract, golden = bundle
+    index = int(golden["instruction"][0])
+    plans, actions, _ = reference.open_loop(contract, index, golden["observations"])
+    ours, our_actions = act(path, contract["instructions"][index]["id"], golden["observations"])
+    assert (ours == plans).all() and (ours == golden["plans"]).all()
+    assert np.abs(our_actions - actions).max() <= TOLERANCE
+    assert np.abs(our_actions - golden["actions"]).max() <= TOLERANCE
+
+
+@pytest.mark.parametrize("offset", [1, 7])
+def test_other_instructions_on_the_same_observations(bundle, offset):
+    """What the observations mean does not matter here: any instruction has to give the same numbers.
+
+    Two logits may be closer than rounding; from there on the two may rightly differ, so the comparison ends at the first
+    decision with a margin below the tolerance.
+    """
+    path, reference, contract, golden = bundle
+    index = (int(golden["instruction"][0]) + offset) % len(contract["instructions"])
+    plans, actions, logits = reference.open_loop(contract, index, golden["observations"])
+    ordered = np.sort(logits[:: contract["horizon"]], axis=1)
+    close = np.flatnonzero(ordered[:, -1] - ordered[:, -2] < TOLERANCE)
+    stop = close[0] * contract["horizon"] if len(close) else len(plans)
+    assert stop > contract["horizon"], "a comparison of nothing"
+    ours, our_actions = act(path, contract["instructions"][index]["id"], golden["observations"])
+    assert (ours[:stop] == plans[:stop]).all()
+    assert np.abs(our_actions[:stop] - actions[:stop]).max() <= TOLERANCE
