@@ -17,6 +17,8 @@
 //! - An action that leaves the controller is finite and inside the contract's limits.
 //! - Nothing is allocated, no call blocks, and the work of a step is bounded by the longest context.
 
+use lads_kernels::Isa;
+
 use crate::contract::Decision;
 use crate::decision::{Decider, PlanIndex, margin};
 use crate::errors::{EncodeError, InstructionError, StepError};
@@ -73,9 +75,16 @@ pub struct Controller<'a, 'm> {
 }
 
 impl<'a, 'm> Controller<'a, 'm> {
-    /// A controller with the contract's decision rule and no instruction yet. The workspace has to be one made for this policy:
-    /// with that of another policy, calls fail with [`ExecError::Span`].
+    /// A controller with the contract's decision rule and no instruction yet, on the widest instructions that this CPU offers.
+    /// The workspace has to be one made for this policy: with that of another policy, calls fail with [`ExecError::Span`].
     pub fn new(policy: Policy<'a>, workspace: Workspace<'m>) -> Self {
+        Self::with_isa(policy, workspace, Isa::detect())
+    }
+
+    /// The same on chosen instructions; the results have the same bits on all of them. [`Isa::portable`] runs the same machine
+    /// code on every CPU of a target.
+    pub fn with_isa(policy: Policy<'a>, mut workspace: Workspace<'m>, isa: Isa) -> Self {
+        workspace.machine.isa = isa;
         let decider = Decider::new(policy.contract().decision());
         let clock = Clock {
             timestep: 0,
@@ -95,6 +104,11 @@ impl<'a, 'm> Controller<'a, 'm> {
     /// The policy at work.
     pub fn policy(&self) -> &Policy<'a> {
         &self.policy
+    }
+
+    /// The instructions that it runs on.
+    pub fn isa(&self) -> Isa {
+        self.workspace.machine.isa
     }
 
     /// Changes how plans are picked, from the next decision on. Sampling starts again from the seed.

@@ -9,6 +9,7 @@ use core::fmt;
 use core::ops::Range;
 
 use lads_kernels as kernels;
+use lads_kernels::Isa;
 
 use crate::check::arena_span;
 use crate::image::PortRecord;
@@ -80,6 +81,8 @@ pub(crate) struct Machine<'m> {
     pub arena: &'m mut [f32],
     pub cache: &'m mut [f32],
     pub ints: [u32; INT_SLOTS],
+    /// What the kernels run on.
+    pub isa: Isa,
 }
 
 impl Machine<'_> {
@@ -132,12 +135,12 @@ impl Machine<'_> {
 
     fn op(&mut self, op: &Op, weights: &[f32], past: usize) -> Result<(), ExecError> {
         let span = match op {
-            Op::Linear(op) => linear(op, weights, self.arena),
-            Op::LayerNorm(op) => layer_norm(op, weights, self.arena),
-            Op::Attention(op) => attention(op, past, self.arena, self.cache),
+            Op::Linear(op) => linear(op, self.isa, weights, self.arena),
+            Op::LayerNorm(op) => layer_norm(op, self.isa, weights, self.arena),
+            Op::Attention(op) => attention(op, self.isa, past, self.arena, self.cache),
             Op::Binary(op) => binary(op, weights, self.arena),
-            Op::Unary(op) => unary(op, weights, self.arena),
-            Op::Softmax(op) => softmax(op, self.arena),
+            Op::Unary(op) => unary(op, self.isa, weights, self.arena),
+            Op::Softmax(op) => softmax(op, self.isa, self.arena),
             Op::Reduce(op) => reduce(op, weights, self.arena),
             Op::MatMul(op) => matmul(op, weights, self.arena),
             Op::Copy(op) => copy(op, weights, self.arena),
@@ -229,7 +232,7 @@ impl<'r> Readable<'r> {
     }
 }
 
-fn linear(op: &op::Linear, weights: &[f32], arena: &mut [f32]) -> Option<()> {
+fn linear(op: &op::Linear, isa: Isa, weights: &[f32], arena: &mut [f32]) -> Option<()> {
     let (read, y) = Readable::cut(weights, arena, op.y)?;
     let bias = op
         .bias
@@ -242,23 +245,28 @@ fn linear(op: &op::Linear, weights: &[f32], arena: &mut [f32]) -> Option<()> {
         activation: op.activation,
         accumulate: op.accumulate,
     };
-    layer.run(read.get(op.x.into())?, y);
+    layer.run(isa, read.get(op.x.into())?, y);
     Some(())
 }
 
-fn layer_norm(op: &op::LayerNorm, weights: &[f32], arena: &mut [f32]) -> Option<()> {
+fn layer_norm(op: &op::LayerNorm, isa: Isa, weights: &[f32], arena: &mut [f32]) -> Option<()> {
     let (read, y) = Readable::cut(weights, arena, op.y)?;
-    kernels::layer_norm(
-        read.get(op.x.into())?,
-        read.get(op.gamma.into())?,
-        read.get(op.beta.into())?,
-        op.eps,
-        y,
-    );
+    let norm = kernels::LayerNorm {
+        gamma: read.get(op.gamma.into())?,
+        beta: read.get(op.beta.into())?,
+        eps: op.eps,
+    };
+    norm.run(isa, read.get(op.x.into())?, y);
     Some(())
 }
 
-fn attention(op: &op::Attention, past: usize, arena: &mut [f32], cache: &mut [f32]) -> Option<()> {
+fn attention(
+    op: &op::Attention,
+    isa: Isa,
+    past: usize,
+    arena: &mut [f32],
+    cache: &mut [f32],
+) -> Option<()> {
     let (heads, head_dim) = (op.heads as usize, op.head_dim as usize);
     let width = heads * head_dim;
     let [cache_k, cache_v] = cache
@@ -293,7 +301,7 @@ fn attention(op: &op::Attention, past: usize, arena: &mut [f32], cache: &mut [f3
         cache_k,
         cache_v,
     };
-    attention.run(q, y, scratch);
+    attention.run(isa, q, y, scratch);
     Some(())
 }
 
@@ -314,19 +322,23 @@ fn binary(op: &op::Binary, weights: &[f32], arena: &mut [f32]) -> Option<()> {
     Some(())
 }
 
-fn unary(op: &op::Unary, weights: &[f32], arena: &mut [f32]) -> Option<()> {
+fn unary(op: &op::Unary, isa: Isa, weights: &[f32], arena: &mut [f32]) -> Option<()> {
     let (read, y) = Readable::cut(weights, arena, op.y)?;
+    let unary = kernels::Unary {
+        kind: op.kind,
+        alpha: op.alpha,
+    };
     if arena_span(op.x) == Some(op.y) {
-        kernels::unary_in_place(op.kind, op.alpha, y);
+        unary.run_in_place(isa, y);
     } else {
-        kernels::unary(op.kind, op.alpha, read.get(op.x)?, y);
+        unary.run(isa, read.get(op.x)?, y);
     }
     Some(())
 }
 
-fn softmax(op: &op::Softmax, arena: &mut [f32]) -> Option<()> {
+fn softmax(op: &op::Softmax, isa: Isa, arena: &mut [f32]) -> Option<()> {
     let (read, y) = Readable::cut(&[], arena, op.y)?;
-    kernels::softmax(read.get(op.x.into())?, op.cols as usize, y);
+    kernels::softmax(isa, read.get(op.x.into())?, op.cols as usize, y);
     Some(())
 }
 

@@ -8,7 +8,7 @@
 //! Invariants: no `std`, no allocation, no unsafe code, no panic. Sizes (contract), weights (image) and mutable state
 //! (workspace) are three types. Everything about a model is checked when it is opened; afterwards only what the caller passes
 //! can be refused, with one small error enum per operation. The same image and the same calls give the same bits on every
-//! target.
+//! target and on every [`Isa`], which a controller chooses once, when it is made.
 //!
 //! ```no_run
 //! use lads_core::{Controller, Instruction, Policy, Workspace};
@@ -70,6 +70,7 @@ pub use decision::PlanIndex;
 pub use errors::{EncodeError, InstructionError, StepError};
 pub use exec::ExecError;
 pub use golden::Golden;
+pub use lads_kernels::Isa;
 pub use policy::{Policy, PolicyError};
 pub use program::{Program, ProgramError};
 pub use self_test::{SelfTest, SelfTestError};

@@ -3,6 +3,8 @@
 use core::error::Error;
 use core::fmt;
 
+use lads_kernels::Isa;
+
 use crate::exec::Machine;
 use crate::op::INT_SLOTS;
 use crate::policy::Policy;
@@ -51,6 +53,7 @@ impl<'m> Workspace<'m> {
                 arena,
                 cache,
                 ints: [0; INT_SLOTS],
+                isa: Isa::portable(),
             },
             now,
             next,

@@ -4,8 +4,8 @@ mod support;
 
 use lads_core::image::{Beyond, DecisionRule, ProgramKind};
 use lads_core::{
-    Controller, Decision, EncodeError, Instruction, InstructionError, PlanIndex, Policy, StepError,
-    Workspace,
+    Controller, Decision, EncodeError, Instruction, InstructionError, Isa, PlanIndex, Policy,
+    StepError, Workspace,
 };
 use support::assemble::{parts, with_golden};
 use support::{Image, Memory, Model, Random, Spec};
@@ -521,6 +521,46 @@ fn a_workspace_of_another_policy_is_refused_by_the_calls() {
         assert!(told.is_err() || stepped.is_err());
         assert!(stepped.is_err());
     }
+}
+
+/// One kitchen-sized episode, bit for bit.
+#[test]
+fn every_instruction_set_gives_the_same_actions() {
+    let image = parts(&Model::random(Spec::KITCHEN, 5)).image();
+    let policy = image.policy();
+    let episode = |isa: Isa| {
+        let mut memory = Memory::for_policy(&policy);
+        let workspace = Workspace::new(&policy, &mut memory.arena, &mut memory.state)
+            .expect("the memory suffices");
+        let mut controller = Controller::with_isa(policy, workspace, isa);
+        assert_eq!(controller.isa(), isa);
+        controller
+            .set_instruction(Instruction::Id(0))
+            .expect("there is one");
+        let mut random = Random(7);
+        let mut bits = Vec::new();
+        for _ in 0..50 {
+            let observation = random.vec(policy.contract().observation_len(), 1.0);
+            let mut action = vec![0.0; policy.contract().action_len()];
+            let report = controller
+                .step(&observation, &mut action)
+                .expect("within limits");
+            bits.push(report.margin.to_bits());
+            bits.extend(
+                action
+                    .iter()
+                    .chain(controller.logits())
+                    .map(|x| x.to_bits()),
+            );
+        }
+        bits
+    };
+    let portable = episode(Isa::portable());
+    for isa in Isa::all() {
+        assert_eq!(episode(isa), portable, "{isa:?}");
+    }
+    let mut memory = Memory::for_policy(&policy);
+    assert_eq!(memory.controller(&policy).isa(), Isa::detect());
 }
 
 #[test]

@@ -9,9 +9,10 @@
 //! y    = (sum over r of p[r] * V[r]) / sum p
 //! ```
 //!
-//! Departures for speed: the dot product runs in sixteen lanes, the weighted sum keeps sixteen elements of `y` in registers and
-//! runs over all rows for each such block, and the division by the sum comes last.
+//! Departures for speed: the dot product runs in sixteen lanes, the weighted sum keeps thirty-two elements of `y` in registers
+//! and runs over all rows for each such pair of blocks, and the division by the sum comes last.
 
+use crate::dispatch::{Isa, Kernel};
 use crate::lanes::{LANES, add_products, add_scaled, tree};
 use crate::norm::exponentials;
 
@@ -54,60 +55,100 @@ pub struct Attention<'c> {
 
 impl Attention<'_> {
     /// Computes `y`, `[queries, heads * head_dim]`. `scratch` is [`attention_scratch_len`] elements long.
-    pub fn run(&self, q: &[f32], y: &mut [f32], scratch: &mut [f32]) {
-        let width = self.heads * self.head_dim;
-        if width == 0 || self.q_stride == 0 {
-            return;
+    pub fn run(&self, isa: Isa, q: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        if self.heads * self.head_dim > 0 && self.q_stride > 0 {
+            isa.run(Queries {
+                attention: self,
+                q,
+                y,
+                scratch,
+            });
         }
-        let queries = q.chunks(self.q_stride).zip(y.chunks_exact_mut(width));
-        for (i, (q, y)) in queries.enumerate() {
-            let Some(p) = scratch.get_mut(..self.visible + i) else {
+    }
+
+    /// One query and one head, whose elements start at `first` in a row of the cache; `p` has an element for each visible row.
+    #[inline(always)]
+    fn head(&self, q: &[f32], first: usize, p: &mut [f32], y: &mut [f32]) {
+        let at = [self.heads * self.head_dim, first];
+        score(q, self.cache_k, at, self.scale, p);
+        let scale = 1.0 / exponentials(p);
+        if self.head_dim.is_multiple_of(LANES) {
+            let (pairs, rest) = y.as_chunks_mut::<{ 2 * LANES }>();
+            for (i, y) in pairs.iter_mut().enumerate() {
+                let at = [at[0], first + i * 2 * LANES];
+                weigh::<2>(p, self.cache_v, at, scale, y);
+            }
+            if !rest.is_empty() {
+                let at = [at[0], first + pairs.len() * 2 * LANES];
+                weigh::<1>(p, self.cache_v, at, scale, rest);
+            }
+        } else {
+            weigh_uneven(p, self.cache_v, at, scale, y);
+        }
+    }
+}
+
+/// Attention at work.
+struct Queries<'a> {
+    attention: &'a Attention<'a>,
+    q: &'a [f32],
+    y: &'a mut [f32],
+    scratch: &'a mut [f32],
+}
+
+impl Kernel for Queries<'_> {
+    #[inline(always)]
+    fn run<const WIDE: usize>(self) {
+        let Attention {
+            heads, head_dim, ..
+        } = *self.attention;
+        let queries = self.q.chunks(self.attention.q_stride);
+        let ys = self.y.chunks_exact_mut(heads * head_dim);
+        for (i, (q, y)) in queries.zip(ys).enumerate() {
+            let Some(p) = self.scratch.get_mut(..self.attention.visible + i) else {
                 return;
             };
-            let heads = q
-                .chunks_exact(self.head_dim)
-                .zip(y.chunks_exact_mut(self.head_dim));
-            for (head, (q, y)) in heads.enumerate() {
-                let first = head * self.head_dim;
-                score(q, self.cache_k, [width, first], self.scale, p);
-                let scale = 1.0 / exponentials(p);
-                if self.head_dim.is_multiple_of(LANES) {
-                    weigh(p, self.cache_v, [width, first], scale, y);
-                } else {
-                    weigh_uneven(p, self.cache_v, [width, first], scale, y);
-                }
+            let parts = q.chunks_exact(head_dim).zip(y.chunks_exact_mut(head_dim));
+            for (head, (q, y)) in parts.enumerate() {
+                self.attention.head(q, head * head_dim, p, y);
             }
         }
     }
 }
 
 /// `p[r] = scale * dot(q, K[r])`, where row `r` of the head starts at `r * width + first`.
-#[inline(never)]
+#[inline(always)]
 fn score(q: &[f32], keys: &[f32], [width, first]: [usize; 2], scale: f32, p: &mut [f32]) {
     for (p, k) in p.iter_mut().zip(keys.chunks_exact(width)) {
         *p = dot(q, k.get(first..first + q.len()).unwrap_or(&[])) * scale;
     }
 }
 
-/// `y = scale * (sum over r of p[r] * V[r])` in the order of the rows; whole blocks of lanes.
-#[inline(never)]
-fn weigh(p: &[f32], values: &[f32], [width, first]: [usize; 2], scale: f32, y: &mut [f32]) {
+/// `y = scale * (sum over r of p[r] * V[r])` in the order of the rows, for `B` blocks of `y` from `first` on.
+#[inline(always)]
+fn weigh<const B: usize>(
+    p: &[f32],
+    values: &[f32],
+    [width, first]: [usize; 2],
+    scale: f32,
+    y: &mut [f32],
+) {
+    let mut sums = [[0.0; LANES]; B];
     let (blocks, _) = values.as_chunks::<LANES>();
-    let (ys, _) = y.as_chunks_mut::<LANES>();
-    for (i, y) in ys.iter_mut().enumerate() {
-        let mut sum = [0.0; LANES];
-        for (&p, row) in p.iter().zip(blocks.chunks_exact(width / LANES)) {
-            if let Some(v) = row.get(first / LANES + i) {
-                add_scaled(&mut sum, p, v);
-            }
+    for (&p, row) in p.iter().zip(blocks.chunks_exact(width / LANES)) {
+        let row = row.get(first / LANES..).and_then(|row| row.first_chunk());
+        let row: &[_; B] = row.unwrap_or(&[[0.0; LANES]; B]);
+        for (sum, v) in sums.iter_mut().zip(row) {
+            add_scaled(sum, p, v);
         }
-        for (y, sum) in y.iter_mut().zip(sum) {
-            *y = sum * scale;
-        }
+    }
+    for (y, sum) in y.iter_mut().zip(sums.as_flattened()) {
+        *y = sum * scale;
     }
 }
 
 /// The same for heads that are no whole number of blocks: element by element, each sum in the same order.
+#[inline(always)]
 fn weigh_uneven(p: &[f32], values: &[f32], [width, first]: [usize; 2], scale: f32, y: &mut [f32]) {
     for (i, y) in y.iter_mut().enumerate() {
         let column = values.iter().skip(first + i).step_by(width);

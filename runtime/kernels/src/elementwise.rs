@@ -1,5 +1,6 @@
 //! Functions of one element.
 
+use crate::dispatch::{Isa, Kernel};
 use crate::math;
 
 /// An operation on one element.
@@ -33,34 +34,61 @@ pub enum UnaryKind {
     Square,
 }
 
-/// `y[i] = kind(x[i])`; `alpha` is the slope of `LeakyRelu`.
-pub fn unary(kind: UnaryKind, alpha: f32, x: &[f32], y: &mut [f32]) {
-    for (y, &x) in y.iter_mut().zip(x) {
-        *y = x;
-    }
-    unary_in_place(kind, alpha, y);
+/// An operation on each element.
+#[derive(Debug, Clone, Copy)]
+pub struct Unary {
+    /// Which.
+    pub kind: UnaryKind,
+    /// The slope of [`UnaryKind::LeakyRelu`].
+    pub alpha: f32,
 }
 
-/// `y[i] = kind(y[i])`; `alpha` is the slope of `LeakyRelu`.
-pub fn unary_in_place(kind: UnaryKind, alpha: f32, y: &mut [f32]) {
-    fn each(y: &mut [f32], f: impl Fn(f32) -> f32) {
-        for y in y {
-            *y = f(*y);
+impl Unary {
+    /// `y[i] = kind(x[i])`
+    pub fn run(self, isa: Isa, x: &[f32], y: &mut [f32]) {
+        for (y, &x) in y.iter_mut().zip(x) {
+            *y = x;
         }
+        self.run_in_place(isa, y);
     }
-    match kind {
-        UnaryKind::Relu => each(y, math::relu),
-        UnaryKind::LeakyRelu => each(y, |x| math::leaky_relu(x, alpha)),
-        UnaryKind::Tanh => each(y, math::tanh),
-        UnaryKind::Sigmoid => each(y, math::sigmoid),
-        UnaryKind::Exp => each(y, math::exp),
-        UnaryKind::Log => each(y, math::log),
-        UnaryKind::Sqrt => each(y, math::sqrt),
-        UnaryKind::Rsqrt => each(y, |x| 1.0 / math::sqrt(x)),
-        UnaryKind::Neg => each(y, |x| -x),
-        UnaryKind::Abs => each(y, f32::abs),
-        UnaryKind::Recip => each(y, |x| 1.0 / x),
-        UnaryKind::Erf => each(y, math::erf),
-        UnaryKind::Square => each(y, |x| x * x),
+
+    /// `y[i] = kind(y[i])`
+    pub fn run_in_place(self, isa: Isa, y: &mut [f32]) {
+        let Self { kind, alpha } = self;
+        isa.run(Elements { kind, alpha, y });
+    }
+}
+
+/// A unary operation at work.
+struct Elements<'a> {
+    kind: UnaryKind,
+    alpha: f32,
+    y: &'a mut [f32],
+}
+
+impl Kernel for Elements<'_> {
+    #[inline(always)]
+    fn run<const WIDE: usize>(self) {
+        #[inline(always)]
+        fn each(y: &mut [f32], f: impl Fn(f32) -> f32) {
+            for y in y {
+                *y = f(*y);
+            }
+        }
+        match self.kind {
+            UnaryKind::Relu => each(self.y, math::relu),
+            UnaryKind::LeakyRelu => each(self.y, |x| math::leaky_relu(x, self.alpha)),
+            UnaryKind::Tanh => each(self.y, math::tanh),
+            UnaryKind::Sigmoid => each(self.y, math::sigmoid),
+            UnaryKind::Exp => each(self.y, math::exp),
+            UnaryKind::Log => each(self.y, math::log),
+            UnaryKind::Sqrt => each(self.y, math::sqrt),
+            UnaryKind::Rsqrt => each(self.y, |x| 1.0 / math::sqrt(x)),
+            UnaryKind::Neg => each(self.y, |x| -x),
+            UnaryKind::Abs => each(self.y, f32::abs),
+            UnaryKind::Recip => each(self.y, |x| 1.0 / x),
+            UnaryKind::Erf => each(self.y, math::erf),
+            UnaryKind::Square => each(self.y, |x| x * x),
+        }
     }
 }

@@ -1,15 +1,16 @@
 //! Dense kernels for batch-1 policies: slices and shapes, nothing of ONNX or LADS.
 //!
 //! Invariants:
-//! - No allocation, no `std`, no unsafe code, no panic: a slice that is too short leaves the rest of the result as it was.
+//! - No allocation, no `std`, no panic, and no unsafe code but in `dispatch`: a slice that is too short leaves the rest of the result as it was.
 //!   Callers that want to be told check shapes beforehand; `lads-core` does so once per program.
 //! - The same bits on every target with IEEE 754 arithmetic: every sum has one fixed order (sixteen lanes, then a tree), no
 //!   multiply-add is fused, and `exp`, `tanh` and `sigmoid` are the polynomials of [`math`].
-//! - Plain Rust that compilers vectorise: inner loops run over arrays of sixteen elements.
+//! - Plain Rust that compilers vectorise: inner loops run over arrays of sixteen elements. The kernels that a control step spends
+//!   its time in are compiled once per instruction set and take an [`Isa`], which says which of them to run.
 //!
 //! [`mod@reference`] holds the naive twin of every kernel; `tests/twins.rs` compares them on random shapes.
 #![no_std]
-#![forbid(unsafe_code)]
+#![deny(unsafe_code)]
 #![allow(
     clippy::inline_always,
     reason = "the loops vectorise once their bodies are inlined into the shape's caller"
@@ -25,6 +26,7 @@
 )]
 
 mod attention;
+mod dispatch;
 mod elementwise;
 mod lanes;
 mod linear;
@@ -36,9 +38,10 @@ pub mod reference;
 mod strided;
 
 pub use attention::{Attention, append, attention_scratch_len};
-pub use elementwise::{UnaryKind, unary, unary_in_place};
+pub use dispatch::Isa;
+pub use elementwise::{Unary, UnaryKind};
 pub use linear::{Activation, Linear, PANEL, pack, packed_len};
 pub use matmul::MatMul;
-pub use norm::{layer_norm, softmax};
+pub use norm::{LayerNorm, softmax};
 pub use reduce::{Axis, ReduceKind, arg_max, arg_min, reduce};
 pub use strided::{BinaryKind, Input, StridedCopy, binary};

@@ -2,8 +2,10 @@
 //!
 //! The weights lie in panels of sixteen outputs, `[ceil(n / 16)][k][16]`, so that one sweep over a panel reads memory strictly
 //! in order and keeps sixteen sums in registers. Rows of `x` go through a panel in pairs: the two tokens of a control step
-//! read each weight once. Each output is one sum in the order of `k`, then the bias, whatever the number of rows.
+//! read each weight once. Where registers allow it, several panels are swept side by side, because a sum waits for its last
+//! addition. Each output is one sum in the order of `k`, then the bias, whatever the number of rows or panels.
 
+use crate::dispatch::{Isa, Kernel};
 use crate::lanes::{Block, LANES, add_scaled};
 use crate::math;
 
@@ -51,6 +53,7 @@ pub enum Activation {
 impl Activation {
     #[inline(always)]
     fn apply(self, block: &mut Block) {
+        #[inline(always)]
         fn each(block: &mut Block, f: impl Fn(f32) -> f32) {
             for x in block {
                 *x = f(*x);
@@ -85,62 +88,93 @@ pub struct Linear<'w> {
 
 impl Linear<'_> {
     /// Computes `y`, `[m, n]`, from `x`, `[m, k]`; `m` is `x.len() / k`.
-    pub fn run(&self, x: &[f32], y: &mut [f32]) {
-        let (k, n) = (self.k, self.n);
-        if k == 0 || n == 0 {
-            return;
+    pub fn run(&self, isa: Isa, x: &[f32], y: &mut [f32]) {
+        if self.k > 0 && self.n > 0 {
+            isa.run(Rows { layer: self, x, y });
         }
-        for (p, panel) in self.w.chunks_exact(k * PANEL).enumerate() {
-            let (panel, _) = panel.as_chunks::<PANEL>();
-            let first = p * PANEL;
-            let mut xs = x.chunks_exact(2 * k);
-            let mut ys = y.chunks_exact_mut(2 * n);
-            for (x, y) in xs.by_ref().zip(ys.by_ref()) {
-                let (x0, x1) = x.split_at(k);
-                let (y0, y1) = y.split_at_mut(n);
-                let (sum0, sum1) = sweep_pair(panel, x0, x1);
-                self.finish(sum0, first, y0);
-                self.finish(sum1, first, y1);
-            }
-            let (x, y) = (xs.remainder(), ys.into_remainder());
-            if x.len() == k && y.len() == n {
-                self.finish(sweep(panel, x), first, y);
-            }
+    }
+
+    /// `P` panels with all rows of `x`; the first output is `first`.
+    #[inline(always)]
+    fn panels<const P: usize>(&self, w: &[f32], first: usize, x: &[f32], y: &mut [f32]) {
+        let (k, n) = (self.k, self.n);
+        let (w, _) = w.as_chunks::<PANEL>();
+        let w: [_; P] = core::array::from_fn(|p| w.get(p * k..(p + 1) * k).unwrap_or(&[]));
+        let mut xs = x.chunks_exact(2 * k);
+        let mut ys = y.chunks_exact_mut(2 * n);
+        for (x, y) in xs.by_ref().zip(ys.by_ref()) {
+            let (x0, x1) = x.split_at(k);
+            let (y0, y1) = y.split_at_mut(n);
+            let [sums0, sums1] = sweep(w, [x0, x1]);
+            self.finish(sums0, first, y0);
+            self.finish(sums1, first, y1);
+        }
+        let (x, y) = (xs.remainder(), ys.into_remainder());
+        if x.len() == k && y.len() == n {
+            let [sums] = sweep(w, [x]);
+            self.finish(sums, first, y);
         }
     }
 
     /// Bias, activation and store of the outputs from `first` on.
     #[inline(always)]
-    fn finish(&self, mut sum: Block, first: usize, y: &mut [f32]) {
-        for (sum, &bias) in sum.iter_mut().zip(self.bias.get(first..).unwrap_or(&[])) {
-            *sum += bias;
-        }
-        self.activation.apply(&mut sum);
-        let y = y.get_mut(first..).unwrap_or(&mut []);
-        for (y, &sum) in y.iter_mut().zip(&sum) {
-            *y = if self.accumulate { *y + sum } else { sum };
+    fn finish<const P: usize>(&self, sums: [Block; P], first: usize, y: &mut [f32]) {
+        for (p, mut sum) in sums.into_iter().enumerate() {
+            let first = first + p * PANEL;
+            for (sum, &bias) in sum.iter_mut().zip(self.bias.get(first..).unwrap_or(&[])) {
+                *sum += bias;
+            }
+            self.activation.apply(&mut sum);
+            let y = y.get_mut(first..).unwrap_or(&mut []);
+            for (y, &sum) in y.iter_mut().zip(&sum) {
+                *y = if self.accumulate { *y + sum } else { sum };
+            }
         }
     }
 }
 
-/// The sixteen sums of one row with a panel.
-#[inline(always)]
-fn sweep(panel: &[Block], x: &[f32]) -> Block {
-    let mut sum = [0.0; PANEL];
-    for (w, &x) in panel.iter().zip(x) {
-        add_scaled(&mut sum, x, w);
-    }
-    sum
+/// A layer at work.
+struct Rows<'a> {
+    layer: &'a Linear<'a>,
+    x: &'a [f32],
+    y: &'a mut [f32],
 }
 
-/// The sums of two rows with a panel, in the same order as [`sweep`].
-#[inline(always)]
-fn sweep_pair(panel: &[Block], x0: &[f32], x1: &[f32]) -> (Block, Block) {
-    let mut sum0 = [0.0; PANEL];
-    let mut sum1 = [0.0; PANEL];
-    for ((w, &x0), &x1) in panel.iter().zip(x0).zip(x1) {
-        add_scaled(&mut sum0, x0, w);
-        add_scaled(&mut sum1, x1, w);
+impl Kernel for Rows<'_> {
+    #[inline(always)]
+    fn run<const WIDE: usize>(self) {
+        let panel = self.layer.k * PANEL;
+        let mut groups = self.layer.w.chunks_exact(WIDE * panel);
+        let mut first = 0;
+        for w in groups.by_ref() {
+            self.layer.panels::<WIDE>(w, first, self.x, self.y);
+            first += WIDE * PANEL;
+        }
+        for w in groups.remainder().chunks_exact(panel) {
+            self.layer.panels::<1>(w, first, self.x, self.y);
+            first += PANEL;
+        }
     }
-    (sum0, sum1)
+}
+
+/// The sums of `R` rows with `P` panels, `x` of `k` elements and `w` of `k` blocks each.
+#[inline(always)]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "the lengths are compared beforehand, and the sums stay in registers only without a branch in the loop"
+)]
+fn sweep<const P: usize, const R: usize>(w: [&[Block]; P], x: [&[f32]; R]) -> [[Block; P]; R] {
+    let mut sums = [[[0.0; PANEL]; P]; R];
+    let k = x[0].len();
+    if x.iter().any(|x| x.len() != k) || w.iter().any(|w| w.len() != k) {
+        return sums;
+    }
+    for l in 0..k {
+        for p in 0..P {
+            for r in 0..R {
+                add_scaled(&mut sums[r][p], x[r][l], &w[p][l]);
+            }
+        }
+    }
+    sums
 }

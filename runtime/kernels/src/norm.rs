@@ -1,35 +1,78 @@
 //! Layer norm and softmax, row by row.
 
+use crate::dispatch::{Isa, Kernel};
 use crate::lanes::{max_of, sum_of};
 use crate::math;
 
-/// `y = (x - mean) / sqrt(variance + eps) * gamma + beta` for each row of `gamma.len()` elements; population variance, taken
-/// in a second pass over the differences from the mean.
-pub fn layer_norm(x: &[f32], gamma: &[f32], beta: &[f32], eps: f32, y: &mut [f32]) {
-    let cols = gamma.len();
-    if cols == 0 {
-        return;
+/// Layer norm with the weights of one layer.
+#[derive(Debug, Clone, Copy)]
+pub struct LayerNorm<'w> {
+    /// Multiplies each normalised element; its length is that of a row.
+    pub gamma: &'w [f32],
+    /// Added last; as long as `gamma`.
+    pub beta: &'w [f32],
+    /// Added to the variance.
+    pub eps: f32,
+}
+
+impl LayerNorm<'_> {
+    /// `y = (x - mean) / sqrt(variance + eps) * gamma + beta` for each row of `gamma.len()` elements; population variance,
+    /// taken in a second pass over the differences from the mean.
+    pub fn run(&self, isa: Isa, x: &[f32], y: &mut [f32]) {
+        if !self.gamma.is_empty() {
+            isa.run(LayerNormRows { norm: *self, x, y });
+        }
     }
-    for (x, y) in x.chunks_exact(cols).zip(y.chunks_exact_mut(cols)) {
-        let mean = sum_of(x, |x| x) / cols as f32;
-        let variance = sum_of(x, |x| (x - mean) * (x - mean)) / cols as f32;
-        let scale = 1.0 / math::sqrt(variance + eps);
-        for (((y, &x), &gamma), &beta) in y.iter_mut().zip(x).zip(gamma).zip(beta) {
-            *y = (x - mean) * scale * gamma + beta;
+}
+
+/// Layer norm at work.
+struct LayerNormRows<'a> {
+    norm: LayerNorm<'a>,
+    x: &'a [f32],
+    y: &'a mut [f32],
+}
+
+impl Kernel for LayerNormRows<'_> {
+    #[inline(always)]
+    fn run<const WIDE: usize>(self) {
+        let LayerNorm { gamma, beta, eps } = self.norm;
+        let cols = gamma.len();
+        let rows = self.x.chunks_exact(cols);
+        for (x, y) in rows.zip(self.y.chunks_exact_mut(cols)) {
+            let mean = sum_of(x, |x| x) / cols as f32;
+            let variance = sum_of(x, |x| (x - mean) * (x - mean)) / cols as f32;
+            let scale = 1.0 / math::sqrt(variance + eps);
+            for (((y, &x), &gamma), &beta) in y.iter_mut().zip(x).zip(gamma).zip(beta) {
+                *y = (x - mean) * scale * gamma + beta;
+            }
         }
     }
 }
 
 /// `y = exp(x - max) / sum(exp(x - max))` for each row of `cols` elements.
-pub fn softmax(x: &[f32], cols: usize, y: &mut [f32]) {
-    if cols == 0 {
-        return;
+pub fn softmax(isa: Isa, x: &[f32], cols: usize, y: &mut [f32]) {
+    if cols > 0 {
+        isa.run(SoftmaxRows { x, cols, y });
     }
-    for (x, y) in x.chunks_exact(cols).zip(y.chunks_exact_mut(cols)) {
-        y.copy_from_slice(x);
-        let scale = 1.0 / exponentials(y);
-        for y in y {
-            *y *= scale;
+}
+
+/// Softmax at work.
+struct SoftmaxRows<'a> {
+    x: &'a [f32],
+    cols: usize,
+    y: &'a mut [f32],
+}
+
+impl Kernel for SoftmaxRows<'_> {
+    #[inline(always)]
+    fn run<const WIDE: usize>(self) {
+        let rows = self.x.chunks_exact(self.cols);
+        for (x, y) in rows.zip(self.y.chunks_exact_mut(self.cols)) {
+            y.copy_from_slice(x);
+            let scale = 1.0 / exponentials(y);
+            for y in y {
+                *y *= scale;
+            }
         }
     }
 }

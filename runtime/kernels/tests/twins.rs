@@ -1,10 +1,10 @@
-//! Every kernel against its naive twin, on random shapes and values.
+//! Every kernel against its naive twin, on random shapes and values, and bit for bit on every instruction set that the CPU offers.
 
 use lads_kernels::reference as naive;
 use lads_kernels::{
-    Activation, Attention, Axis, BinaryKind, Input, Linear, MatMul, ReduceKind, StridedCopy,
-    UnaryKind, append, arg_max, arg_min, attention_scratch_len, binary, layer_norm, pack,
-    packed_len, reduce, softmax, unary, unary_in_place,
+    Activation, Attention, Axis, BinaryKind, Input, Isa, LayerNorm, Linear, MatMul, ReduceKind,
+    StridedCopy, Unary, UnaryKind, append, arg_max, arg_min, attention_scratch_len, binary, pack,
+    packed_len, reduce, softmax,
 };
 use proptest::prelude::*;
 use proptest::sample::select;
@@ -66,6 +66,23 @@ fn close(got: &[f32], expected: &[f32], bound: f32) {
     }
 }
 
+/// Runs a kernel on every instruction set; its results, which have to have the same bits, and not a number in the same places.
+#[track_caller]
+fn on_all<const N: usize>(kernel: impl Fn(Isa) -> [Vec<f32>; N]) -> [Vec<f32>; N] {
+    let portable = kernel(Isa::portable());
+    for isa in Isa::all() {
+        for (got, expected) in kernel(isa).iter().zip(&portable) {
+            assert_eq!(got.len(), expected.len());
+            for (i, (got, expected)) in got.iter().zip(expected).enumerate() {
+                // Which of its bit patterns not a number has is left open by Rust.
+                let same = got.to_bits() == expected.to_bits() || got.is_nan() && expected.is_nan();
+                assert!(same, "{isa:?}, element {i}: {got:e} against {expected:e}");
+            }
+        }
+    }
+    portable
+}
+
 fn activation() -> impl Strategy<Value = Activation> {
     let all = [
         Activation::None,
@@ -80,7 +97,7 @@ fn activation() -> impl Strategy<Value = Activation> {
 proptest! {
     #[test]
     fn linear_equals_its_twin(
-        (m, k, n) in (1_usize..6, 1_usize..70, 1_usize..50),
+        (m, k, n) in (1_usize..6, 1_usize..70, 1_usize..180),
         activation in activation(),
         (with_bias, accumulate) in any::<(bool, bool)>(),
         seed in any::<u64>(),
@@ -91,8 +108,11 @@ proptest! {
         let mut packed = vec![f32::NAN; packed_len(k, n)];
         pack(&w, k, n, &mut packed);
         let layer = Linear { k, n, w: &packed, bias: &bias, activation, accumulate };
-        let mut y = before.clone();
-        layer.run(&x, &mut y);
+        let [y] = on_all(|isa| {
+            let mut y = before.clone();
+            layer.run(isa, &x, &mut y);
+            [y]
+        });
         let mut expected = vec![0.0; m * n];
         naive::linear(&x, &w, &bias, activation, [k, n], &mut expected);
         if accumulate {
@@ -102,7 +122,7 @@ proptest! {
         // Each row alone gives the same bits as the rows together.
         for (row, x) in x.chunks(k).enumerate() {
             let mut alone = before[row * n..(row + 1) * n].to_vec();
-            layer.run(x, &mut alone);
+            layer.run(Isa::detect(), x, &mut alone);
             prop_assert_eq!(&alone, &y[row * n..(row + 1) * n]);
         }
     }
@@ -110,8 +130,13 @@ proptest! {
     #[test]
     fn layer_norm_equals_its_twin(rows in 1_usize..4, cols in 1_usize..150, seed in any::<u64>()) {
         let (x, gamma, beta) = (values(rows * cols, seed), values(cols, seed ^ 1), values(cols, seed ^ 2));
-        let (mut y, mut expected) = (vec![0.0; rows * cols], vec![0.0; rows * cols]);
-        layer_norm(&x, &gamma, &beta, 1e-5, &mut y);
+        let norm = LayerNorm { gamma: &gamma, beta: &beta, eps: 1e-5 };
+        let [y] = on_all(|isa| {
+            let mut y = vec![0.0; rows * cols];
+            norm.run(isa, &x, &mut y);
+            [y]
+        });
+        let mut expected = vec![0.0; rows * cols];
         naive::layer_norm(&x, &gamma, &beta, 1e-5, &mut expected);
         // A single column, or two that are nearly equal, are all cancellation.
         close(&y, &expected, if cols < 4 { 1e-2 } else { 1e-5 });
@@ -125,8 +150,12 @@ proptest! {
         seed in any::<u64>(),
     ) {
         let x: Vec<f32> = values(rows * cols, seed).iter().map(|x| x * scale).collect();
-        let (mut y, mut expected) = (vec![0.0; rows * cols], vec![0.0; rows * cols]);
-        softmax(&x, cols, &mut y);
+        let [y] = on_all(|isa| {
+            let mut y = vec![0.0; rows * cols];
+            softmax(isa, &x, cols, &mut y);
+            [y]
+        });
+        let mut expected = vec![0.0; rows * cols];
         naive::softmax(&x, cols, &mut expected);
         close(&y, &expected, 1e-6);
         for row in y.chunks(cols) {
@@ -136,7 +165,7 @@ proptest! {
 
     #[test]
     fn attention_equals_its_twin(
-        (heads, head_dim) in (1_usize..5, select(vec![1_usize, 3, 5, 8, 16, 17, 32, 48])),
+        (heads, head_dim) in (1_usize..5, select(vec![1_usize, 3, 5, 8, 16, 17, 32, 48, 64])),
         (past, tokens) in (0_usize..40, 1_usize..6),
         (queries, gap) in (1_usize..6, 0_usize..7),
         seed in any::<u64>(),
@@ -169,9 +198,13 @@ proptest! {
             cache_k: &cache_k,
             cache_v: &cache_v,
         };
-        let mut scratch = vec![f32::NAN; attention_scratch_len(queries, capacity)];
-        let (mut y, mut expected) = (vec![f32::NAN; queries * width], vec![0.0; queries * width]);
-        attention.run(&q, &mut y, &mut scratch);
+        let [y] = on_all(|isa| {
+            let mut scratch = vec![f32::NAN; attention_scratch_len(queries, capacity)];
+            let mut y = vec![f32::NAN; queries * width];
+            attention.run(isa, &q, &mut y, &mut scratch);
+            [y]
+        });
+        let mut expected = vec![0.0; queries * width];
         naive::attention(&attention, &q, &mut expected);
         close(&y, &expected, 1e-5);
     }
@@ -180,11 +213,14 @@ proptest! {
     fn unary_equals_its_twin(kind in select(UNARY.to_vec()), len in 1_usize..40, seed in any::<u64>()) {
         let x: Vec<f32> = values(len, seed).iter().map(|x| x * 8.0).collect();
         let expected: Vec<f32> = x.iter().map(|&x| naive::unary(kind, 0.2, x)).collect();
-        let mut y = vec![0.0; len];
-        unary(kind, 0.2, &x, &mut y);
+        let unary = Unary { kind, alpha: 0.2 };
+        let [y, in_place] = on_all(|isa| {
+            let (mut y, mut in_place) = (vec![0.0; len], x.clone());
+            unary.run(isa, &x, &mut y);
+            unary.run_in_place(isa, &mut in_place);
+            [y, in_place]
+        });
         close(&y, &expected, 1e-6);
-        let mut in_place = x;
-        unary_in_place(kind, 0.2, &mut in_place);
         close(&in_place, &y, 0.0);
     }
 
@@ -303,6 +339,33 @@ fn strides(dims: [usize; 4], keeps: [bool; 4], gap: usize) -> [usize; 4] {
     strides
 }
 
+/// Floats of all magnitudes: subnormal, infinite, not a number, and where `exp` and `tanh` change their ways.
+#[test]
+fn extreme_elements_are_the_same_on_every_instruction_set() {
+    let x: Vec<f32> = (0..=u32::MAX).step_by(65521).map(f32::from_bits).collect();
+    for kind in UNARY {
+        let unary = Unary { kind, alpha: 0.2 };
+        on_all(|isa| {
+            let mut y = vec![0.0; x.len()];
+            unary.run(isa, &x, &mut y);
+            [y]
+        });
+    }
+    // Rows with elements that are not a number, infinite, or too large to be added up.
+    let gamma = vec![1.0; 61];
+    let norm = LayerNorm {
+        gamma: &gamma,
+        beta: &gamma,
+        eps: 1e-5,
+    };
+    on_all(|isa| {
+        let [mut p, mut y] = [(); 2].map(|()| vec![0.0; x.len()]);
+        softmax(isa, &x, 61, &mut p);
+        norm.run(isa, &x, &mut y);
+        [p, y]
+    });
+}
+
 #[test]
 fn what_is_not_a_number_is_passed_over_by_the_best_element() {
     assert_eq!(arg_max(&[f32::NAN, 1.0, 2.0, f32::NAN]), 2);
@@ -348,12 +411,11 @@ fn results_have_the_same_bits_everywhere() {
         activation: Activation::Tanh,
         accumulate: false,
     };
-    let mut y = vec![0.0; 3 * n];
-    layer.run(&values(3 * k, 3), &mut y);
-    let mut z = vec![0.0; 3 * n];
-    layer_norm(&y, &bias, &bias, 1e-5, &mut z);
-    let mut p = vec![0.0; 3 * n];
-    softmax(&z, n, &mut p);
+    let norm = LayerNorm {
+        gamma: &bias,
+        beta: &bias,
+        eps: 1e-5,
+    };
     let cache = values(50 * 64, 4);
     let attention = Attention {
         heads: 2,
@@ -364,9 +426,16 @@ fn results_have_the_same_bits_everywhere() {
         cache_k: &cache,
         cache_v: &cache,
     };
-    let mut attended = vec![0.0; 128];
-    attention.run(&values(128, 5), &mut attended, &mut [0.0; 50]);
-    let digests = [&y, &z, &p, &attended].map(|x| digest(x));
+    let results = on_all(|isa| {
+        let [mut y, mut z, mut p] = [(); 3].map(|()| vec![0.0; 3 * n]);
+        layer.run(isa, &values(3 * k, 3), &mut y);
+        norm.run(isa, &y, &mut z);
+        softmax(isa, &z, n, &mut p);
+        let mut attended = vec![0.0; 128];
+        attention.run(isa, &values(128, 5), &mut attended, &mut [0.0; 50]);
+        [y, z, p, attended]
+    });
+    let digests = results.map(|x| digest(&x));
     let expected = [
         0x05e1_b773_fda2_c929,
         0xddf6_4acd_014e_4f1e,

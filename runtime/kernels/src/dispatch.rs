@@ -1,0 +1,184 @@
+//! One kernel body, compiled once per instruction set; the only unsafe code of the crate.
+//!
+//! ```text
+//! Isa::run(kernel):  AVX-512 → avx512(kernel)    the same inlined `Kernel::run`, with wider registers
+//!                    AVX2    → avx2(kernel)
+//!                    else    → kernel.run()
+//! ```
+//!
+//! Invariants:
+//! - An [`Isa`] is the proof that its instructions exist: only its constructors make one, and of them only [`Isa::detect`] and
+//!   [`Isa::all`] ask the CPU.
+//! - The bits of a result do not depend on the `Isa`. A wider register holds more of the sixteen lanes, and wider code sums more
+//!   outputs side by side, but each sum has the same operations in the same order, and Rust never fuses a multiplication with an
+//!   addition. `tests/twins.rs` compares every kernel bit for bit.
+//!
+//! Nothing here can fail: a CPU that offers nothing wider gets [`Isa::portable`].
+#![allow(unsafe_code)]
+
+use core::fmt;
+
+/// Instructions that kernels may use, chosen once and then passed along; copying it costs nothing.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Isa(Level);
+
+/// Sorted: a later one is wider.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Level {
+    /// What the target of the build offers in any case.
+    Portable,
+    /// AVX and AVX2.
+    #[cfg(target_arch = "x86_64")]
+    Avx2,
+    /// AVX-512 F, BW, DQ and VL, and AVX2.
+    #[cfg(target_arch = "x86_64")]
+    Avx512,
+}
+
+impl Isa {
+    /// What every CPU of the build's target has. For tests, and where the machine code has to be the same on all machines.
+    pub const fn portable() -> Self {
+        Self(Level::Portable)
+    }
+
+    /// The widest that this CPU and its operating system offer.
+    pub fn detect() -> Self {
+        #[cfg(target_arch = "x86_64")]
+        return Self(x86_64::widest());
+        #[cfg(not(target_arch = "x86_64"))]
+        return Self::portable();
+    }
+
+    /// All that this CPU and its operating system offer, the portable one first.
+    pub fn all() -> impl Iterator<Item = Self> {
+        let widest = Self::detect();
+        [
+            Level::Portable,
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2,
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512,
+        ]
+        .into_iter()
+        .map(Self)
+        .filter(move |isa| *isa <= widest)
+    }
+
+    /// Its name: `portable`, `avx2` or `avx512`.
+    pub const fn name(self) -> &'static str {
+        match self.0 {
+            Level::Portable => "portable",
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => "avx2",
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => "avx512",
+        }
+    }
+
+    /// Runs a kernel with these instructions.
+    #[inline(always)]
+    pub(crate) fn run(self, kernel: impl Kernel) {
+        match self.0 {
+            Level::Portable => kernel.run::<1>(),
+            #[cfg(target_arch = "x86_64")]
+            // SAFETY: `Isa`'s constructors make this level only where `x86_64::widest` found AVX2 in CPU and operating system.
+            Level::Avx2 => unsafe { x86_64::avx2(kernel) },
+            #[cfg(target_arch = "x86_64")]
+            // SAFETY: `Isa`'s constructors make this level only where `x86_64::widest` found AVX2 and all four parts of
+            // AVX-512 in CPU and operating system.
+            Level::Avx512 => unsafe { x86_64::avx512(kernel) },
+        }
+    }
+}
+
+impl fmt::Debug for Isa {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "Isa({})", self.name())
+    }
+}
+
+/// A kernel and its operands.
+pub(crate) trait Kernel {
+    /// Does the work. `#[inline(always)]` in every implementation, and in what it calls, so that each instruction set gets a
+    /// body of its own. `WIDE` is how many blocks of sixteen lanes the registers hold for each of two rows, beside the operands.
+    fn run<const WIDE: usize>(self);
+}
+
+#[cfg(target_arch = "x86_64")]
+mod x86_64 {
+    use core::arch::x86_64::{__cpuid, __cpuid_count, _xgetbv};
+
+    use super::{Kernel, Level};
+
+    /// Sixteen registers of half a block.
+    #[target_feature(enable = "avx2")]
+    pub fn avx2(kernel: impl Kernel) {
+        kernel.run::<2>();
+    }
+
+    /// Thirty-two registers of one block.
+    #[target_feature(enable = "avx2,avx512f,avx512bw,avx512dq,avx512vl")]
+    pub fn avx512(kernel: impl Kernel) {
+        kernel.run::<4>();
+    }
+
+    /// Bits of XCR0, the register states that the operating system saves: SSE and AVX.
+    const YMM_STATE: u64 = 0b110;
+    /// The same, and the mask registers, the upper halves of the first sixteen ZMM registers, the other sixteen.
+    const ZMM_STATE: u64 = 0b1110_0110;
+
+    /// Asks the CPU. Bits and leaves are those of Intel's manual, volume 1, sections 14.3, 14.7.1 and 15.2.
+    pub fn widest() -> Level {
+        let has = |register: u32, bits: &[u32]| bits.iter().all(|bit| register >> bit & 1 == 1);
+        if __cpuid(0).eax < 7 {
+            return Level::Portable;
+        }
+        // Leaf 1, ECX: 27 OSXSAVE, 28 AVX.
+        if !has(__cpuid(1).ecx, &[27, 28]) {
+            return Level::Portable;
+        }
+        // SAFETY: OSXSAVE, read from the CPU above, says that the operating system has enabled `xgetbv`.
+        let saved = unsafe { _xgetbv(0) };
+        // Leaf 7, EBX: 5 AVX2, 16 AVX512F, 17 AVX512DQ, 30 AVX512BW, 31 AVX512VL.
+        let extended = __cpuid_count(7, 0).ebx;
+        let avx2 = has(extended, &[5]) && saved & YMM_STATE == YMM_STATE;
+        let avx512 = has(extended, &[16, 17, 30, 31]) && saved & ZMM_STATE == ZMM_STATE;
+        match (avx2, avx512) {
+            (true, true) => Level::Avx512,
+            (true, false) => Level::Avx2,
+            (false, _) => Level::Portable,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    extern crate std;
+
+    use super::Isa;
+
+    #[test]
+    fn the_portable_one_comes_first_and_the_detected_one_last() {
+        assert_eq!(Isa::all().next(), Some(Isa::portable()));
+        assert_eq!(Isa::all().last(), Some(Isa::detect()));
+        assert!(Isa::all().is_sorted());
+    }
+
+    /// The standard library's detection is another implementation of the same question.
+    #[cfg(target_arch = "x86_64")]
+    #[test]
+    fn detection_agrees_with_the_standard_library() {
+        let avx2 = std::arch::is_x86_feature_detected!("avx2");
+        let avx512 = avx2
+            && std::arch::is_x86_feature_detected!("avx512f")
+            && std::arch::is_x86_feature_detected!("avx512bw")
+            && std::arch::is_x86_feature_detected!("avx512dq")
+            && std::arch::is_x86_feature_detected!("avx512vl");
+        let expected = match (avx2, avx512) {
+            (_, true) => "avx512",
+            (true, _) => "avx2",
+            _ => "portable",
+        };
+        assert_eq!(Isa::detect().name(), expected);
+    }
+}
