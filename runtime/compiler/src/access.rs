@@ -19,7 +19,11 @@ impl Access {
     }
 
     fn strided(span: Span, dims: [u32; 4], strides: [u32; 4]) -> Self {
-        Self { offset: span.offset, dims, strides }
+        Self {
+            offset: span.offset,
+            dims,
+            strides,
+        }
     }
 
     fn rows(span: Span, rows: u32, stride: u32) -> Self {
@@ -33,7 +37,10 @@ impl Access {
         let [sa, sb, sc, sd] = self.strides.map(|stride| stride as usize);
         (0..a as usize).flat_map(move |i| {
             (0..b as usize).flat_map(move |j| {
-                (0..c as usize).flat_map(move |k| (0..d as usize).map(move |l| self.offset as usize + i * sa + j * sb + k * sc + l * sd))
+                (0..c as usize).flat_map(move |k| {
+                    (0..d as usize)
+                        .map(move |l| self.offset as usize + i * sa + j * sb + k * sc + l * sd)
+                })
             })
         })
     }
@@ -41,26 +48,43 @@ impl Access {
 
 /// The arena span of an operand that lies there.
 fn arena(operand: Operand) -> Option<Span> {
-    matches!(operand.space, Space::Arena).then_some(Span { offset: operand.offset, len: operand.len })
+    matches!(operand.space, Space::Arena).then_some(Span {
+        offset: operand.offset,
+        len: operand.len,
+    })
 }
 
 /// What an op reads before it writes.
 pub(crate) fn reads(op: &Op) -> Vec<Access> {
-    let strided = |operand: Operand, dims, strides| arena(operand).map(|span| Access::strided(span, dims, strides));
+    let strided = |operand: Operand, dims, strides| {
+        arena(operand).map(|span| Access::strided(span, dims, strides))
+    };
     match op {
         Op::Linear(op) => {
             let to = op.accumulate.then(|| Access::all(op.y));
-            [Some(Access::all(op.x)), to].into_iter().flatten().collect()
+            [Some(Access::all(op.x)), to]
+                .into_iter()
+                .flatten()
+                .collect()
         }
         Op::LayerNorm(op) => vec![Access::all(op.x)],
         Op::Attention(op) => {
-            let mut all = vec![Access::rows(op.k, op.tokens, op.k_stride), Access::rows(op.v, op.tokens, op.v_stride)];
+            let mut all = vec![
+                Access::rows(op.k, op.tokens, op.k_stride),
+                Access::rows(op.v, op.tokens, op.v_stride),
+            ];
             if op.queries > 0 {
                 all.push(Access::rows(op.q, op.queries, op.q_stride));
             }
             all
         }
-        Op::Binary(op) => [strided(op.a, op.dims, op.a_strides), strided(op.b, op.dims, op.b_strides)].into_iter().flatten().collect(),
+        Op::Binary(op) => [
+            strided(op.a, op.dims, op.a_strides),
+            strided(op.b, op.dims, op.b_strides),
+        ]
+        .into_iter()
+        .flatten()
+        .collect(),
         Op::Unary(op) => arena(op.x).map(Access::all).into_iter().collect(),
         Op::Softmax(op) => vec![Access::all(op.x)],
         Op::Reduce(op) => arena(op.x).map(Access::all).into_iter().collect(),
@@ -73,7 +97,9 @@ pub(crate) fn reads(op: &Op) -> Vec<Access> {
         }
         Op::GatherRow(_) => vec![],
         Op::Copy(op) => strided(op.x, op.dims, op.x_strides).into_iter().collect(),
-        Op::ArgMin(op::ArgMin { x, .. }) | Op::ArgMax(op::ArgMax { x, .. }) => vec![Access::all(*x)],
+        Op::ArgMin(op::ArgMin { x, .. }) | Op::ArgMax(op::ArgMax { x, .. }) => {
+            vec![Access::all(*x)]
+        }
     }
 }
 
@@ -98,7 +124,9 @@ pub(crate) fn writes(op: &Op) -> Vec<Access> {
 pub(crate) fn slots(op: &Op) -> (Option<IntSlot>, Option<IntSlot>) {
     match op {
         Op::GatherRow(op) => (Some(op.index), None),
-        Op::ArgMin(op::ArgMin { out, .. }) | Op::ArgMax(op::ArgMax { out, .. }) => (None, Some(*out)),
+        Op::ArgMin(op::ArgMin { out, .. }) | Op::ArgMax(op::ArgMax { out, .. }) => {
+            (None, Some(*out))
+        }
         _ => (None, None),
     }
 }
@@ -119,7 +147,9 @@ pub(crate) fn each_span(op: &mut Op, f: &mut impl FnMut(&mut Span)) {
     match op {
         Op::Linear(op) => [&mut op.x, &mut op.y].into_iter().for_each(span),
         Op::LayerNorm(op) => [&mut op.x, &mut op.y].into_iter().for_each(span),
-        Op::Attention(op) => [&mut op.q, &mut op.k, &mut op.v, &mut op.y, &mut op.scratch].into_iter().for_each(span),
+        Op::Attention(op) => [&mut op.q, &mut op.k, &mut op.v, &mut op.y, &mut op.scratch]
+            .into_iter()
+            .for_each(span),
         Op::Binary(op) => {
             operand(&mut op.a, &mut span);
             operand(&mut op.b, &mut span);

@@ -3,6 +3,7 @@
 //! A [`Bundle`] is checked as a whole before anything is compiled: the file is an ONNX model, its contract reads, every entry that
 //! a policy of its kind needs is there, and the shapes that the entries declare are those of the contract. Nothing is written.
 
+use std::fmt::Write as _;
 use std::path::Path;
 
 use bytes::Bytes;
@@ -31,25 +32,48 @@ pub struct Bundle {
 impl Bundle {
     /// Reads a file. Errors name it.
     pub fn open(path: &Path) -> Result<Self, BundleError> {
-        let read = || Self::from_owned(std::fs::read(path)?.into());
-        read().map_err(|source| BundleError::File { path: path.into(), source: Box::new(source) })
+        let read = || Self::from_owned(&std::fs::read(path)?.into());
+        read().map_err(|source| BundleError::File {
+            path: path.into(),
+            source: Box::new(source),
+        })
     }
 
     /// Reads a file's content.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, BundleError> {
-        Self::from_owned(Bytes::copy_from_slice(bytes))
+        Self::from_owned(&Bytes::copy_from_slice(bytes))
     }
 
-    fn from_owned(bytes: Bytes) -> Result<Self, BundleError> {
-        let model = onnx::decode(&bytes)?;
-        let property = |key: &str| model.metadata_props.iter().find(|pair| pair.key == key).map(|pair| pair.value.as_str());
+    fn from_owned(bytes: &Bytes) -> Result<Self, BundleError> {
+        let model = onnx::decode(bytes)?;
+        let property = |key: &str| {
+            model
+                .metadata_props
+                .iter()
+                .find(|pair| pair.key == key)
+                .map(|pair| pair.value.as_str())
+        };
         let contract = Contract::parse(property("lads.contract").ok_or(BundleError::NoContract)?)?;
-        let golden = property("lads.golden").ok_or_else(|| BundleError::Golden { problem: "missing from the model's metadata".into() })?;
+        let golden = property("lads.golden").ok_or_else(|| BundleError::Golden {
+            problem: "missing from the model's metadata".into(),
+        })?;
         let golden = Golden::parse(golden, &contract)?;
-        let graph = model.graph.as_ref().ok_or_else(|| BundleError::NotOnnx { problem: "it has no graph".into() })?;
+        let graph = model.graph.as_ref().ok_or_else(|| BundleError::NotOnnx {
+            problem: "it has no graph".into(),
+        })?;
         entries::check(graph, &contract)?;
-        let sha256 = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
-        Ok(Self { contract, golden, sha256, bytes: bytes.len(), model })
+        let mut sha256 = String::new();
+        for byte in Sha256::digest(bytes) {
+            // Writing to a string cannot fail.
+            let _ = write!(sha256, "{byte:02x}");
+        }
+        Ok(Self {
+            contract,
+            golden,
+            sha256,
+            bytes: bytes.len(),
+            model,
+        })
     }
 
     /// What the policy expects and promises.
@@ -74,7 +98,11 @@ impl Bundle {
 
     /// The value of a metadata key, for example `action_scale`.
     pub fn metadata(&self, key: &str) -> Option<&str> {
-        self.model.metadata_props.iter().find(|pair| pair.key == key).map(|pair| pair.value.as_str())
+        self.model
+            .metadata_props
+            .iter()
+            .find(|pair| pair.key == key)
+            .map(|pair| pair.value.as_str())
     }
 
     /// The entry graphs of the file, in the order of their first input.
@@ -94,23 +122,51 @@ impl Bundle {
     pub fn entry_onnx(&self, entry: &str) -> Result<Vec<u8>, BundleError> {
         let graph = self.graph();
         let prefix = format!("{entry}/");
-        let outputs: Vec<_> = graph.output.iter().filter(|value| value.name.starts_with(&prefix)).cloned().collect();
+        let outputs: Vec<_> = graph
+            .output
+            .iter()
+            .filter(|value| value.name.starts_with(&prefix))
+            .cloned()
+            .collect();
         if outputs.is_empty() {
-            let problem = format!("entry {entry} is missing; the file has {}", self.entries().join(", "));
-            return Err(BundleError::Entry { problem });
+            let problem = format!(
+                "entry {entry} is missing; the file has {}",
+                self.entries().join(", ")
+            );
+            return Err(BundleError::Entry {
+                problem: problem.into(),
+            });
         }
         let roots = outputs.iter().map(|value| value.name.as_str());
         let node: Vec<_> = entries::needed(graph, roots).into_iter().cloned().collect();
-        let read: std::collections::HashSet<&str> = node.iter().flat_map(|node| &node.input).map(String::as_str).collect();
+        let read: std::collections::HashSet<&str> = node
+            .iter()
+            .flat_map(|node| &node.input)
+            .map(String::as_str)
+            .collect();
         let own = GraphProto {
             name: entry.into(),
-            initializer: graph.initializer.iter().filter(|tensor| read.contains(tensor.name.as_str())).cloned().collect(),
+            initializer: graph
+                .initializer
+                .iter()
+                .filter(|tensor| read.contains(tensor.name.as_str()))
+                .cloned()
+                .collect(),
             sparse_initializer: vec![],
-            input: graph.input.iter().filter(|value| value.name.starts_with(&prefix)).cloned().collect(),
+            input: graph
+                .input
+                .iter()
+                .filter(|value| value.name.starts_with(&prefix))
+                .cloned()
+                .collect(),
             output: outputs,
             node,
         };
-        let model = ModelProto { graph: Some(own), metadata_props: vec![], ..self.model.clone() };
+        let model = ModelProto {
+            graph: Some(own),
+            metadata_props: vec![],
+            ..self.model.clone()
+        };
         Ok(model.encode_to_vec())
     }
 
@@ -138,7 +194,11 @@ impl Bundle {
             })
             .collect();
         scored.sort_by(|a, b| b.0.total_cmp(&a.0));
-        scored.into_iter().take(NEAREST).map(|(_, text)| text).collect()
+        scored
+            .into_iter()
+            .take(NEAREST)
+            .map(|(_, text)| text)
+            .collect()
     }
 
     pub(crate) fn graph(&self) -> &GraphProto {
@@ -157,5 +217,8 @@ impl Bundle {
 
 /// Lower case, single spaces.
 fn plain(text: &str) -> String {
-    text.to_lowercase().split_whitespace().collect::<Vec<_>>().join(" ")
+    text.to_lowercase()
+        .split_whitespace()
+        .collect::<Vec<_>>()
+        .join(" ")
 }

@@ -6,7 +6,9 @@ use lads_core::Policy;
 use lads_core::op::{Port, WeightSpan};
 
 use crate::bundle::Bundle;
-use crate::entries::{self, ACT, ENCODE, INSTRUCT, LOOKUP_INSTRUCTION, LOOKUP_PLAN, START, STEP, Signature};
+use crate::entries::{
+    self, ACT, ENCODE, INSTRUCT, LOOKUP_INSTRUCTION, LOOKUP_PLAN, START, STEP, Signature,
+};
 use crate::error::CompileError;
 use crate::fuse::fuse;
 use crate::image::{self, Image, Parts};
@@ -27,15 +29,34 @@ pub(crate) struct Recipe {
 
 /// In the order of `lads_core::image::ProgramKind`.
 pub(crate) const RECIPES: [Recipe; 7] = [
-    Recipe { name: "instruct", entry: INSTRUCT, outputs: &[], ports: &[("words", Port::Words)] },
+    Recipe {
+        name: "instruct",
+        entry: INSTRUCT,
+        outputs: &[],
+        ports: &[("words", Port::Words)],
+    },
     Recipe {
         name: "start",
         entry: START,
         outputs: &["logits"],
-        ports: &[("observation", Port::Observation), ("timestep", Port::Timestep), ("logits", Port::Logits)],
+        ports: &[
+            ("observation", Port::Observation),
+            ("timestep", Port::Timestep),
+            ("logits", Port::Logits),
+        ],
     },
-    Recipe { name: "step_decide", entry: STEP, outputs: &["logits"], ports: STEP_PORTS },
-    Recipe { name: "step_record", entry: STEP, outputs: &[], ports: STEP_PORTS },
+    Recipe {
+        name: "step_decide",
+        entry: STEP,
+        outputs: &["logits"],
+        ports: STEP_PORTS,
+    },
+    Recipe {
+        name: "step_record",
+        entry: STEP,
+        outputs: &[],
+        ports: STEP_PORTS,
+    },
     Recipe {
         name: "lookup",
         entry: LOOKUP_PLAN,
@@ -46,7 +67,11 @@ pub(crate) const RECIPES: [Recipe; 7] = [
         name: "act",
         entry: ACT,
         outputs: &["action"],
-        ports: &[("observation", Port::Observation), ("plan", Port::Plan), ("action", Port::Action)],
+        ports: &[
+            ("observation", Port::Observation),
+            ("plan", Port::Plan),
+            ("action", Port::Action),
+        ],
     },
     Recipe {
         name: "encode",
@@ -68,45 +93,85 @@ const STEP_PORTS: &[(&str, Port)] = &[
     ("logits", Port::Logits),
 ];
 
+/// One program that was made.
+struct Made {
+    placed: Placed,
+    tokens: usize,
+    report: ProgramReport,
+}
+
 /// Compiles a bundle.
 pub fn compile(bundle: &Bundle) -> Result<Image, CompileError> {
     let contract = bundle.contract();
     let signatures = entries::signatures(contract);
     let model = Model::new(&bundle.model, bundle.graph())?;
     let cache = Cache::new(contract);
-    let cache_len = cache.len().ok_or_else(|| CompileError::TooLarge { what: "the KV cache".into() })?;
+    let cache_len = cache.len().ok_or_else(|| CompileError::TooLarge {
+        what: "the KV cache".into(),
+    })?;
     let mut weights = Weights::default();
-    let mut programs: Vec<Placed> = vec![];
-    let mut tokens = vec![];
-    let mut reports = vec![];
-    for recipe in &RECIPES {
+    let mut made: Vec<Made> = vec![];
+    // Whole matrices come before the parts of them that other programs need, and what runs in every control step comes first.
+    let (before, rest) = RECIPES.split_at(1);
+    for recipe in rest.iter().chain(before) {
         let signature = signature(&signatures, recipe.entry)?;
         let entry = model.import(signature, &HashMap::new())?;
         let fused = fuse(entry, signature, recipe.outputs)?;
         let lowered = lower(recipe.entry, &fused, recipe.ports, cache, &mut weights)?;
         let placed = plan(&lowered);
-        verify(&lowered, &placed).map_err(|fault| CompileError::Plan { program: recipe.name, fault })?;
-        reports.push(ProgramReport {
+        verify(&lowered, &placed).map_err(|fault| CompileError::Plan {
+            program: recipe.name,
+            fault,
+        })?;
+        let report = ProgramReport {
             name: recipe.name,
             entry: recipe.entry,
             ops: placed.ops.len(),
             arena_len: placed.arena_len as usize,
             arena_lower_bound: placed.lower_bound as usize,
+        };
+        made.push(Made {
+            placed,
+            tokens: lowered.tokens,
+            report,
         });
-        programs.push(placed);
-        tokens.push(lowered.tokens);
     }
-    let words = instruction_words(bundle, &model, signature(&signatures, LOOKUP_INSTRUCTION)?, &mut weights)?;
-    let report = CompileReport { programs: reports, weight_bytes: weights.data.len() * 4, cache_len: cache_len as usize };
-    let parts = Parts { programs: &programs, tokens: &tokens, words: &words, weights: &weights.data, cache_len };
+    made.rotate_right(before.len());
+    let words = instruction_words(
+        bundle,
+        &model,
+        signature(&signatures, LOOKUP_INSTRUCTION)?,
+        &mut weights,
+    )?;
+    let report = CompileReport {
+        programs: made.iter().map(|made| made.report.clone()).collect(),
+        weight_bytes: weights.data.len() * 4,
+        cache_len: cache_len as usize,
+    };
+    let programs: Vec<(&Placed, usize)> = made
+        .iter()
+        .map(|made| (&made.placed, made.tokens))
+        .collect();
+    let parts = Parts {
+        programs: &programs,
+        words: &words,
+        weights: &weights.data,
+        cache_len,
+    };
     let image = image::write(bundle, &parts, report)?;
     Policy::new_checked(image.as_bytes()).map_err(CompileError::Image)?;
     Ok(image)
 }
 
 fn signature<'s>(signatures: &'s [Signature], entry: &str) -> Result<&'s Signature, CompileError> {
-    let missing = || CompileError::Entry { entry: entry.into(), problem: "it belongs to no policy of this kind".into() };
-    signatures.iter().find(|signature| signature.entry == entry).ok_or_else(missing)
+    let missing = || CompileError::Entry {
+        entry: entry.into(),
+        problem: "it belongs to no policy of this kind".into(),
+    };
+    signatures
+        .iter()
+        .find(|signature| signature.entry == entry)
+        .ok_or_else(missing)
 }
 
 /// The words of every known instruction: the entry is evaluated for each id.
@@ -117,27 +182,47 @@ fn instruction_words(
     weights: &mut Weights,
 ) -> Result<Vec<(u32, WeightSpan)>, CompileError> {
     let contract = bundle.contract();
-    let refused = |problem| CompileError::Entry { entry: LOOKUP_INSTRUCTION.into(), problem };
+    let refused = |problem: String| CompileError::Entry {
+        entry: LOOKUP_INSTRUCTION.into(),
+        problem: problem.into(),
+    };
     let mut all = vec![];
     for (id, known) in contract.instructions.iter().enumerate() {
-        let entry = model.import(signature, &HashMap::from([("id", Tensor::i64(&[1], vec![id as i64]))]))?;
+        let entry = model.import(
+            signature,
+            &HashMap::from([("id", Tensor::i64(&[1], vec![id as i64]))]),
+        )?;
         let constant = |name: &str| {
             let found = entry.outputs.iter().find(|(output, _)| output == name);
             found.and_then(|&(_, id)| entry.graph.constant(id))
         };
-        let length = constant("length").and_then(|tensor| tensor.as_i64().and_then(|data| data.first().copied()));
+        let length = constant("length")
+            .and_then(|tensor| tensor.as_i64().and_then(|data| data.first().copied()));
         let words = constant("words").and_then(|tensor| tensor.as_f32());
         let (Some(length), Some(words)) = (length, words) else {
-            return Err(refused(format!("it is not a table: instruction {} does not evaluate to constants", known.id)));
+            return Err(refused(format!(
+                "it is not a table: instruction {} does not evaluate to constants",
+                known.id
+            )));
         };
-        let length = usize::try_from(length).ok().filter(|length| (1..=contract.context.words).contains(length));
+        let length = usize::try_from(length)
+            .ok()
+            .filter(|length| (1..=contract.context.words).contains(length));
         let length = length.ok_or_else(|| {
-            refused(format!("instruction {} has no length from 1 to the contract's `context.words` {}", known.id, contract.context.words))
+            refused(format!(
+                "instruction {} has no length from 1 to the contract's `context.words` {}",
+                known.id, contract.context.words
+            ))
         })?;
         if words.iter().any(|x| !x.is_finite()) {
-            return Err(refused(format!("the words of instruction {} are not finite", known.id)));
+            return Err(refused(format!(
+                "the words of instruction {} are not finite",
+                known.id
+            )));
         }
-        let span = weights.store(&words[..length * contract.language.dim]).map_err(refused)?;
+        let span = weights
+            .store(&words[..length * contract.language.dim])
+            .map_err(refused)?;
         all.push((length as u32, span));
     }
     Ok(all)

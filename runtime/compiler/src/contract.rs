@@ -196,14 +196,23 @@ const MAX_LEN: usize = 1 << 20;
 impl Contract {
     /// Reads and checks a contract.
     pub fn parse(json: &str) -> Result<Self, BundleError> {
-        let refused = |problem: String| BundleError::Contract { problem };
-        let value: serde_json::Value = serde_json::from_str(json).map_err(|error| refused(format!("is no JSON: {error}")))?;
-        let version = value.get("version").ok_or_else(|| refused("missing field `version`".into()))?;
+        let refused = |problem: String| BundleError::Contract {
+            problem: problem.into(),
+        };
+        let value: serde_json::Value =
+            serde_json::from_str(json).map_err(|error| refused(format!("is no JSON: {error}")))?;
+        let version = value
+            .get("version")
+            .ok_or_else(|| refused("missing field `version`".into()))?;
         if version.as_u64() != Some(u64::from(CONTRACT_VERSION)) {
-            return Err(BundleError::ContractVersion { found: version.to_string(), supported: CONTRACT_VERSION });
+            return Err(BundleError::ContractVersion {
+                found: version.to_string().into(),
+                supported: CONTRACT_VERSION,
+            });
         }
         // From the text, so that the error tells where.
-        let contract: Self = serde_json::from_str(json).map_err(|error| refused(error.to_string()))?;
+        let contract: Self =
+            serde_json::from_str(json).map_err(|error| refused(error.to_string()))?;
         contract.check().map_err(refused)?;
         Ok(contract)
     }
@@ -225,10 +234,15 @@ impl Contract {
         ];
         for (field, len) in lengths {
             if !(1..=MAX_LEN).contains(&len) {
-                return Err(format!("field `{field}` is {len}, it must be 1 to {MAX_LEN}"));
+                return Err(format!(
+                    "field `{field}` is {len}, it must be 1 to {MAX_LEN}"
+                ));
             }
         }
-        for (field, value) in [("control_period_s", self.control_period_s), ("decision.temperature", self.decision.temperature)] {
+        for (field, value) in [
+            ("control_period_s", self.control_period_s),
+            ("decision.temperature", self.decision.temperature),
+        ] {
             if !(value.is_finite() && value > 0.0) {
                 return Err(format!("field `{field}` is {value}, it must be positive"));
             }
@@ -237,7 +251,11 @@ impl Contract {
         elements("action", &self.action)?;
         let ids = self.instructions.iter().map(|known| known.id.as_str());
         distinct("instructions", "id", ids)?;
-        distinct("instructions", "text", self.instructions.iter().map(|known| known.text.as_str()))
+        distinct(
+            "instructions",
+            "text",
+            self.instructions.iter().map(|known| known.text.as_str()),
+        )
     }
 }
 
@@ -245,13 +263,23 @@ fn elements(field: &str, elements: &[Element]) -> Result<(), String> {
     for (i, element) in elements.iter().enumerate() {
         let Element { name, min, max, .. } = element;
         if !(min.is_finite() && max.is_finite() && min < max) {
-            return Err(format!("field `{field}[{i}]` ({name}) has limits {min} to {max}, which is no range"));
+            return Err(format!(
+                "field `{field}[{i}]` ({name}) has limits {min} to {max}, which is no range"
+            ));
         }
     }
-    distinct(field, "name", elements.iter().map(|element| element.name.as_str()))
+    distinct(
+        field,
+        "name",
+        elements.iter().map(|element| element.name.as_str()),
+    )
 }
 
-fn distinct<'a>(field: &str, part: &str, names: impl Iterator<Item = &'a str>) -> Result<(), String> {
+fn distinct<'a>(
+    field: &str,
+    part: &str,
+    names: impl Iterator<Item = &'a str>,
+) -> Result<(), String> {
     let mut seen = HashSet::new();
     for (i, name) in names.enumerate() {
         if name.trim().is_empty() {

@@ -39,7 +39,12 @@ pub(crate) struct Signature {
 
 fn value(name: &str, ty: Type, shape: &[usize], fields: &'static str) -> Value {
     let shape = shape.iter().map(|&dim| Dim::of(dim)).collect();
-    Value { name: name.into(), ty, shape, fields }
+    Value {
+        name: name.into(),
+        ty,
+        shape,
+        fields,
+    }
 }
 
 /// `past_key_values.N.key|value` or `present.N.key|value` of every layer.
@@ -50,7 +55,12 @@ fn cache(contract: &Contract, name: &str, len: Dim) -> Vec<Value> {
         .map(|name| Value {
             name,
             ty: Type::F32,
-            shape: vec![Dim::of(1), Dim::of(network.heads), len, Dim::of(network.head_dim)],
+            shape: vec![
+                Dim::of(1),
+                Dim::of(network.heads),
+                len,
+                Dim::of(network.head_dim),
+            ],
             fields: "`network`, `context.words`",
         })
         .collect()
@@ -61,7 +71,14 @@ pub(crate) fn signatures(contract: &Contract) -> Vec<Signature> {
     use Type::{F32, I64};
     let c = contract;
     let (o, a, h) = (c.observation.len(), c.action.len(), c.horizon);
-    let words = || value("words", F32, &[1, c.context.words, c.language.dim], "`context.words`, `language.dim`");
+    let words = || {
+        value(
+            "words",
+            F32,
+            &[1, c.context.words, c.language.dim],
+            "`context.words`, `language.dim`",
+        )
+    };
     let observation = || value("observation", F32, &[1, o], "`observation`");
     let logits = || value("logits", F32, &[1, c.codebook.size], "`codebook.size`");
     let plan = || value("plan", F32, &[1, c.codebook.dim], "`codebook.dim`");
@@ -72,7 +89,11 @@ pub(crate) fn signatures(contract: &Contract) -> Vec<Signature> {
     };
     let past = || (Dim::past(0), "past_key_values");
     vec![
-        Signature { entry: LOOKUP_INSTRUCTION, inputs: vec![int("id")], outputs: vec![words(), int("length")] },
+        Signature {
+            entry: LOOKUP_INSTRUCTION,
+            inputs: vec![int("id")],
+            outputs: vec![words(), int("length")],
+        },
         Signature {
             entry: INSTRUCT,
             inputs: vec![words()],
@@ -86,13 +107,21 @@ pub(crate) fn signatures(contract: &Contract) -> Vec<Signature> {
         Signature {
             entry: STEP,
             inputs: with_cache(
-                vec![value("action", F32, &[1, a], "`action`"), observation(), int("timestep")],
+                vec![
+                    value("action", F32, &[1, a], "`action`"),
+                    observation(),
+                    int("timestep"),
+                ],
                 past().1,
                 past().0,
             ),
             outputs: with_cache(vec![logits()], "present", Dim::past(2)),
         },
-        Signature { entry: LOOKUP_PLAN, inputs: vec![int("index")], outputs: vec![plan()] },
+        Signature {
+            entry: LOOKUP_PLAN,
+            inputs: vec![int("index")],
+            outputs: vec![plan()],
+        },
         Signature {
             entry: ACT,
             inputs: vec![observation(), plan()],
@@ -104,7 +133,10 @@ pub(crate) fn signatures(contract: &Contract) -> Vec<Signature> {
                 value("observations", F32, &[1, h, o], "`horizon`, `observation`"),
                 value("actions", F32, &[1, h, a], "`horizon`, `action`"),
             ],
-            outputs: vec![value("latent", F32, &[1, c.codebook.dim], "`codebook.dim`"), int("index")],
+            outputs: vec![
+                value("latent", F32, &[1, c.codebook.dim], "`codebook.dim`"),
+                int("index"),
+            ],
         },
     ]
 }
@@ -118,13 +150,23 @@ pub(crate) fn entry_of(name: &str) -> Option<&str> {
 
 /// Compares what the graph declares with what the contract says.
 pub(crate) fn check(graph: &GraphProto, contract: &Contract) -> Result<(), BundleError> {
-    let refused = |problem| BundleError::Entry { problem };
+    let refused = |problem: String| BundleError::Entry {
+        problem: problem.into(),
+    };
     if !graph.sparse_initializer.is_empty() {
         return Err(refused("the graph has sparse initializers".into()));
     }
     let mut known = HashSet::new();
-    for Signature { entry, inputs, outputs } in signatures(contract) {
-        for (values, declared, what) in [(inputs, &graph.input, "input"), (outputs, &graph.output, "output")] {
+    for Signature {
+        entry,
+        inputs,
+        outputs,
+    } in signatures(contract)
+    {
+        for (values, declared, what) in [
+            (inputs, &graph.input, "input"),
+            (outputs, &graph.output, "output"),
+        ] {
             for value in values {
                 let name = format!("{entry}/{}", value.name);
                 let found = declared.iter().find(|other| other.name == name);
@@ -135,9 +177,15 @@ pub(crate) fn check(graph: &GraphProto, contract: &Contract) -> Result<(), Bundl
         }
     }
     for declared in graph.input.iter().chain(&graph.output) {
-        let initialized = graph.initializer.iter().any(|tensor| tensor.name == declared.name);
+        let initialized = graph
+            .initializer
+            .iter()
+            .any(|tensor| tensor.name == declared.name);
         if !initialized && !known.contains(&declared.name) {
-            return Err(refused(format!("value {} belongs to no entry of a policy of kind `lads`", declared.name)));
+            return Err(refused(format!(
+                "value {} belongs to no entry of a policy of kind `lads`",
+                declared.name
+            )));
         }
     }
     Ok(())
@@ -150,34 +198,54 @@ fn declared(tensor: &TensorTypeProto) -> Option<(Option<Type>, Vec<Dim>)> {
         data_type::INT64 => Some(Type::I64),
         _ => None,
     };
-    let shape = tensor.shape.as_ref()?.dim.iter().map(|dim| match (&dim.dim_value, &dim.dim_param) {
-        (Some(len), _) => usize::try_from(*len).ok().map(Dim::of),
-        (None, Some(text)) => {
-            let rest = text.strip_prefix('P')?;
-            let added = rest.trim().strip_prefix('+').map_or_else(|| rest.is_empty().then_some(0), |n| n.trim().parse().ok());
-            added.map(Dim::past)
-        }
-        (None, None) => None,
-    });
+    let shape =
+        tensor
+            .shape
+            .as_ref()?
+            .dim
+            .iter()
+            .map(|dim| match (&dim.dim_value, &dim.dim_param) {
+                (Some(len), _) => usize::try_from(*len).ok().map(Dim::of),
+                (None, Some(text)) => {
+                    let rest = text.strip_prefix('P')?;
+                    let added = rest
+                        .trim()
+                        .strip_prefix('+')
+                        .map_or_else(|| rest.is_empty().then_some(0), |n| n.trim().parse().ok());
+                    added.map(Dim::past)
+                }
+                (None, None) => None,
+            });
     Some((ty, shape.collect::<Option<_>>()?))
 }
 
 fn compare(name: &str, wanted: &Value, found: &ValueInfoProto) -> Result<(), String> {
     let tensor = found.r#type.as_ref().and_then(|ty| ty.tensor_type.as_ref());
     let tensor = tensor.ok_or_else(|| format!("{name} declares no tensor type"))?;
-    let (ty, shape) = declared(tensor).ok_or_else(|| format!("{name} declares no shape that can be read (the only symbolic axis is `P`)"))?;
+    let (ty, shape) = declared(tensor).ok_or_else(|| {
+        format!("{name} declares no shape that can be read (the only symbolic axis is `P`)")
+    })?;
     if ty != Some(wanted.ty) {
-        return Err(format!("{name} has elements of {}, it must be {:?}", data_type::name(tensor.elem_type), wanted.ty));
+        return Err(format!(
+            "{name} has elements of {}, it must be {:?}",
+            data_type::name(tensor.elem_type),
+            wanted.ty
+        ));
     }
     if shape != wanted.shape {
         let (found, wanted_shape, fields) = (show(&shape), show(&wanted.shape), wanted.fields);
-        return Err(format!("{name} has shape {found}, by the contract's {fields} it is {wanted_shape}"));
+        return Err(format!(
+            "{name} has shape {found}, by the contract's {fields} it is {wanted_shape}"
+        ));
     }
     Ok(())
 }
 
 /// The nodes that some values need, in the graph's order.
-pub(crate) fn needed<'g>(graph: &'g GraphProto, roots: impl Iterator<Item = &'g str>) -> Vec<&'g NodeProto> {
+pub(crate) fn needed<'g>(
+    graph: &'g GraphProto,
+    roots: impl Iterator<Item = &'g str>,
+) -> Vec<&'g NodeProto> {
     let producers: HashMap<&str, usize> = graph
         .node
         .iter()
@@ -194,5 +262,10 @@ pub(crate) fn needed<'g>(graph: &'g GraphProto, roots: impl Iterator<Item = &'g 
             stack.extend(graph.node[i].input.iter().map(String::as_str));
         }
     }
-    graph.node.iter().zip(wanted).filter_map(|(node, wanted)| wanted.then_some(node)).collect()
+    graph
+        .node
+        .iter()
+        .zip(wanted)
+        .filter_map(|(node, wanted)| wanted.then_some(node))
+        .collect()
 }

@@ -1,8 +1,38 @@
 //! What can go wrong with a bundle: one line that names the thing and says what to do about it.
 
+use std::fmt;
 use std::path::PathBuf;
 
 use lads_core::PolicyError;
+
+/// Text of one line: control characters, which names in a hostile file may hold, are escaped.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Line(String);
+
+impl From<&str> for Line {
+    fn from(text: &str) -> Self {
+        let escaped = |c: char| {
+            if c.is_control() {
+                c.escape_default().to_string()
+            } else {
+                c.to_string()
+            }
+        };
+        Self(text.chars().map(escaped).collect())
+    }
+}
+
+impl From<String> for Line {
+    fn from(text: String) -> Self {
+        Self::from(text.as_str())
+    }
+}
+
+impl fmt::Display for Line {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
 
 /// Why a file is not a bundle that can be used.
 #[derive(Debug, thiserror::Error)]
@@ -14,7 +44,7 @@ pub enum BundleError {
     #[error("not an ONNX model: {problem}; give the .onnx bundle that the exporter wrote")]
     NotOnnx {
         /// What does not fit.
-        problem: String,
+        problem: Line,
     },
     /// The file ends too early.
     #[error("truncated: {needed} bytes are needed, the file has {got}; copy or export it again")]
@@ -25,13 +55,17 @@ pub enum BundleError {
         got: u64,
     },
     /// An ONNX model without a policy's contract.
-    #[error("no `lads.contract` in the model's metadata, so it is not a policy bundle; export it with the exporter of this project")]
+    #[error(
+        "no `lads.contract` in the model's metadata, so it is not a policy bundle; export it with the exporter of this project"
+    )]
     NoContract,
     /// A contract that another version of this crate reads.
-    #[error("the contract has version {found}, this program reads version {supported}; export the bundle again or use the matching release")]
+    #[error(
+        "the contract has version {found}, this program reads version {supported}; export the bundle again or use the matching release"
+    )]
     ContractVersion {
         /// Version in the file.
-        found: String,
+        found: Line,
         /// Version that is read.
         supported: u32,
     },
@@ -39,19 +73,19 @@ pub enum BundleError {
     #[error("contract: {problem}; export the bundle again")]
     Contract {
         /// The field and what is wrong with it.
-        problem: String,
+        problem: Line,
     },
     /// A graph that contradicts the contract, or misses an entry.
     #[error("{problem}; export the bundle again")]
     Entry {
         /// The value and the field.
-        problem: String,
+        problem: Line,
     },
     /// The recorded episode does not read.
     #[error("`lads.golden`: {problem}; export the bundle again")]
     Golden {
         /// What is wrong with it.
-        problem: String,
+        problem: Line,
     },
     /// One of the above, in a file.
     #[error("{path}: {source}", path = path.display())]
@@ -70,24 +104,26 @@ pub enum CompileError {
     #[error("entry {entry}, node `{node}`: operator {operator} {problem}")]
     Operator {
         /// The entry, for example `high_level/step`.
-        entry: String,
+        entry: Line,
         /// The ONNX operator.
-        operator: String,
+        operator: Line,
         /// The node's name, or its first output's.
-        node: String,
+        node: Line,
         /// What is not supported, and instead of what.
-        problem: String,
+        problem: Line,
     },
     /// A value that is missing or has another shape than the contract says.
     #[error("entry {entry}: {problem}; export the bundle again")]
     Entry {
         /// The entry.
-        entry: String,
+        entry: Line,
         /// What is wrong with it.
-        problem: String,
+        problem: Line,
     },
     /// A memory plan that the verifier refused: a defect of this compiler.
-    #[error("program {program}: the memory plan is wrong ({fault}); this is a defect of the compiler, please report it with the bundle")]
+    #[error(
+        "program {program}: the memory plan is wrong ({fault}); this is a defect of the compiler, please report it with the bundle"
+    )]
     Plan {
         /// The program.
         program: &'static str,
@@ -95,12 +131,16 @@ pub enum CompileError {
         fault: crate::verify::PlanFault,
     },
     /// The policy is too large for an image, whose offsets have 32 bits.
-    #[error("{what} is too large for a program image, whose offsets have 32 bits; use a smaller network")]
+    #[error(
+        "{what} is too large for a program image, whose offsets have 32 bits; use a smaller network"
+    )]
     TooLarge {
         /// What is too large.
-        what: String,
+        what: Line,
     },
     /// The image that was made does not load: a defect of this compiler.
-    #[error("the compiled image does not load ({0}); this is a defect of the compiler, please report it with the bundle")]
+    #[error(
+        "the compiled image does not load ({0}); this is a defect of the compiler, please report it with the bundle"
+    )]
     Image(PolicyError),
 }

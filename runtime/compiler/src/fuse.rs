@@ -26,21 +26,51 @@ pub(crate) struct Fused {
 }
 
 /// Fuses an entry of which only some outputs are wanted, besides the cache.
-pub(crate) fn fuse(entry: Entry, signature: &Signature, wanted: &[&str]) -> Result<Fused, CompileError> {
+pub(crate) fn fuse(
+    entry: Entry,
+    signature: &Signature,
+    wanted: &[&str],
+) -> Result<Fused, CompileError> {
     let name = signature.entry;
-    let refused = |problem| CompileError::Entry { entry: name.into(), problem };
-    let Entry { graph, inputs, outputs } = entry;
+    let refused = |problem: String| CompileError::Entry {
+        entry: name.into(),
+        problem: problem.into(),
+    };
+    let Entry {
+        graph,
+        inputs,
+        outputs,
+    } = entry;
     let cached = attention::fuse(graph, &inputs, &outputs).map_err(|fault| fault.named(name))?;
-    let kept: Vec<(String, Id)> = outputs.into_iter().filter(|(output, _)| wanted.contains(&output.as_str())).collect();
+    let kept: Vec<(String, Id)> = outputs
+        .into_iter()
+        .filter(|(output, _)| wanted.contains(&output.as_str()))
+        .collect();
     // The constants that a value needs are part of it; inputs are kept so that their ports stay known.
-    let mut fused = Fused { graph: cached.graph, inputs: cached.inputs, outputs: vec![], records: vec![], tokens: cached.tokens };
+    let mut fused = Fused {
+        graph: cached.graph,
+        inputs: cached.inputs,
+        outputs: vec![],
+        records: vec![],
+        tokens: cached.tokens,
+    };
     for (output, old) in kept {
-        let id = cached.copies.get(&old).copied().ok_or_else(|| refused(format!("output {output} reads the cache outside an attention")))?;
+        let id = cached.copies.get(&old).copied().ok_or_else(|| {
+            refused(format!(
+                "output {output} reads the cache outside an attention"
+            ))
+        })?;
         fused.outputs.push((output, id));
     }
     let roots: Vec<Id> = fused.outputs.iter().map(|&(_, id)| id).collect();
     let live = live_attentions(&fused.graph, &roots, &cached.layers);
-    fused.records = cached.layers.iter().zip(live).filter(|(_, live)| !live).map(|(layer, _)| layer.record).collect();
+    fused.records = cached
+        .layers
+        .iter()
+        .zip(live)
+        .filter(|(_, live)| !live)
+        .map(|(layer, _)| layer.record)
+        .collect();
     let fused = rows::narrow(fused).map_err(refused)?;
     let fused = linear::fuse(fused).map_err(refused)?;
     attention::no_past_left(&fused, name)?;
@@ -54,7 +84,9 @@ fn live_attentions(graph: &Graph, roots: &[Id], layers: &[attention::Layer]) -> 
     let mut roots = roots.to_vec();
     for (i, layer) in layers.iter().enumerate().rev() {
         let order = topological(graph, &roots, &std::collections::HashMap::new());
-        live[i] = order.iter().any(|&id| matches!(graph.op(id), Op::Attention { layer, .. } if *layer == i));
+        live[i] = order
+            .iter()
+            .any(|&id| matches!(graph.op(id), Op::Attention { layer, .. } if *layer == i));
         if !live[i] {
             roots.push(layer.record);
         }
@@ -65,12 +97,21 @@ fn live_attentions(graph: &Graph, roots: &[Id], layers: &[attention::Layer]) -> 
 impl Fused {
     /// Everything that has to be computed.
     pub fn roots(&self) -> Vec<Id> {
-        self.outputs.iter().map(|&(_, id)| id).chain(self.records.iter().copied()).collect()
+        self.outputs
+            .iter()
+            .map(|&(_, id)| id)
+            .chain(self.records.iter().copied())
+            .collect()
     }
 
     /// The same entry in another graph; the ids are mapped.
     fn mapped(self, graph: Graph, of: impl Fn(Id) -> Id) -> Self {
-        let named = |values: Vec<(String, Id)>| values.into_iter().map(|(name, id)| (name, of(id))).collect();
+        let named = |values: Vec<(String, Id)>| {
+            values
+                .into_iter()
+                .map(|(name, id)| (name, of(id)))
+                .collect()
+        };
         Self {
             graph,
             inputs: named(self.inputs),

@@ -22,9 +22,9 @@ use lads_core::op::{BinaryKind, ReduceKind, UnaryKind};
 
 use crate::tensor::{Data, Tensor};
 
-pub(crate) use eval::evaluate;
 #[cfg(test)]
 pub(crate) use eval::apply;
+pub(crate) use eval::evaluate;
 pub(crate) use rewrite::{Rewriter, topological};
 
 /// Length of an axis: `fixed`, or `P + fixed`.
@@ -116,7 +116,10 @@ pub(crate) struct Unary {
 
 impl Unary {
     pub fn of(kind: UnaryKind) -> Self {
-        Self { kind: Kind(kind), alpha: 0 }
+        Self {
+            kind: Kind(kind),
+            alpha: 0,
+        }
     }
 }
 
@@ -158,9 +161,17 @@ pub(crate) enum Op {
     /// See `ArgMin`.
     ArgMax,
     /// `x·W + b` over the last axis of `x`, operands `x, W [k, n]`, then `b [n]` if `bias`, then what it is added to if `residual`.
-    Linear { bias: bool, residual: bool, activation: Option<Unary> },
+    Linear {
+        bias: bool,
+        residual: bool,
+        activation: Option<Unary>,
+    },
     /// Causal attention of `q [queries, w]` over the cache of a layer after `k, v [tokens, w]` were appended; the result is `[queries, w]`.
-    Attention { layer: usize, heads: usize, scale: u32 },
+    Attention {
+        layer: usize,
+        heads: usize,
+        scale: u32,
+    },
     /// Appends `k, v [tokens, w]` to the cache of a layer; gives nothing.
     Record { layer: usize, heads: usize },
 }
@@ -252,10 +263,14 @@ impl Graph {
             Data::I64(_) => Type::I64,
         };
         // The same initializer, read by several nodes, is one constant.
-        let number = self.consts.iter().position(|known| Arc::ptr_eq(known, &tensor)).unwrap_or_else(|| {
-            self.consts.push(tensor);
-            self.consts.len() - 1
-        });
+        let number = self
+            .consts
+            .iter()
+            .position(|known| Arc::ptr_eq(known, &tensor))
+            .unwrap_or_else(|| {
+                self.consts.push(tensor);
+                self.consts.len() - 1
+            });
         self.add(Op::Const(number), vec![], shape, ty)
     }
 
@@ -273,7 +288,13 @@ impl Graph {
 
     fn push(&mut self, op: Op, inputs: Vec<Id>, shape: Vec<Dim>, ty: Type) -> Id {
         let id = Id(self.nodes.len() as u32);
-        self.nodes.push(Node { op, inputs, shape, ty, origin: self.current });
+        self.nodes.push(Node {
+            op,
+            inputs,
+            shape,
+            ty,
+            origin: self.current,
+        });
         id
     }
 }

@@ -5,8 +5,9 @@ use std::collections::HashMap;
 
 use lads_core::codec::{Field, Writer};
 use lads_core::image::{
-    self, Beyond, CRC_WORD, ContractRecord, DecisionRule, ElementRecord, GoldenRecord, InstructionRecord, Layout, PORTS, PolicyKind,
-    PortRecord, ProgramRecord, QuaternionOrder, SECTIONS, Section, Split, Text,
+    self, Beyond, CRC_WORD, ContractRecord, DecisionRule, ElementRecord, GoldenRecord,
+    InstructionRecord, Layout, PORTS, PolicyKind, PortRecord, ProgramRecord, QuaternionOrder,
+    SECTIONS, Section, Split, Text,
 };
 use lads_core::op::{Place, Port, WeightSpan};
 
@@ -50,7 +51,12 @@ impl Image {
         }
         let crc = image::crc32(&memory[start..start + bytes]);
         memory[start + CRC_WORD * 4..][..4].copy_from_slice(&crc.to_le_bytes());
-        Self { memory, start, len: bytes, report }
+        Self {
+            memory,
+            start,
+            len: bytes,
+            report,
+        }
     }
 }
 
@@ -73,7 +79,10 @@ impl Strings {
         if let Some(&known) = self.known.get(text) {
             return known;
         }
-        let added = Text { offset: self.bytes.len() as u32, len: text.len() as u32 };
+        let added = Text {
+            offset: self.bytes.len() as u32,
+            len: text.len() as u32,
+        };
         self.bytes.extend_from_slice(text.as_bytes());
         self.known.insert(text.into(), added);
         added
@@ -82,9 +91,8 @@ impl Strings {
 
 /// What goes into an image besides what the bundle says.
 pub(crate) struct Parts<'a> {
-    /// In the order of `ProgramKind`.
-    pub programs: &'a [Placed],
-    pub tokens: &'a [usize],
+    /// In the order of `ProgramKind`, with the tokens that each appends to the cache.
+    pub programs: &'a [(&'a Placed, usize)],
     /// Words of each instruction: how many, and where.
     pub words: &'a [(u32, WeightSpan)],
     pub weights: &'a [f32],
@@ -92,13 +100,23 @@ pub(crate) struct Parts<'a> {
 }
 
 /// Writes an image.
-pub(crate) fn write(bundle: &Bundle, parts: &Parts, report: CompileReport) -> Result<Image, CompileError> {
+pub(crate) fn write(
+    bundle: &Bundle,
+    parts: &Parts,
+    report: CompileReport,
+) -> Result<Image, CompileError> {
     let mut strings = Strings::default();
     let contract = contract_words(bundle, parts, &mut strings);
     while !strings.bytes.len().is_multiple_of(4) {
         strings.bytes.push(0);
     }
-    let strings: Vec<u32> = strings.bytes.as_chunks::<4>().0.iter().map(|&word| u32::from_le_bytes(word)).collect();
+    let strings: Vec<u32> = strings
+        .bytes
+        .as_chunks::<4>()
+        .0
+        .iter()
+        .map(|&word| u32::from_le_bytes(word))
+        .collect();
     let (programs, ops) = program_words(parts);
     let golden = golden_words(bundle.golden());
     let weights: Vec<u32> = parts.weights.iter().map(|x| x.to_bits()).collect();
@@ -111,7 +129,9 @@ pub(crate) fn write(bundle: &Bundle, parts: &Parts, report: CompileReport) -> Re
         (Section::Golden, golden),
     ];
     let lens = sections.each_ref().map(|(_, words)| words.len() * 4);
-    let layout = Layout::new(lens).ok_or_else(|| CompileError::TooLarge { what: "the policy".into() })?;
+    let layout = Layout::new(lens).ok_or_else(|| CompileError::TooLarge {
+        what: "the policy".into(),
+    })?;
     let mut words = vec![0; layout.total_bytes() / 4];
     words[..image::HEADER_WORDS].copy_from_slice(&layout.header());
     for (section, content) in sections {
@@ -195,7 +215,7 @@ fn contract_words(bundle: &Bundle, parts: &Parts, strings: &mut Strings) -> Vec<
 fn program_words(parts: &Parts) -> (Vec<u32>, Vec<u32>) {
     let (mut programs, mut ops) = (vec![], vec![]);
     let mut first_op = 0;
-    for (program, &tokens) in parts.programs.iter().zip(parts.tokens) {
+    for &(program, tokens) in parts.programs {
         let record = ProgramRecord {
             first_op,
             ops_len: program.ops.len() as u32,
@@ -207,7 +227,7 @@ fn program_words(parts: &Parts) -> (Vec<u32>, Vec<u32>) {
             outputs: port_records(&program.outputs),
         };
         put(&mut programs, &record);
-        ops.extend(program.ops.iter().flat_map(|op| op.encode()));
+        ops.extend(program.ops.iter().flat_map(lads_core::op::Op::encode));
         first_op += program.ops.len() as u32;
     }
     (programs, ops)
@@ -224,7 +244,14 @@ fn port_records(ports: &[(Port, Place)]) -> [PortRecord; PORTS] {
 
 fn golden_words(golden: &Golden) -> Vec<u32> {
     let mut out = vec![];
-    put(&mut out, &GoldenRecord { instruction: golden.instruction as u32, steps: golden.steps() as u32, tolerance: golden.tolerance });
+    put(
+        &mut out,
+        &GoldenRecord {
+            instruction: golden.instruction as u32,
+            steps: golden.steps() as u32,
+            tolerance: golden.tolerance,
+        },
+    );
     out.extend(golden.observations.iter().map(|x| x.to_bits()));
     out.extend(&golden.plans);
     out.extend(golden.actions.iter().map(|x| x.to_bits()));

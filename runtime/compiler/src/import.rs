@@ -30,7 +30,6 @@ const MAX_NODES: usize = 1 << 16;
 /// The initializers of a model, read once each, so that entries share them.
 pub(crate) struct Model<'m> {
     graph: &'m GraphProto,
-    opset: i64,
     protos: HashMap<&'m str, &'m TensorProto>,
     tensors: RefCell<HashMap<&'m str, Arc<Tensor>>>,
 }
@@ -45,14 +44,34 @@ pub(crate) struct Entry {
 
 impl<'m> Model<'m> {
     pub fn new(model: &'m ModelProto, graph: &'m GraphProto) -> Result<Self, CompileError> {
-        let refused = |problem| CompileError::Entry { entry: "(all)".into(), problem };
-        let default = model.opset_import.iter().find(|set| set.domain.is_empty() || set.domain == "ai.onnx");
-        let opset = default.map(|set| set.version).ok_or_else(|| refused("the model imports no ONNX operator set".into()))?;
+        let refused = |problem: String| CompileError::Entry {
+            entry: "(all)".into(),
+            problem: problem.into(),
+        };
+        let default = model
+            .opset_import
+            .iter()
+            .find(|set| set.domain.is_empty() || set.domain == "ai.onnx");
+        let opset = default
+            .map(|set| set.version)
+            .ok_or_else(|| refused("the model imports no ONNX operator set".into()))?;
         if !OPSETS.contains(&opset) {
-            return Err(refused(format!("ONNX operator set {opset} is not supported, {} to {} are", OPSETS.start(), OPSETS.end())));
+            return Err(refused(format!(
+                "ONNX operator set {opset} is not supported, {} to {} are",
+                OPSETS.start(),
+                OPSETS.end()
+            )));
         }
-        let protos = graph.initializer.iter().map(|tensor| (tensor.name.as_str(), tensor)).collect();
-        Ok(Self { graph, opset, protos, tensors: RefCell::default() })
+        let protos = graph
+            .initializer
+            .iter()
+            .map(|tensor| (tensor.name.as_str(), tensor))
+            .collect();
+        Ok(Self {
+            graph,
+            protos,
+            tensors: RefCell::default(),
+        })
     }
 
     fn initializer(&self, name: &str) -> Result<Option<Arc<Tensor>>, String> {
@@ -62,34 +81,54 @@ impl<'m> Model<'m> {
         if let Some(tensor) = self.tensors.borrow().get(name) {
             return Ok(Some(tensor.clone()));
         }
-        let tensor = Tensor::from_proto(proto).map_err(|problem| format!("initializer {name}: {problem}"))?;
+        let tensor = Tensor::from_proto(proto)
+            .map_err(|problem| format!("initializer {name}: {problem}"))?;
         self.tensors.borrow_mut().insert(name, tensor.clone());
         Ok(Some(tensor))
     }
 
     /// Builds an entry. Inputs that are in `bindings` are constants.
-    pub fn import(&self, signature: &Signature, bindings: &HashMap<&str, Tensor>) -> Result<Entry, CompileError> {
+    pub fn import(
+        &self,
+        signature: &Signature,
+        bindings: &HashMap<&str, Tensor>,
+    ) -> Result<Entry, CompileError> {
         let entry = signature.entry;
-        let refused = |problem| CompileError::Entry { entry: entry.into(), problem };
+        let refused = |problem: String| CompileError::Entry {
+            entry: entry.into(),
+            problem: problem.into(),
+        };
         let full = |name: &str| format!("{entry}/{name}");
-        let mut builder = Builder { model: self, graph: Graph::default(), values: HashMap::new() };
+        let mut builder = Builder {
+            model: self,
+            graph: Graph::default(),
+            values: HashMap::new(),
+        };
         let mut inputs = vec![];
         for input in &signature.inputs {
             let id = match bindings.get(input.name.as_str()) {
                 Some(tensor) => builder.graph.add_const(Arc::new(tensor.clone())),
-                None => builder.graph.input(&full(&input.name), &input.shape, input.ty),
+                None => builder
+                    .graph
+                    .input(&full(&input.name), &input.shape, input.ty),
             };
             builder.values.insert(full(&input.name), id);
             inputs.push((input.name.clone(), id));
         }
-        let roots: Vec<String> = signature.outputs.iter().map(|output| full(&output.name)).collect();
+        let roots: Vec<String> = signature
+            .outputs
+            .iter()
+            .map(|output| full(&output.name))
+            .collect();
         for node in entries::needed(self.graph, roots.iter().map(String::as_str)) {
-            builder.node(node).map_err(|problem| CompileError::Operator {
-                entry: entry.into(),
-                operator: node.op_type.clone(),
-                node: node_name(node).into(),
-                problem,
-            })?;
+            builder
+                .node(node)
+                .map_err(|problem| CompileError::Operator {
+                    entry: entry.into(),
+                    operator: node.op_type.as_str().into(),
+                    node: node_name(node).into(),
+                    problem: problem.into(),
+                })?;
             if builder.graph.ids().len() > MAX_NODES {
                 return Err(refused(format!("it has more than {MAX_NODES} operations")));
             }
@@ -108,13 +147,21 @@ impl<'m> Model<'m> {
             }
             outputs.push((output.name.clone(), id));
         }
-        Ok(Entry { graph: builder.graph, inputs, outputs })
+        Ok(Entry {
+            graph: builder.graph,
+            inputs,
+            outputs,
+        })
     }
 }
 
 /// A node's name, or its first output's.
 fn node_name(node: &NodeProto) -> &str {
-    if node.name.is_empty() { node.output.first().map_or("", String::as_str) } else { &node.name }
+    if node.name.is_empty() {
+        node.output.first().map_or("", String::as_str)
+    } else {
+        &node.name
+    }
 }
 
 /// The values of an entry that were built so far.
@@ -129,7 +176,10 @@ impl Builder<'_, '_> {
         if let Some(&id) = self.values.get(name) {
             return Ok(id);
         }
-        let tensor = self.model.initializer(name)?.ok_or_else(|| format!("value {name} is not computed by this entry"))?;
+        let tensor = self
+            .model
+            .initializer(name)?
+            .ok_or_else(|| format!("value {name} is not computed by this entry"))?;
         let id = self.graph.add_const(tensor);
         self.values.insert(name.into(), id);
         Ok(id)
@@ -142,11 +192,17 @@ impl Builder<'_, '_> {
         }
         let mut inputs = vec![];
         for name in &node.input {
-            inputs.push(if name.is_empty() { None } else { Some(self.value(name)?) });
+            inputs.push(if name.is_empty() {
+                None
+            } else {
+                Some(self.value(name)?)
+            });
         }
         let attributes = Attributes::new(&node.attribute)?;
-        let given = node.output.iter().map(|name| !name.is_empty()).collect();
-        let operands = Operands { inputs, given, opset: self.model.opset };
+        let operands = Operands {
+            inputs,
+            outputs: node.output.len(),
+        };
         let outputs = operators::translate(&mut self.graph, &node.op_type, &operands, &attributes)?;
         attributes.all_read()?;
         for (name, id) in node.output.iter().zip(outputs) {
@@ -154,7 +210,11 @@ impl Builder<'_, '_> {
                 return Err(format!("gives {name}, which exists already"));
             }
         }
-        match node.output.iter().find(|name| !name.is_empty() && !self.values.contains_key(*name)) {
+        match node
+            .output
+            .iter()
+            .find(|name| !name.is_empty() && !self.values.contains_key(*name))
+        {
             Some(missing) => Err(format!("does not support its output {missing}")),
             None => Ok(()),
         }
@@ -164,14 +224,14 @@ impl Builder<'_, '_> {
 /// What a node reads.
 struct Operands {
     inputs: Vec<Option<Id>>,
-    /// Which outputs have a name.
-    given: Vec<bool>,
-    opset: i64,
+    /// How many outputs the node has.
+    outputs: usize,
 }
 
 impl Operands {
     fn get(&self, i: usize) -> Result<Id, String> {
-        self.optional(i).ok_or_else(|| format!("misses its input {i}"))
+        self.optional(i)
+            .ok_or_else(|| format!("misses its input {i}"))
     }
 
     fn optional(&self, i: usize) -> Option<Id> {
@@ -185,9 +245,9 @@ impl Operands {
 
     /// Refuses inputs from `n` on.
     fn at_most(&self, n: usize) -> Result<(), String> {
-        match self.inputs.iter().skip(n).any(Option::is_some) {
-            true => Err(format!("does not support its input {n}")),
-            false => Ok(()),
+        if self.inputs.iter().skip(n).any(Option::is_some) {
+            return Err(format!("does not support its input {n}"));
         }
+        Ok(())
     }
 }

@@ -8,11 +8,15 @@
 //! an [`Image`] that `lads-core` runs without allocating. Runs on the host and may allocate; what it reads may be hostile, so
 //! every error is a value that names the thing and the remedy.
 //!
-//! Operators of the default ONNX domain that are compiled (operator sets 13 to 21): Abs, Add, ArgMax, ArgMin, BatchNormalization,
-//! Cast, Clip, Concat, Constant, ConstantOfShape, Div, Dropout, Erf, Exp, Expand, Flatten, Gather, Gelu, Gemm, Identity, LSTM,
-//! LayerNormalization, LeakyRelu, Log, LogSoftmax, MatMul, Max, Min, Mul, Neg, Pow, Reciprocal, ReduceL1, ReduceL2, ReduceMax,
-//! ReduceMean, ReduceMin, ReduceProd, ReduceSum, ReduceSumSquare, Relu, Reshape, Shape, Sigmoid, Slice, Softmax, Split, Sqrt,
-//! Squeeze, Sub, Sum, Tanh, Transpose, Unsqueeze. Anything else is an error that names the operator, the node and the entry.
+//! Operators of the default ONNX domain that are compiled (operator sets 13 to 21); anything else is an error that names the
+//! operator, the node and the entry:
+//!
+//! ```text
+//! Abs Add ArgMax ArgMin BatchNormalization Cast Clip Concat Constant ConstantOfShape Div Dropout Erf Exp Expand Flatten Gather
+//! Gelu Gemm Identity LSTM LayerNormalization LeakyRelu Log LogSoftmax MatMul Max Min Mul Neg Pow Reciprocal ReduceL1 ReduceL2
+//! ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare Relu Reshape Shape Sigmoid Slice Softmax Split Sqrt
+//! Squeeze Sub Sum Tanh Transpose Unsqueeze
+//! ```
 #![forbid(unsafe_code)]
 
 mod access;
@@ -39,7 +43,7 @@ mod tests;
 pub use bundle::Bundle;
 pub use compile::compile;
 pub use contract::Contract;
-pub use error::{BundleError, CompileError};
+pub use error::{BundleError, CompileError, Line};
 pub use golden::Golden;
 pub use image::Image;
 pub use report::{CompileReport, ProgramReport};

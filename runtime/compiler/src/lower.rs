@@ -6,6 +6,7 @@
 //!
 //! In place are: a residual that nobody else reads any more, and elementwise ops whose operand nobody else reads any more.
 
+mod cached;
 mod compute;
 mod view;
 mod weights;
@@ -50,7 +51,12 @@ impl Cache {
     pub fn new(contract: &Contract) -> Self {
         let network = contract.network;
         let capacity = contract.context.words + 2 * contract.context.steps - 1;
-        Self { capacity, layers: network.layers, heads: network.heads, head_dim: network.head_dim }
+        Self {
+            capacity,
+            layers: network.layers,
+            heads: network.heads,
+            head_dim: network.head_dim,
+        }
     }
 
     fn width(&self) -> usize {
@@ -66,7 +72,13 @@ impl Cache {
     pub(crate) fn spans(&self, layer: usize) -> [StateSpan; 2] {
         let len = (self.capacity * self.width()) as u32;
         let offset = 2 * layer as u32 * len;
-        [StateSpan { offset, len }, StateSpan { offset: offset + len, len }]
+        [
+            StateSpan { offset, len },
+            StateSpan {
+                offset: offset + len,
+                len,
+            },
+        ]
     }
 }
 
@@ -81,11 +93,17 @@ pub(crate) fn lower(
     let order = topological(&fused.graph, &fused.roots(), &HashMap::new());
     let mut lowering = Lowering::new(fused, &order, cache, weights);
     lowering.place_concatenations(&order);
+    lowering.place_residuals(&order);
     lowering.inputs(&order, fused, ports);
     for &id in &order {
         lowering.node(id).map_err(|problem| {
             let (operator, node) = fused.graph.origin(id);
-            CompileError::Operator { entry: entry.into(), operator: operator.into(), node: node.into(), problem }
+            CompileError::Operator {
+                entry: entry.into(),
+                operator: operator.into(),
+                node: node.into(),
+                problem: problem.into(),
+            }
         })?;
         for &input in &fused.graph.node(id).inputs {
             if let Some(pending) = lowering.pending.get_mut(&input) {
@@ -93,17 +111,39 @@ pub(crate) fn lower(
             }
         }
     }
-    lowering.outputs(fused, ports).map_err(|problem| CompileError::Entry { entry: entry.into(), problem })?;
+    lowering
+        .outputs(fused, ports)
+        .map_err(|problem| CompileError::Entry {
+            entry: entry.into(),
+            problem: problem.into(),
+        })?;
     if lowering.end > MAX_VIRTUAL {
-        return Err(CompileError::TooLarge { what: format!("the working memory of {entry}") });
+        return Err(CompileError::TooLarge {
+            what: format!("the working memory of {entry}").into(),
+        });
     }
-    let Lowering { ops, buffers, input_ports, output_ports, .. } = lowering;
-    Ok(Lowered { ops, buffers, inputs: input_ports, outputs: output_ports, tokens: fused.tokens })
+    let Lowering {
+        ops,
+        buffers,
+        input_ports,
+        output_ports,
+        ..
+    } = lowering;
+    Ok(Lowered {
+        ops,
+        buffers,
+        inputs: input_ports,
+        outputs: output_ports,
+        tokens: fused.tokens,
+    })
 }
 
 /// The port of a value at the edge.
 fn port_of(ports: &[(&str, Port)], name: &str) -> Option<Port> {
-    ports.iter().find(|(known, _)| *known == name).map(|&(_, port)| port)
+    ports
+        .iter()
+        .find(|(known, _)| *known == name)
+        .map(|&(_, port)| port)
 }
 
 /// An entry on its way to ops.
@@ -132,7 +172,9 @@ struct Lowering<'a> {
 impl<'a> Lowering<'a> {
     fn new(fused: &'a Fused, order: &[Id], cache: Cache, weights: &'a mut Weights) -> Self {
         let mut pending: HashMap<Id, usize> = HashMap::new();
-        let uses = order.iter().flat_map(|&id| fused.graph.node(id).inputs.iter().copied());
+        let uses = order
+            .iter()
+            .flat_map(|&id| fused.graph.node(id).inputs.iter().copied());
         for id in uses.chain(fused.outputs.iter().map(|&(_, id)| id)) {
             *pending.entry(id).or_default() += 1;
         }
@@ -157,7 +199,10 @@ impl<'a> Lowering<'a> {
     /// A buffer of its own.
     fn buffer(&mut self, len: usize) -> usize {
         let len = u32::try_from(len).unwrap_or(u32::MAX);
-        self.buffers.push(Span { offset: self.end, len });
+        self.buffers.push(Span {
+            offset: self.end,
+            len,
+        });
         self.residents.push(vec![]);
         self.end = self.end.saturating_add(len);
         self.buffers.len() - 1
@@ -165,13 +210,17 @@ impl<'a> Lowering<'a> {
 
     /// The shape of a value; all are static by now.
     fn shape(&self, id: Id) -> Result<Vec<usize>, String> {
-        self.g.known_shape(id).ok_or_else(|| "depends on the context length".into())
+        self.g
+            .known_shape(id)
+            .ok_or_else(|| "depends on the context length".into())
     }
 
     /// Decides which values are computed inside the buffer of a concatenation.
     fn place_concatenations(&mut self, order: &[Id]) {
         for &id in order {
-            let (Op::Concat { axis }, Type::F32) = (self.g.op(id), self.g.ty(id)) else { continue };
+            let (Op::Concat { axis }, Type::F32) = (self.g.op(id), self.g.ty(id)) else {
+                continue;
+            };
             let Ok(shape) = self.shape(id) else { continue };
             // The parts lie one after the other only if the axis is the first that is longer than one.
             if shape[..*axis].iter().any(|&dim| dim != 1) || self.placed.contains_key(&id) {
@@ -194,11 +243,40 @@ impl<'a> Lowering<'a> {
         }
     }
 
+    /// A residual that only its layer reads is computed where the layer belongs, so that the layer is added in place.
+    fn place_residuals(&mut self, order: &[Id]) {
+        // Users first, so that a chain of residuals shares one place.
+        for &id in order.iter().rev() {
+            let (Op::Linear { residual: true, .. }, Some(&place)) =
+                (self.g.op(id), self.placed.get(&id))
+            else {
+                continue;
+            };
+            let Some(mut source) = self.g.node(id).inputs.last().copied() else {
+                continue;
+            };
+            let mut alone = self.pending.get(&source) == Some(&1);
+            while *self.g.op(source) == Op::Reshape {
+                source = self.g.node(source).inputs[0];
+                alone &= self.pending.get(&source) == Some(&1);
+            }
+            if alone && self.computes(source) && *self.g.op(source) != Op::Input {
+                self.placed.entry(source).or_insert(place);
+            }
+        }
+    }
+
     /// Whether a value is written by an op of its own or by the caller, and so can be written anywhere.
     fn computes(&self, id: Id) -> bool {
         let moves = matches!(
             self.g.op(id),
-            Op::Const(_) | Op::Reshape | Op::Transpose(_) | Op::Slice { .. } | Op::Expand | Op::Concat { .. } | Op::Record { .. }
+            Op::Const(_)
+                | Op::Reshape
+                | Op::Transpose(_)
+                | Op::Slice { .. }
+                | Op::Expand
+                | Op::Concat { .. }
+                | Op::Record { .. }
         );
         !moves && self.g.ty(id) == Type::F32
     }
@@ -222,14 +300,25 @@ impl<'a> Lowering<'a> {
 
     /// True when no later node reads the buffer, the node that is being lowered aside.
     fn dies_here(&self, buffer: usize, at: Id) -> bool {
-        let reads = |id: Id| self.g.node(at).inputs.iter().filter(|&&input| input == id).count();
-        self.residents[buffer].iter().all(|&id| self.pending.get(&id).copied().unwrap_or(0) <= reads(id))
+        let reads = |id: Id| {
+            self.g
+                .node(at)
+                .inputs
+                .iter()
+                .filter(|&&input| input == id)
+                .count()
+        };
+        self.residents[buffer]
+            .iter()
+            .all(|&id| self.pending.get(&id).copied().unwrap_or(0) <= reads(id))
     }
 
     fn inputs(&mut self, order: &[Id], fused: &Fused, ports: &[(&str, Port)]) {
         let needed: HashSet<Id> = order.iter().copied().collect();
         for (name, id) in &fused.inputs {
-            let Some(port) = port_of(ports, name).filter(|_| needed.contains(id)) else { continue };
+            let Some(port) = port_of(ports, name).filter(|_| needed.contains(id)) else {
+                continue;
+            };
             let place = if port.is_int() {
                 let slot = self.slot();
                 self.ints.insert(*id, (slot, 0));
@@ -252,7 +341,9 @@ impl<'a> Lowering<'a> {
 
     fn outputs(&mut self, fused: &Fused, ports: &[(&str, Port)]) -> Result<(), String> {
         for (name, id) in &fused.outputs {
-            let Some(port) = port_of(ports, name) else { continue };
+            let Some(port) = port_of(ports, name) else {
+                continue;
+            };
             let place = if port.is_int() {
                 match self.ints.get(id) {
                     Some(&(slot, 0)) => Place::Int(slot),
@@ -260,8 +351,16 @@ impl<'a> Lowering<'a> {
                 }
             } else {
                 // A value that is an input or a constant is copied, so that outputs are the program's own.
-                let computed = self.views.get(id).is_some_and(|view| view.buffer().is_some()) && *self.g.op(*id) != Op::Input;
-                let span = if computed { self.contiguous(*id)? } else { self.copied(*id)? };
+                let computed = self
+                    .views
+                    .get(id)
+                    .is_some_and(|view| view.buffer().is_some())
+                    && *self.g.op(*id) != Op::Input;
+                let span = if computed {
+                    self.contiguous(*id)?
+                } else {
+                    self.copied(*id)?
+                };
                 Place::Span(span)
             };
             self.output_ports.push((port, place));
@@ -274,8 +373,13 @@ impl<'a> Lowering<'a> {
 
     /// Elements of the arena, from the first of a view.
     fn span(&self, view: &View, len: usize) -> Span {
-        let base = view.buffer().map_or(0, |buffer| self.buffers[buffer].offset);
-        Span { offset: base.saturating_add(view.offset as u32), len: len as u32 }
+        let base = view
+            .buffer()
+            .map_or(0, |buffer| self.buffers[buffer].offset);
+        Span {
+            offset: base.saturating_add(view.offset as u32),
+            len: len as u32,
+        }
     }
 
     /// The view of a value; constants are put into the weights.
@@ -283,7 +387,11 @@ impl<'a> Lowering<'a> {
         if let Some(view) = self.views.get(&id) {
             return Ok(view.clone());
         }
-        let tensor = self.g.constant(id).cloned().ok_or("reads a value that was not computed")?;
+        let tensor = self
+            .g
+            .constant(id)
+            .cloned()
+            .ok_or("reads a value that was not computed")?;
         let shape = self.shape(id)?;
         if shape.contains(&0) {
             return Err("reads an empty constant".into());
@@ -298,7 +406,11 @@ impl<'a> Lowering<'a> {
     fn operand(&self, view: &View, len: usize) -> Operand {
         match view.buffer() {
             Some(_) => self.span(view, len).into(),
-            None => Operand { space: Space::Weights, offset: view.offset as u32, len: len as u32 },
+            None => Operand {
+                space: Space::Weights,
+                offset: view.offset as u32,
+                len: len as u32,
+            },
         }
     }
 

@@ -185,8 +185,23 @@ pub(crate) mod data_type {
     /// The name of an element type, for messages.
     pub fn name(code: i32) -> String {
         let known = [
-            "undefined", "float32", "uint8", "int8", "uint16", "int16", "int32", "int64", "string", "bool", "float16", "float64", "uint32",
-            "uint64", "complex64", "complex128", "bfloat16",
+            "undefined",
+            "float32",
+            "uint8",
+            "int8",
+            "uint16",
+            "int16",
+            "int32",
+            "int64",
+            "string",
+            "bool",
+            "float16",
+            "float64",
+            "uint32",
+            "uint64",
+            "complex64",
+            "complex128",
+            "bfloat16",
         ];
         usize::try_from(code)
             .ok()
@@ -199,7 +214,7 @@ pub(crate) mod data_type {
 pub(crate) fn decode(bytes: &Bytes) -> Result<ModelProto, BundleError> {
     envelope::check(bytes)?;
     let model = ModelProto::decode(bytes.clone()).map_err(|error| BundleError::NotOnnx {
-        problem: format!("its protocol buffer does not decode: {error}"),
+        problem: format!("its protocol buffer does not decode: {error}").into(),
     })?;
     if model.graph.is_none() {
         return Err(BundleError::NotOnnx {

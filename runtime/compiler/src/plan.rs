@@ -34,14 +34,21 @@ pub(crate) fn plan(lowered: &Lowered) -> Placed {
     let last = lowered.ops.len() + 1;
     let sum_at = |time: usize| -> u32 {
         let lives_then = |life: &Life| life.is_some_and(|(from, to)| (from..=to).contains(&time));
-        buffers.iter().zip(&lives).filter(|(_, life)| lives_then(life)).map(|(buffer, _)| buffer.len).sum()
+        buffers
+            .iter()
+            .zip(&lives)
+            .filter(|(_, life)| lives_then(life))
+            .map(|(buffer, _)| buffer.len)
+            .sum()
     };
     let moved = |span: &mut Span| {
         let buffer = buffer_of(buffers, *span);
         span.offset = span.offset - buffers[buffer].offset + offsets[buffer];
     };
     let mut ops = lowered.ops.clone();
-    ops.iter_mut().for_each(|op| each_span(op, &mut |span| moved(span)));
+    for op in &mut ops {
+        each_span(op, &mut |span| moved(span));
+    }
     let ports = |ports: &[(Port, Place)]| {
         let place = |place: Place| match place {
             Place::Span(mut span) => {
@@ -52,12 +59,19 @@ pub(crate) fn plan(lowered: &Lowered) -> Placed {
         };
         ports.iter().map(|&(port, at)| (port, place(at))).collect()
     };
-    let ends = buffers.iter().zip(&lives).zip(&offsets).filter(|((_, life), _)| life.is_some());
+    let ends = buffers
+        .iter()
+        .zip(&lives)
+        .zip(&offsets)
+        .filter(|((_, life), _)| life.is_some());
     Placed {
         ops,
         inputs: ports(&lowered.inputs),
         outputs: ports(&lowered.outputs),
-        arena_len: ends.map(|((buffer, _), offset)| offset + buffer.len).max().unwrap_or(0),
+        arena_len: ends
+            .map(|((buffer, _), offset)| offset + buffer.len)
+            .max()
+            .unwrap_or(0),
         lower_bound: (0..=last).map(sum_at).max().unwrap_or(0),
     }
 }
@@ -100,10 +114,17 @@ fn place(buffers: &[Span], lives: &[Life]) -> Vec<u32> {
     let mut done: Vec<usize> = vec![];
     for i in order {
         let beside = |&j: &usize| match (lives[i], lives[j]) {
-            (Some((from, to)), Some((other_from, other_to))) => from <= other_to && other_from <= to,
+            (Some((from, to)), Some((other_from, other_to))) => {
+                from <= other_to && other_from <= to
+            }
             _ => false,
         };
-        let mut taken: Vec<(u32, u32)> = done.iter().copied().filter(beside).map(|j| (offsets[j], offsets[j] + buffers[j].len)).collect();
+        let mut taken: Vec<(u32, u32)> = done
+            .iter()
+            .copied()
+            .filter(beside)
+            .map(|j| (offsets[j], offsets[j] + buffers[j].len))
+            .collect();
         taken.sort_unstable();
         let mut free = 0;
         let mut best: Option<(u32, u32)> = None;

@@ -31,17 +31,33 @@ pub struct CompileReport {
 impl CompileReport {
     /// Elements of arena that the largest program needs.
     pub fn arena_len(&self) -> usize {
-        self.programs.iter().map(|program| program.arena_len).max().unwrap_or(0)
+        self.programs
+            .iter()
+            .map(|program| program.arena_len)
+            .max()
+            .unwrap_or(0)
     }
 }
 
 /// A table, one line per program.
 impl fmt::Display for CompileReport {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        writeln!(f, "{:<12} {:>5} {:>8} {:>8}", "program", "ops", "arena", "at least")?;
+        writeln!(
+            f,
+            "{:<12} {:>5} {:>8} {:>8}",
+            "program", "ops", "arena", "at least"
+        )?;
         for program in &self.programs {
-            writeln!(f, "{:<12} {:>5} {:>8} {:>8}", program.name, program.ops, program.arena_len, program.arena_lower_bound)?;
+            writeln!(
+                f,
+                "{:<12} {:>5} {:>8} {:>8}",
+                program.name, program.ops, program.arena_len, program.arena_lower_bound
+            )?;
         }
-        write!(f, "weights {} bytes, KV cache {} elements", self.weight_bytes, self.cache_len)
+        write!(
+            f,
+            "weights {} bytes, KV cache {} elements",
+            self.weight_bytes, self.cache_len
+        )
     }
 }

@@ -28,7 +28,9 @@ pub(crate) struct Tensor {
 
 /// The number of elements of a shape, if it is not beyond [`MAX_ELEMENTS`].
 pub(crate) fn elements(shape: &[usize]) -> Option<usize> {
-    let product = shape.iter().try_fold(1usize, |product, &dim| product.checked_mul(dim))?;
+    let product = shape
+        .iter()
+        .try_fold(1usize, |product, &dim| product.checked_mul(dim))?;
     (product <= MAX_ELEMENTS).then_some(product)
 }
 
@@ -44,12 +46,18 @@ pub(crate) fn strides(shape: &[usize]) -> Vec<usize> {
 impl Tensor {
     pub fn f32(shape: &[usize], data: Vec<f32>) -> Self {
         debug_assert_eq!(shape.iter().product::<usize>(), data.len());
-        Self { shape: shape.to_vec(), data: Data::F32(data) }
+        Self {
+            shape: shape.to_vec(),
+            data: Data::F32(data),
+        }
     }
 
     pub fn i64(shape: &[usize], data: Vec<i64>) -> Self {
         debug_assert_eq!(shape.iter().product::<usize>(), data.len());
-        Self { shape: shape.to_vec(), data: Data::I64(data) }
+        Self {
+            shape: shape.to_vec(),
+            data: Data::I64(data),
+        }
     }
 
     pub fn scalar(value: f32) -> Self {
@@ -74,18 +82,26 @@ impl Tensor {
     pub fn uniform(&self) -> Option<f32> {
         let data = self.as_f32()?;
         let &first = data.first()?;
-        data.iter().all(|x| x.to_bits() == first.to_bits()).then_some(first)
+        data.iter()
+            .all(|x| x.to_bits() == first.to_bits())
+            .then_some(first)
     }
 
     /// Reads a tensor of a model file. The error says what is wrong with it.
     pub fn from_proto(proto: &TensorProto) -> Result<Arc<Self>, String> {
         if proto.data_location != 0 || !proto.external_data.is_empty() {
-            return Err("its elements are in another file; export one file with the weights inside".into());
+            return Err(
+                "its elements are in another file; export one file with the weights inside".into(),
+            );
         }
         if proto.segment.is_some() {
             return Err("it is split into segments".into());
         }
-        let shape: Option<Vec<usize>> = proto.dims.iter().map(|&dim| usize::try_from(dim).ok()).collect();
+        let shape: Option<Vec<usize>> = proto
+            .dims
+            .iter()
+            .map(|&dim| usize::try_from(dim).ok())
+            .collect();
         let (shape, len) = shape
             .filter(|shape| shape.len() <= MAX_RANK)
             .and_then(|shape| elements(&shape).map(|len| (shape, len)))
@@ -96,16 +112,25 @@ impl Tensor {
             data_type::FLOAT => Data::F32(proto.float_data.clone()),
             data_type::INT64 if !raw.is_empty() => Data::I64(words(raw, i64::from_le_bytes)?),
             data_type::INT64 => Data::I64(proto.int64_data.clone()),
-            data_type::INT32 if !raw.is_empty() => Data::I64(words(raw, |word| i64::from(i32::from_le_bytes(word)))?),
+            data_type::INT32 if !raw.is_empty() => {
+                Data::I64(words(raw, |word| i64::from(i32::from_le_bytes(word)))?)
+            }
             data_type::INT32 => Data::I64(proto.int32_data.iter().map(|&x| i64::from(x)).collect()),
-            other => return Err(format!("its elements are {}; supported are float32, int64 and int32", data_type::name(other))),
+            other => {
+                return Err(format!(
+                    "its elements are {}; supported are float32, int64 and int32",
+                    data_type::name(other)
+                ));
+            }
         };
         let got = match &data {
             Data::F32(data) => data.len(),
             Data::I64(data) => data.len(),
         };
         if got != len {
-            return Err(format!("its shape {shape:?} needs {len} elements, it has {got}"));
+            return Err(format!(
+                "its shape {shape:?} needs {len} elements, it has {got}"
+            ));
         }
         Ok(Arc::new(Self { shape, data }))
     }
@@ -115,7 +140,10 @@ impl Tensor {
 fn words<T, const N: usize>(raw: &[u8], read: impl Fn([u8; N]) -> T) -> Result<Vec<T>, String> {
     let (words, rest) = raw.as_chunks::<N>();
     if !rest.is_empty() {
-        return Err(format!("it has {} bytes, which is no whole number of elements", raw.len()));
+        return Err(format!(
+            "it has {} bytes, which is no whole number of elements",
+            raw.len()
+        ));
     }
     Ok(words.iter().copied().map(read).collect())
 }

@@ -1,6 +1,7 @@
 //! Tests of the stages against oracles: tract for what a graph means, a plain interpreter for what ops do.
 
 mod attention;
+mod layers;
 mod machine;
 mod models;
 mod operators;
@@ -43,5 +44,9 @@ fn compiled(
     let lowered = lower(signature.entry, &fused, ports, cache, &mut weights)?;
     let placed = plan(&lowered);
     verify(&lowered, &placed).expect("the memory plan is proven");
-    Ok(Compiled { lowered, placed, weights: weights.data })
+    Ok(Compiled {
+        lowered,
+        placed,
+        weights: weights.data,
+    })
 }

@@ -64,34 +64,55 @@ struct State {
 
 /// Proves that the placed program computes what the program over the virtual arena does.
 pub(crate) fn verify(planned: &Lowered, placed: &Placed) -> Result<(), PlanFault> {
-    let end = planned.buffers.iter().map(|buffer| buffer.offset as usize + buffer.len as usize).max().unwrap_or(0);
-    let mut state = State { generations: vec![0; end], arena: vec![(0, 0); placed.arena_len as usize], ints: [false; INT_SLOTS] };
+    let end = planned
+        .buffers
+        .iter()
+        .map(|buffer| buffer.offset as usize + buffer.len as usize)
+        .max()
+        .unwrap_or(0);
+    let mut state = State {
+        generations: vec![0; end],
+        arena: vec![(0, 0); placed.arena_len as usize],
+        ints: [false; INT_SLOTS],
+    };
     let last = planned.ops.len();
     if placed.ops.len() != last {
         return Err(PlanFault::Changed { op: last });
     }
     for (from, to) in ports(&planned.inputs, &placed.inputs, last)? {
-        state.port(from, to, last, State::write, &mut |ints, slot| {
-            ints[slot] = true;
-            Ok(())
-        })?;
+        state.port(from, to, last, State::write)?;
+        if let Place::Int(slot) = to {
+            state.ints[usize::from(slot.0)] = true;
+        }
     }
     for (i, (from, to)) in planned.ops.iter().zip(&placed.ops).enumerate() {
         state.op(i, from, to)?;
     }
     for (from, to) in ports(&planned.outputs, &placed.outputs, last)? {
-        state.port(from, to, last, State::read, &mut |ints, slot| if ints[slot] { Ok(()) } else { Err(PlanFault::Unset { op: last }) })?;
+        state.port(from, to, last, State::read)?;
+        if matches!(to, Place::Int(slot) if !state.ints[usize::from(slot.0)]) {
+            return Err(PlanFault::Unset { op: last });
+        }
     }
     Ok(())
 }
 
 /// The places of the same ports.
-fn ports(planned: &[(Port, Place)], placed: &[(Port, Place)], op: usize) -> Result<Vec<(Place, Place)>, PlanFault> {
-    let same = planned.len() == placed.len() && planned.iter().zip(placed).all(|(from, to)| from.0 == to.0);
+fn ports(
+    planned: &[(Port, Place)],
+    placed: &[(Port, Place)],
+    op: usize,
+) -> Result<Vec<(Place, Place)>, PlanFault> {
+    let same = planned.len() == placed.len()
+        && planned.iter().zip(placed).all(|(from, to)| from.0 == to.0);
     if !same {
         return Err(PlanFault::Changed { op });
     }
-    Ok(planned.iter().zip(placed).map(|(from, to)| (from.1, to.1)).collect())
+    Ok(planned
+        .iter()
+        .zip(placed)
+        .map(|(from, to)| (from.1, to.1))
+        .collect())
 }
 
 /// An op with all its offsets zero.
@@ -106,7 +127,10 @@ type Touch = fn(&mut State, usize, usize, usize) -> Result<(), PlanFault>;
 impl State {
     fn read(&mut self, op: usize, planned: usize, element: usize) -> Result<(), PlanFault> {
         let generation = self.generations.get(planned).copied().unwrap_or(0);
-        let content = *self.arena.get(element).ok_or(PlanFault::Bounds { op, element })?;
+        let content = *self
+            .arena
+            .get(element)
+            .ok_or(PlanFault::Bounds { op, element })?;
         match generation {
             0 => Err(PlanFault::Unwritten { op, element }),
             _ if content == (planned, generation) => Ok(()),
@@ -115,14 +139,28 @@ impl State {
     }
 
     fn write(&mut self, op: usize, planned: usize, element: usize) -> Result<(), PlanFault> {
-        let generation = self.generations.get_mut(planned).ok_or(PlanFault::Changed { op })?;
+        let generation = self
+            .generations
+            .get_mut(planned)
+            .ok_or(PlanFault::Changed { op })?;
         *generation += 1;
-        *self.arena.get_mut(element).ok_or(PlanFault::Bounds { op, element })? = (planned, *generation);
+        *self
+            .arena
+            .get_mut(element)
+            .ok_or(PlanFault::Bounds { op, element })? = (planned, *generation);
         Ok(())
     }
 
-    fn pairs(&mut self, op: usize, from: Access, to: Access, touch: Touch) -> Result<(), PlanFault> {
-        from.elements().zip(to.elements()).try_for_each(|(planned, element)| touch(self, op, planned, element))
+    fn pairs(
+        &mut self,
+        op: usize,
+        from: Access,
+        to: Access,
+        touch: Touch,
+    ) -> Result<(), PlanFault> {
+        from.elements()
+            .zip(to.elements())
+            .try_for_each(|(planned, element)| touch(self, op, planned, element))
     }
 
     fn op(&mut self, i: usize, from: &Op, to: &Op) -> Result<(), PlanFault> {
@@ -136,7 +174,10 @@ impl State {
         for (from, to) in access::reads(from).into_iter().zip(access::reads(to)) {
             self.pairs(i, from, to, Self::read)?;
         }
-        let written: Vec<(Access, Access)> = access::writes(from).into_iter().zip(access::writes(to)).collect();
+        let written: Vec<(Access, Access)> = access::writes(from)
+            .into_iter()
+            .zip(access::writes(to))
+            .collect();
         for &(from, to) in &written {
             self.pairs(i, from, to, Self::write)?;
         }
@@ -150,20 +191,17 @@ impl State {
         Ok(())
     }
 
-    fn port(
-        &mut self,
-        from: Place,
-        to: Place,
-        last: usize,
-        touch: Touch,
-        int: &mut dyn FnMut(&mut [bool; INT_SLOTS], usize) -> Result<(), PlanFault>,
-    ) -> Result<(), PlanFault> {
+    /// Touches the elements of a port that is no integer.
+    fn port(&mut self, from: Place, to: Place, last: usize, touch: Touch) -> Result<(), PlanFault> {
         match (from, to) {
             (Place::Span(from), Place::Span(to)) if from.len == to.len => {
-                let elements = |span: Span| span.offset as usize..span.offset as usize + span.len as usize;
-                elements(from).zip(elements(to)).try_for_each(|(planned, element)| touch(self, last, planned, element))
+                let elements =
+                    |span: Span| span.offset as usize..span.offset as usize + span.len as usize;
+                elements(from)
+                    .zip(elements(to))
+                    .try_for_each(|(planned, element)| touch(self, last, planned, element))
             }
-            (Place::Int(from), Place::Int(to)) if from == to => int(&mut self.ints, usize::from(to.0)),
+            (Place::Int(from), Place::Int(to)) if from == to => Ok(()),
             _ => Err(PlanFault::Changed { op: last }),
         }
     }

@@ -52,7 +52,12 @@ pub(super) struct Fault {
 
 impl Fault {
     pub fn named(self, entry: &str) -> CompileError {
-        CompileError::Operator { entry: entry.into(), operator: self.operator, node: self.node, problem: self.problem }
+        CompileError::Operator {
+            entry: entry.into(),
+            operator: self.operator.into(),
+            node: self.node.into(),
+            problem: self.problem.into(),
+        }
     }
 }
 
@@ -80,23 +85,42 @@ struct Scores {
     mask: Option<(Id, f32)>,
 }
 
-pub(super) fn fuse(mut graph: Graph, inputs: &[(String, Id)], outputs: &[(String, Id)]) -> Result<Cached, Fault> {
-    let find = |values: &[(String, Id)], name: String| values.iter().find(|(other, _)| *other == name).map(|&(_, id)| id);
+pub(super) fn fuse(
+    mut graph: Graph,
+    inputs: &[(String, Id)],
+    outputs: &[(String, Id)],
+) -> Result<Cached, Fault> {
+    let find = |values: &[(String, Id)], name: String| {
+        values
+            .iter()
+            .find(|(other, _)| *other == name)
+            .map(|&(_, id)| id)
+    };
     let mut found = vec![];
     for layer in 0.. {
         let present = ["key", "value"].map(|part| find(outputs, format!("present.{layer}.{part}")));
-        let [Some(key), Some(value)] = present else { break };
-        let past = ["key", "value"].map(|part| find(inputs, format!("past_key_values.{layer}.{part}")));
-        let one = locate(&mut graph, past, key, value).map_err(|problem| fault(&graph, value, layer, problem))?;
+        let [Some(key), Some(value)] = present else {
+            break;
+        };
+        let past =
+            ["key", "value"].map(|part| find(inputs, format!("past_key_values.{layer}.{part}")));
+        let one = locate(&mut graph, past, key, value)
+            .map_err(|problem| fault(&graph, value, layer, &problem))?;
         found.push(one);
     }
     rebuild(graph, &found, inputs, outputs)
 }
 
-fn fault(graph: &Graph, at: Id, layer: usize, problem: String) -> Fault {
+fn fault(graph: &Graph, at: Id, layer: usize, problem: &str) -> Fault {
     let (operator, node) = graph.origin(at);
-    let problem = format!("ends an attention over the cache (layer {layer}) that is not understood: {problem}");
-    Fault { operator: operator.into(), node: node.into(), problem }
+    let problem = format!(
+        "ends an attention over the cache (layer {layer}) that is not understood: {problem}"
+    );
+    Fault {
+        operator: operator.into(),
+        node: node.into(),
+        problem,
+    }
 }
 
 /// Finds one layer's parts.
@@ -104,23 +128,41 @@ fn locate(g: &mut Graph, past: [Option<Id>; 2], key: Id, value: Id) -> Result<Fo
     let [past_key, past_value] = past;
     let new = |g: &Graph, past: Option<Id>, present: Id| match (past, g.op(present)) {
         (None, _) => Ok(present),
-        (Some(past), Op::Concat { axis: 2 }) if g.node(present).inputs.len() == 2 && g.node(present).inputs[0] == past => {
+        (Some(past), Op::Concat { axis: 2 })
+            if g.node(present).inputs.len() == 2 && g.node(present).inputs[0] == past =>
+        {
             Ok(g.node(present).inputs[1])
         }
-        _ => Err("a present value is not its past and the new rows, concatenated along axis 2".to_string()),
+        _ => Err(
+            "a present value is not its past and the new rows, concatenated along axis 2"
+                .to_string(),
+        ),
     };
     let (k, v) = (new(g, past_key, key)?, new(g, past_value, value)?);
     let heads = match g.known_shape(k).as_deref() {
         Some(&[1, heads, _, _]) if g.shape(k) == g.shape(v) => heads,
-        _ => return Err(format!("new keys {} and values {} are not [1, heads, N, head_dim]", show(g.shape(k)), show(g.shape(v)))),
+        _ => {
+            return Err(format!(
+                "new keys {} and values {} are not [1, heads, N, head_dim]",
+                show(g.shape(k)),
+                show(g.shape(v))
+            ));
+        }
     };
-    let products: Vec<Id> = g.ids().filter(|&id| *g.op(id) == Op::MatMul && g.node(id).inputs[1] == value).collect();
+    let products: Vec<Id> = g
+        .ids()
+        .filter(|&id| *g.op(id) == Op::MatMul && g.node(id).inputs[1] == value)
+        .collect();
     let out = match products[..] {
         [] => None,
         [node] => {
             let (q, scale) = attends(g, node, past_key, k, key)?;
             if g.shape(q) != g.shape(k) {
-                return Err(format!("queries {} and new keys {} differ in shape", show(g.shape(q)), show(g.shape(k))));
+                return Err(format!(
+                    "queries {} and new keys {} differ in shape",
+                    show(g.shape(q)),
+                    show(g.shape(k))
+                ));
             }
             Some(Match { node, q, scale })
         }
@@ -130,7 +172,13 @@ fn locate(g: &mut Graph, past: [Option<Id>; 2], key: Id, value: Id) -> Result<Fo
 }
 
 /// Checks the scores of an attention and returns its queries and scale.
-fn attends(g: &mut Graph, out: Id, past: Option<Id>, k: Id, present: Id) -> Result<(Id, f32), String> {
+fn attends(
+    g: &mut Graph,
+    out: Id,
+    past: Option<Id>,
+    k: Id,
+    present: Id,
+) -> Result<(Id, f32), String> {
     let weights = g.node(out).inputs[0];
     if *g.op(weights) != Op::Softmax {
         return Err("the values are not weighted by a softmax".into());
@@ -146,26 +194,53 @@ fn attends(g: &mut Graph, out: Id, past: Option<Id>, k: Id, present: Id) -> Resu
     if *g.op(all) != (Op::Concat { axis: last }) {
         // One token sees the whole past and itself, so one product over all keys is as good.
         let whole = scores(g, all)?;
-        expect(whole.k == present, "the scores read neither past and new keys apart nor all of them at once")?;
-        expect(g.shape(k)[2].is_one(), "one product over all keys hides no later token")?;
-        expect(whole.mask.is_none(), "a mask over past tokens is not supported")?;
+        expect(
+            whole.k == present,
+            "the scores read neither past and new keys apart nor all of them at once",
+        )?;
+        expect(
+            g.shape(k)[2].is_one(),
+            "one product over all keys hides no later token",
+        )?;
+        expect(
+            whole.mask.is_none(),
+            "a mask over past tokens is not supported",
+        )?;
         return Ok((whole.q, whole.scale));
     }
     let &[old, new] = &g.node(all).inputs[..] else {
-        return Err("the scores are not concatenated from those of the past and the new tokens".into());
+        return Err(
+            "the scores are not concatenated from those of the past and the new tokens".into(),
+        );
     };
     let (old, new) = (scores(g, old)?, scores(g, new)?);
-    expect(old.k == past && new.k == k, "the scores do not read the past keys first and the new keys second")?;
-    expect(old.q == new.q, "the scores of past and new tokens read different queries")?;
-    expect(old.mask.is_none(), "a mask over past tokens is not supported")?;
+    expect(
+        old.k == past && new.k == k,
+        "the scores do not read the past keys first and the new keys second",
+    )?;
+    expect(
+        old.q == new.q,
+        "the scores of past and new tokens read different queries",
+    )?;
+    expect(
+        old.mask.is_none(),
+        "a mask over past tokens is not supported",
+    )?;
     let close = (old.scale - new.scale).abs() <= SCALE_TOLERANCE * new.scale.abs();
-    expect(close, "the scores of past and new tokens have different scales")?;
+    expect(
+        close,
+        "the scores of past and new tokens have different scales",
+    )?;
     causal(g, &new, k)?;
     Ok((new.q, new.scale))
 }
 
 fn expect(condition: bool, problem: &str) -> Result<(), String> {
-    if condition { Ok(()) } else { Err(problem.into()) }
+    if condition {
+        Ok(())
+    } else {
+        Err(problem.into())
+    }
 }
 
 /// The mask is exactly triangular; one token alone needs none.
@@ -177,11 +252,25 @@ fn causal(g: &Graph, scores: &Scores, k: Id) -> Result<(), String> {
     let shape = g.known_shape(mask).unwrap_or_default();
     let square = shape.ends_with(&[n, n]) && shape.iter().rev().skip(2).all(|&dim| dim == 1);
     let data = g.constant(mask).and_then(|tensor| tensor.as_f32());
-    let (Some(data), true) = (data, square || (n == 1 && shape.iter().all(|&dim| dim == 1))) else {
+    let (Some(data), true) = (
+        data,
+        square || (n == 1 && shape.iter().all(|&dim| dim == 1)),
+    ) else {
         return Err(format!("the mask {shape:?} is no constant [{n}, {n}]"));
     };
-    let triangular = (0..n).all(|i| (0..n).all(|j| if j <= i { data[i * n + j] == 0.0 } else { data[i * n + j] * scale <= MASKED }));
-    expect(triangular, "the mask is not zero on and below the diagonal and very negative above it")
+    let triangular = (0..n).all(|i| {
+        (0..n).all(|j| {
+            if j <= i {
+                data[i * n + j] == 0.0
+            } else {
+                data[i * n + j] * scale <= MASKED
+            }
+        })
+    });
+    expect(
+        triangular,
+        "the mask is not zero on and below the diagonal and very negative above it",
+    )
 }
 
 /// Takes a product of queries and keys apart.
@@ -194,15 +283,29 @@ fn scores(g: &mut Graph, mut at: Id) -> Result<Scores, String> {
             at = x;
             continue;
         }
-        let Op::Binary(Kind(BinaryKind::Add)) = g.op(at) else { break };
+        let Op::Binary(Kind(BinaryKind::Add)) = g.op(at) else {
+            break;
+        };
         let inputs = &g.node(at).inputs;
-        let (x, added) = if g.constant(inputs[0]).is_some() { (inputs[1], inputs[0]) } else { (inputs[0], inputs[1]) };
-        expect(g.constant(added).is_some() && mask.is_none(), "something other than one constant mask is added to the scores")?;
+        let (x, added) = if g.constant(inputs[0]).is_some() {
+            (inputs[1], inputs[0])
+        } else {
+            (inputs[0], inputs[1])
+        };
+        expect(
+            g.constant(added).is_some() && mask.is_none(),
+            "something other than one constant mask is added to the scores",
+        )?;
         mask = Some((added, scale));
         at = x;
     }
-    expect(*g.op(at) == Op::MatMul, "the scores are no scaled product of queries and keys")?;
-    let &[mut q, keys] = &g.node(at).inputs[..] else { return Err("a product has two operands".into()) };
+    expect(
+        *g.op(at) == Op::MatMul,
+        "the scores are no scaled product of queries and keys",
+    )?;
+    let &[mut q, keys] = &g.node(at).inputs[..] else {
+        return Err("a product has two operands".into());
+    };
     while let Some((x, factor)) = scalar_factor(g, q) {
         scale *= factor;
         q = x;
@@ -227,7 +330,9 @@ fn scalar_factor(g: &Graph, id: Id) -> Option<(Id, f32)> {
     let scalar = |id: Id| {
         let tensor = g.constant(id)?;
         tensor.as_f32()?;
-        (tensor.shape.iter().product::<usize>() == 1).then(|| tensor.uniform()).flatten()
+        (tensor.shape.iter().product::<usize>() == 1)
+            .then(|| tensor.uniform())
+            .flatten()
     };
     match g.op(id) {
         Op::Binary(Kind(BinaryKind::Mul)) => match (scalar(inputs[0]), scalar(inputs[1])) {
@@ -241,12 +346,18 @@ fn scalar_factor(g: &Graph, id: Id) -> Option<(Id, f32)> {
 }
 
 /// Copies everything that does not read the cache into a new graph, the attentions as single nodes.
-fn rebuild(mut old: Graph, found: &[Found], inputs: &[(String, Id)], outputs: &[(String, Id)]) -> Result<Cached, Fault> {
+fn rebuild(
+    mut old: Graph,
+    found: &[Found],
+    inputs: &[(String, Id)],
+    outputs: &[(String, Id)],
+) -> Result<Cached, Fault> {
     let mut replace = HashMap::new();
     let mut records = vec![];
     for (layer, one) in found.iter().enumerate() {
         let at = one.out.as_ref().map_or(one.v, |out| out.node);
-        let replaced = replaced(&mut old, layer, one).map_err(|problem| fault(&old, at, layer, problem))?;
+        let replaced =
+            replaced(&mut old, layer, one).map_err(|problem| fault(&old, at, layer, &problem))?;
         if let (Some(out), Some(new)) = (&one.out, replaced.out) {
             replace.insert(out.node, new);
         }
@@ -256,14 +367,20 @@ fn rebuild(mut old: Graph, found: &[Found], inputs: &[(String, Id)], outputs: &[
     // Present values are gone: they are the cache itself.
     let reads_cache = |id: Id| old.shape(id).iter().any(|dim| dim.past);
     let present = |name: &str| name.starts_with("present.");
-    let mut roots: Vec<Id> = outputs.iter().filter(|(name, id)| !present(name) && !reads_cache(*id)).map(|&(_, id)| id).collect();
+    let mut roots: Vec<Id> = outputs
+        .iter()
+        .filter(|(name, id)| !present(name) && !reads_cache(*id))
+        .map(|&(_, id)| id)
+        .collect();
     roots.extend(&records);
     roots.extend(inputs.iter().map(|&(_, id)| id));
     let mut rewriter = Rewriter::new(&old, replace.clone());
     let mut copies = HashMap::new();
     for id in topological(&old, &roots, &replace) {
         let operands = rewriter.operands(id);
-        let new = rewriter.rebuild(id, &operands).map_err(|problem| fault(&old, id, 0, problem))?;
+        let new = rewriter
+            .rebuild(id, &operands)
+            .map_err(|problem| fault(&old, id, 0, &problem))?;
         rewriter.set(id, new);
         copies.insert(id, new);
     }
@@ -272,9 +389,23 @@ fn rebuild(mut old: Graph, found: &[Found], inputs: &[(String, Id)], outputs: &[
             copies.insert(from, copy);
         }
     }
-    let inputs = inputs.iter().map(|(name, id)| (name.clone(), rewriter.copy_of(*id))).collect();
-    let layers = records.iter().map(|&record| Layer { record: rewriter.copy_of(record) }).collect();
-    Ok(Cached { graph: rewriter.new, inputs, layers, tokens, copies })
+    let inputs = inputs
+        .iter()
+        .map(|(name, id)| (name.clone(), rewriter.copy_of(*id)))
+        .collect();
+    let layers = records
+        .iter()
+        .map(|&record| Layer {
+            record: rewriter.copy_of(record),
+        })
+        .collect();
+    Ok(Cached {
+        graph: rewriter.new,
+        inputs,
+        layers,
+        tokens,
+        copies,
+    })
 }
 
 struct Replaced {
@@ -285,21 +416,38 @@ struct Replaced {
 /// The nodes that stand for a layer: one row per token, the heads side by side.
 fn replaced(g: &mut Graph, layer: usize, one: &Found) -> Result<Replaced, String> {
     let shape = g.known_shape(one.k).unwrap_or_default();
-    let &[_, heads, tokens, head_dim] = &shape[..] else { return Err("keys of four axes".into()) };
+    let &[_, heads, tokens, head_dim] = &shape[..] else {
+        return Err("keys of four axes".into());
+    };
     let rows = [Dim::of(tokens), Dim::of(heads * head_dim)];
     let flat = |g: &mut Graph, id: Id| {
         let turned = g.transpose(id, &[0, 2, 1, 3])?;
         g.reshape(turned, &rows)
     };
     let (k, v) = (flat(g, one.k)?, flat(g, one.v)?);
-    let record = g.cached(Op::Record { layer, heads: one.heads }, vec![k, v])?;
-    let Some(out) = &one.out else { return Ok(Replaced { record, out: None }) };
+    let record = g.cached(
+        Op::Record {
+            layer,
+            heads: one.heads,
+        },
+        vec![k, v],
+    );
+    let Some(out) = &one.out else {
+        return Ok(Replaced { record, out: None });
+    };
     let q = flat(g, out.q)?;
-    let op = Op::Attention { layer, heads: one.heads, scale: out.scale.to_bits() };
-    let y = g.cached(op, vec![q, k, v])?;
+    let op = Op::Attention {
+        layer,
+        heads: one.heads,
+        scale: out.scale.to_bits(),
+    };
+    let y = g.cached(op, vec![q, k, v]);
     let split = g.reshape(y, &[1, tokens, heads, head_dim].map(Dim::of))?;
     let y = g.transpose(split, &[0, 2, 1, 3])?;
-    Ok(Replaced { record, out: Some(y) })
+    Ok(Replaced {
+        record,
+        out: Some(y),
+    })
 }
 
 /// Refuses an entry in which a value still depends on the context length.
@@ -308,8 +456,16 @@ pub(super) fn no_past_left(fused: &Fused, entry: &str) -> Result<(), CompileErro
     for id in topological(g, &fused.roots(), &HashMap::new()) {
         if g.shape(id).iter().any(|dim| dim.past) {
             let (operator, node) = g.origin(id);
-            let problem = format!("reads the cache outside an attention (its value is {})", show(g.shape(id)));
-            return Err(CompileError::Operator { entry: entry.into(), operator: operator.into(), node: node.into(), problem });
+            let problem = format!(
+                "reads the cache outside an attention (its value is {})",
+                show(g.shape(id))
+            );
+            return Err(CompileError::Operator {
+                entry: entry.into(),
+                operator: operator.into(),
+                node: node.into(),
+                problem: problem.into(),
+            });
         }
     }
     Ok(())

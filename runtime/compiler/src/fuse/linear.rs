@@ -17,13 +17,22 @@ pub(super) fn fuse(fused: Fused) -> Result<Fused, String> {
     roots.extend(fused.inputs.iter().map(|&(_, id)| id));
     let order = topological(old, &roots, &HashMap::new());
     let mut uses: HashMap<Id, usize> = HashMap::new();
-    for id in order.iter().flat_map(|&id| old.node(id).inputs.clone()).chain(outputs) {
+    for id in order
+        .iter()
+        .flat_map(|&id| old.node(id).inputs.clone())
+        .chain(outputs)
+    {
         *uses.entry(id).or_default() += 1;
     }
     let mut rewriter = Rewriter::new(old, HashMap::new());
     for &id in &order {
         let operands = rewriter.operands(id);
-        let alone: Vec<bool> = old.node(id).inputs.iter().map(|input| uses[input] == 1).collect();
+        let alone: Vec<bool> = old
+            .node(id)
+            .inputs
+            .iter()
+            .map(|input| uses[input] == 1)
+            .collect();
         rewriter.at(id);
         let taken = match old.op(id) {
             Op::MatMul => product(&mut rewriter.new, &operands)?,
@@ -49,33 +58,67 @@ fn product(g: &mut Graph, x: &[Id]) -> Result<Option<Id>, String> {
     if !(matrix && rows) {
         return Ok(None);
     }
-    g.linear(Op::Linear { bias: false, residual: false, activation: None }, x.to_vec()).map(Some)
+    g.linear(
+        Op::Linear {
+            bias: false,
+            residual: false,
+            activation: None,
+        },
+        x.to_vec(),
+    )
+    .map(Some)
 }
 
 /// The layer that a value is, if it still can take something in.
 fn layer(g: &Graph, id: Id) -> Option<(bool, Option<Unary>)> {
     match *g.op(id) {
-        Op::Linear { bias, residual: false, activation } => Some((bias, activation)),
+        Op::Linear {
+            bias,
+            residual: false,
+            activation,
+        } => Some((bias, activation)),
         _ => None,
     }
 }
 
 /// A linear layer and something: a scale, a bias or a residual.
-fn combined(g: &mut Graph, kind: BinaryKind, x: &[Id], alone: &[bool]) -> Result<Option<Id>, String> {
+fn combined(
+    g: &mut Graph,
+    kind: BinaryKind,
+    x: &[Id],
+    alone: &[bool],
+) -> Result<Option<Id>, String> {
     let commutes = matches!(kind, BinaryKind::Add | BinaryKind::Mul);
     // The later layer is taken first: the other side is then more likely to be the residual that it belongs to.
     let sides = if x[0] > x[1] { [0, 1] } else { [1, 0] };
     for side in sides {
         let (own, other) = (x[side], x[1 - side]);
-        let Some((bias, activation)) = layer(g, own).filter(|_| alone[side] && (commutes || side == 0)) else { continue };
+        let Some((bias, activation)) =
+            layer(g, own).filter(|_| alone[side] && (commutes || side == 0))
+        else {
+            continue;
+        };
         if let Some(column) = per_output(g, own, other)? {
             if activation.is_none() {
                 return folded(g, kind, own, bias, column);
             }
-        } else if kind == BinaryKind::Add && g.shape(other) == g.shape(own) && g.ty(other) == Type::F32 && g.constant(other).is_none() {
+        } else if kind == BinaryKind::Add
+            && g.shape(other) == g.shape(own)
+            && g.ty(other) == Type::F32
+            && g.constant(other).is_none()
+        {
             let mut inputs = g.node(own).inputs.clone();
             inputs.push(other);
-            return g.linear(Op::Linear { bias, residual: true, activation }, inputs).map(Some);
+            return g
+                .linear(
+                    Op::Linear {
+                        bias,
+                        residual: true,
+                        activation,
+                    },
+                    inputs,
+                )
+                .map(Some);
         }
     }
     Ok(None)
@@ -84,7 +127,10 @@ fn combined(g: &mut Graph, kind: BinaryKind, x: &[Id], alone: &[bool]) -> Result
 /// The constant as one value per output of the layer, if that is what it is.
 fn per_output(g: &mut Graph, layer: Id, constant: Id) -> Result<Option<Id>, String> {
     let shape = g.shape(constant).to_vec();
-    if g.constant(constant).is_none() || shape.len() > g.shape(layer).len() || shape.iter().rev().skip(1).any(|dim| !dim.is_one()) {
+    if g.constant(constant).is_none()
+        || shape.len() > g.shape(layer).len()
+        || shape.iter().rev().skip(1).any(|dim| !dim.is_one())
+    {
         return Ok(None);
     }
     let n = *g.shape(layer).last().ok_or("a layer has rows")?;
@@ -93,10 +139,18 @@ fn per_output(g: &mut Graph, layer: Id, constant: Id) -> Result<Option<Id>, Stri
 }
 
 /// Folds `layer + c`, `layer - c`, `layer * c` or `layer / c`.
-fn folded(g: &mut Graph, kind: BinaryKind, layer: Id, bias: bool, column: Id) -> Result<Option<Id>, String> {
+fn folded(
+    g: &mut Graph,
+    kind: BinaryKind,
+    layer: Id,
+    bias: bool,
+    column: Id,
+) -> Result<Option<Id>, String> {
     let mut inputs = g.node(layer).inputs.clone();
     match kind {
-        BinaryKind::Add | BinaryKind::Sub if bias => inputs[2] = g.binary(kind, inputs[2], column)?,
+        BinaryKind::Add | BinaryKind::Sub if bias => {
+            inputs[2] = g.binary(kind, inputs[2], column)?;
+        }
         BinaryKind::Add => inputs.push(column),
         BinaryKind::Sub => {
             let negative = g.unary(Unary::of(UnaryKind::Neg), column)?;
@@ -111,13 +165,34 @@ fn folded(g: &mut Graph, kind: BinaryKind, layer: Id, bias: bool, column: Id) ->
         _ => return Ok(None),
     }
     let bias = inputs.len() == 3;
-    g.linear(Op::Linear { bias, residual: false, activation: None }, inputs).map(Some)
+    g.linear(
+        Op::Linear {
+            bias,
+            residual: false,
+            activation: None,
+        },
+        inputs,
+    )
+    .map(Some)
 }
 
 /// An activation after a layer that has none yet.
 fn activated(g: &mut Graph, unary: Unary, x: Id) -> Result<Option<Id>, String> {
-    let fits = matches!(unary.kind.0, UnaryKind::Relu | UnaryKind::LeakyRelu | UnaryKind::Tanh | UnaryKind::Sigmoid);
-    let Some((bias, None)) = layer(g, x).filter(|_| fits) else { return Ok(None) };
+    let fits = matches!(
+        unary.kind.0,
+        UnaryKind::Relu | UnaryKind::LeakyRelu | UnaryKind::Tanh | UnaryKind::Sigmoid
+    );
+    let Some((bias, None)) = layer(g, x).filter(|_| fits) else {
+        return Ok(None);
+    };
     let inputs = g.node(x).inputs.clone();
-    g.linear(Op::Linear { bias, residual: false, activation: Some(unary) }, inputs).map(Some)
+    g.linear(
+        Op::Linear {
+            bias,
+            residual: false,
+            activation: Some(unary),
+        },
+        inputs,
+    )
+    .map(Some)
 }

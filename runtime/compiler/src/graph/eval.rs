@@ -10,7 +10,10 @@ use crate::tensor::{Data, Tensor, strides};
 /// The value of a node whose operands are constants; `shape` is its shape.
 pub(crate) fn evaluate(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> Option<Tensor> {
     match op {
-        Op::Reshape => Some(Tensor { shape: shape.to_vec(), data: x[0].data.clone() }),
+        Op::Reshape => Some(Tensor {
+            shape: shape.to_vec(),
+            data: x[0].data.clone(),
+        }),
         Op::Transpose(perm) => {
             let from = strides(&x[0].shape);
             let turned: Vec<usize> = perm.iter().map(|&axis| from[axis]).collect();
@@ -20,7 +23,12 @@ pub(crate) fn evaluate(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> Option<Te
             let from = strides(&x[0].shape);
             Some(gathered(&x[0], shape, &from, start * from[*axis]))
         }
-        Op::Expand => Some(gathered(&x[0], shape, &broadcast_strides(&x[0].shape, shape), 0)),
+        Op::Expand => Some(gathered(
+            &x[0],
+            shape,
+            &broadcast_strides(&x[0].shape, shape),
+            0,
+        )),
         Op::Concat { axis } => concat(x, *axis, shape),
         Op::Binary(kind) => binary(kind.0, &x[0], &x[1], shape),
         Op::Unary(unary) => {
@@ -30,10 +38,17 @@ pub(crate) fn evaluate(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> Option<Te
         Op::Reduce(kind, axis) => reduce(kind.0, &x[0], *axis, shape),
         Op::MatMul => matmul(&x[0], &x[1], shape),
         Op::GatherRow => {
-            let &[index] = x[1].as_i64()? else { return None };
+            let &[index] = x[1].as_i64()? else {
+                return None;
+            };
             let rows = *x[0].shape.first()?;
             let index = usize::try_from(index).ok().filter(|&index| index < rows)?;
-            Some(gathered(&x[0], shape, &strides(&x[0].shape)[1..], index * strides(&x[0].shape)[0]))
+            Some(gathered(
+                &x[0],
+                shape,
+                &strides(&x[0].shape)[1..],
+                index * strides(&x[0].shape)[0],
+            ))
         }
         _ => None,
     }
@@ -61,7 +76,10 @@ fn gathered(x: &Tensor, shape: &[usize], strides: &[usize], offset: usize) -> Te
         Data::F32(x) => Data::F32(pick(x, shape, strides, offset)),
         Data::I64(x) => Data::I64(pick(x, shape, strides, offset)),
     };
-    Tensor { shape: shape.to_vec(), data }
+    Tensor {
+        shape: shape.to_vec(),
+        data,
+    }
 }
 
 /// Strides of `from` when read with shape `to`: 0 where it broadcasts.
@@ -69,7 +87,10 @@ fn broadcast_strides(from: &[usize], to: &[usize]) -> Vec<usize> {
     let own = strides(from);
     let missing = to.len() - from.len();
     (0..to.len())
-        .map(|i| i.checked_sub(missing).map_or(0, |i| if from[i] == 1 { 0 } else { own[i] }))
+        .map(|i| {
+            i.checked_sub(missing)
+                .map_or(0, |i| if from[i] == 1 { 0 } else { own[i] })
+        })
         .collect()
 }
 
@@ -93,7 +114,10 @@ fn concat(parts: &[Arc<Tensor>], axis: usize, shape: &[usize]) -> Option<Tensor>
         }
         Data::I64(y)
     };
-    Some(Tensor { shape: shape.to_vec(), data })
+    Some(Tensor {
+        shape: shape.to_vec(),
+        data,
+    })
 }
 
 fn binary(kind: BinaryKind, a: &Tensor, b: &Tensor, shape: &[usize]) -> Option<Tensor> {
@@ -133,7 +157,13 @@ fn binary(kind: BinaryKind, a: &Tensor, b: &Tensor, shape: &[usize]) -> Option<T
 pub(crate) fn apply(unary: Unary, x: f32) -> f32 {
     match unary.kind.0 {
         UnaryKind::Relu => x.max(0.0),
-        UnaryKind::LeakyRelu => if x < 0.0 { f32::from_bits(unary.alpha) * x } else { x },
+        UnaryKind::LeakyRelu => {
+            if x < 0.0 {
+                f32::from_bits(unary.alpha) * x
+            } else {
+                x
+            }
+        }
         UnaryKind::Tanh => x.tanh(),
         UnaryKind::Sigmoid => 1.0 / (1.0 + (-x).exp()),
         UnaryKind::Exp => x.exp(),
@@ -176,7 +206,10 @@ fn matmul(a: &Tensor, b: &Tensor, shape: &[usize]) -> Option<Tensor> {
     let matrices = |x: &Tensor, rows: usize, cols: usize| {
         let mut offsets = vec![];
         let lead = &x.shape[..x.shape.len() - 2];
-        let steps: Vec<usize> = broadcast_strides(lead, batch).iter().map(|stride| stride * rows * cols).collect();
+        let steps: Vec<usize> = broadcast_strides(lead, batch)
+            .iter()
+            .map(|stride| stride * rows * cols)
+            .collect();
         each(batch, &steps, 0, &mut |at| offsets.push(at));
         offsets
     };

@@ -13,14 +13,25 @@ pub(crate) fn topological(graph: &Graph, roots: &[Id], replace: &HashMap<Id, Id>
     let resolve = |id: Id| replace.get(&id).copied().unwrap_or(id);
     let mut order = vec![];
     let mut entered = std::collections::HashSet::new();
-    let mut stack: Vec<Visit> = roots.iter().rev().map(|&id| Visit::Enter(resolve(id))).collect();
+    let mut stack: Vec<Visit> = roots
+        .iter()
+        .rev()
+        .map(|&id| Visit::Enter(resolve(id)))
+        .collect();
     while let Some(visit) = stack.pop() {
         match visit {
             Visit::Leave(id) => order.push(id),
             Visit::Enter(id) => {
                 if entered.insert(id) {
                     stack.push(Visit::Leave(id));
-                    stack.extend(graph.node(id).inputs.iter().rev().map(|&input| Visit::Enter(resolve(input))));
+                    stack.extend(
+                        graph
+                            .node(id)
+                            .inputs
+                            .iter()
+                            .rev()
+                            .map(|&input| Visit::Enter(resolve(input))),
+                    );
                 }
             }
         }
@@ -38,8 +49,16 @@ pub(crate) struct Rewriter<'g> {
 
 impl<'g> Rewriter<'g> {
     pub fn new(old: &'g Graph, replace: HashMap<Id, Id>) -> Self {
-        let new = Graph { origins: old.origins.clone(), ..Graph::default() };
-        Self { old, new, copies: HashMap::new(), replace }
+        let new = Graph {
+            origins: old.origins.clone(),
+            ..Graph::default()
+        };
+        Self {
+            old,
+            new,
+            copies: HashMap::new(),
+            replace,
+        }
     }
 
     /// The copy of an old node.
@@ -49,7 +68,12 @@ impl<'g> Rewriter<'g> {
 
     /// The copies of an old node's operands.
     pub fn operands(&self, old: Id) -> Vec<Id> {
-        self.old.node(old).inputs.iter().map(|&input| self.copy_of(input)).collect()
+        self.old
+            .node(old)
+            .inputs
+            .iter()
+            .map(|&input| self.copy_of(input))
+            .collect()
     }
 
     /// Says what an old node became.
@@ -91,18 +115,7 @@ impl<'g> Rewriter<'g> {
             Op::GatherRow => new.gather_row(x[0], x[1])?,
             Op::ArgMin | Op::ArgMax => new.arg(node.op.clone(), x[0])?,
             Op::Linear { .. } => new.linear(node.op.clone(), x.to_vec())?,
-            Op::Attention { .. } | Op::Record { .. } => new.cached(node.op.clone(), x.to_vec())?,
+            Op::Attention { .. } | Op::Record { .. } => new.cached(node.op.clone(), x.to_vec()),
         })
-    }
-
-    /// Copies everything that the roots need, unchanged but for the replacements, and returns the new roots.
-    pub fn copy_all(mut self, roots: &[Id]) -> Result<(Graph, Vec<Id>), String> {
-        for old in topological(self.old, roots, &self.replace) {
-            let operands = self.operands(old);
-            let new = self.rebuild(old, &operands)?;
-            self.set(old, new);
-        }
-        let roots = roots.iter().map(|&root| self.copy_of(root)).collect();
-        Ok((self.new, roots))
     }
 }

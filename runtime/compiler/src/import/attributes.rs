@@ -32,13 +32,17 @@ impl<'n> Attributes<'n> {
 
     fn take(&self, name: &str, kind: i32) -> Result<Option<&'n AttributeProto>, String> {
         match self.0.borrow_mut().remove(name) {
-            Some(attribute) if attribute.kind != kind || !attribute.ref_attr_name.is_empty() => Err(format!("has attribute {name} of a wrong type")),
+            Some(attribute) if attribute.kind != kind || !attribute.ref_attr_name.is_empty() => {
+                Err(format!("has attribute {name} of a wrong type"))
+            }
             found => Ok(found),
         }
     }
 
     pub fn int(&self, name: &str, default: i64) -> Result<i64, String> {
-        Ok(self.take(name, INT)?.map_or(default, |attribute| attribute.i))
+        Ok(self
+            .take(name, INT)?
+            .map_or(default, |attribute| attribute.i))
     }
 
     pub fn flag(&self, name: &str, default: bool) -> Result<bool, String> {
@@ -50,19 +54,31 @@ impl<'n> Attributes<'n> {
     }
 
     pub fn float(&self, name: &str, default: f32) -> Result<f32, String> {
-        Ok(self.take(name, FLOAT)?.map_or(default, |attribute| attribute.f))
+        Ok(self
+            .take(name, FLOAT)?
+            .map_or(default, |attribute| attribute.f))
     }
 
     pub fn floats(&self, name: &str) -> Result<Option<&'n [f32]>, String> {
-        Ok(self.take(name, FLOATS)?.map(|attribute| &attribute.floats[..]))
+        Ok(self
+            .take(name, FLOATS)?
+            .map(|attribute| &attribute.floats[..]))
     }
 
     pub fn text(&self, name: &str) -> Result<Option<String>, String> {
-        Ok(self.take(name, STRING)?.map(|attribute| String::from_utf8_lossy(&attribute.s).into_owned()))
+        Ok(self
+            .take(name, STRING)?
+            .map(|attribute| String::from_utf8_lossy(&attribute.s).into_owned()))
     }
 
     pub fn texts(&self, name: &str) -> Result<Option<Vec<String>>, String> {
-        let text = |attribute: &AttributeProto| attribute.strings.iter().map(|s| String::from_utf8_lossy(s).into_owned()).collect();
+        let text = |attribute: &AttributeProto| {
+            attribute
+                .strings
+                .iter()
+                .map(|s| String::from_utf8_lossy(s).into_owned())
+                .collect()
+        };
         Ok(self.take(name, STRINGS)?.map(text))
     }
 
@@ -78,7 +94,9 @@ impl<'n> Attributes<'n> {
     pub fn only(&self, name: &str, supported: i64) -> Result<(), String> {
         match self.int(name, supported)? {
             found if found == supported => Ok(()),
-            found => Err(format!("does not support {name} = {found}, only {supported}")),
+            found => Err(format!(
+                "does not support {name} = {found}, only {supported}"
+            )),
         }
     }
 

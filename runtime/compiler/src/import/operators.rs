@@ -37,7 +37,10 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
         "Erf" => unary(g, UnaryKind::Erf),
         "LeakyRelu" => {
             let alpha = a.float("alpha", 0.01)?.to_bits();
-            let unary = Unary { alpha, ..Unary::of(UnaryKind::LeakyRelu) };
+            let unary = Unary {
+                alpha,
+                ..Unary::of(UnaryKind::LeakyRelu)
+            };
             g.unary(unary, x.get(0)?).map(|y| vec![y])
         }
         "Gelu" => gelu(g, x, a),
@@ -86,7 +89,11 @@ fn constant(g: &mut Graph, value: f32) -> Id {
 
 /// A value by itself is a square.
 fn multiply(g: &mut Graph, a: Id, b: Id) -> Result<Id, String> {
-    if a == b && g.ty(a) == Type::F32 { g.unary(Unary::of(UnaryKind::Square), a) } else { g.binary(BinaryKind::Mul, a, b) }
+    if a == b && g.ty(a) == Type::F32 {
+        g.unary(Unary::of(UnaryKind::Square), a)
+    } else {
+        g.binary(BinaryKind::Mul, a, b)
+    }
 }
 
 fn power(g: &mut Graph, x: &Operands) -> Outputs {
@@ -101,7 +108,10 @@ fn power(g: &mut Graph, x: &Operands) -> Outputs {
         None => exponent,
     };
     let plain = g.shape(exponent).iter().all(|dim| dim.is_one());
-    let uniform = g.constant(exponent).and_then(|tensor| tensor.uniform()).filter(|_| plain);
+    let uniform = g
+        .constant(exponent)
+        .and_then(|tensor| tensor.uniform())
+        .filter(|_| plain);
     let unary = |g: &mut Graph, kind| g.unary(Unary::of(kind), base);
     let y = match uniform {
         Some(2.0) => unary(g, UnaryKind::Square)?,
@@ -156,7 +166,13 @@ fn clip(g: &mut Graph, x: &Operands) -> Outputs {
 
 /// `alpha * A·B + beta * C`
 fn gemm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
-    let turn = |g: &mut Graph, id: Id, flag: bool| if flag { g.transpose(id, &[1, 0]) } else { Ok(id) };
+    let turn = |g: &mut Graph, id: Id, flag: bool| {
+        if flag {
+            g.transpose(id, &[1, 0])
+        } else {
+            Ok(id)
+        }
+    };
     let (mut left, mut right) = (x.get(0)?, x.get(1)?);
     if g.shape(left).len() != 2 || g.shape(right).len() != 2 {
         return Err("supports matrices only".into());
@@ -201,7 +217,10 @@ fn log_softmax(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
 
 /// A constant spread over the last axis of `x`, or one value where there is none.
 fn per_column(g: &mut Graph, x: Id, id: Option<Id>, otherwise: f32) -> Result<Id, String> {
-    let cols = *g.shape(x).last().ok_or("a scalar has no axis to normalise")?;
+    let cols = *g
+        .shape(x)
+        .last()
+        .ok_or("a scalar has no axis to normalise")?;
     let id = id.unwrap_or_else(|| constant(g, otherwise));
     if g.shape(id).iter().rev().skip(1).any(|dim| !dim.is_one()) {
         return Err("supports scales and biases over the last axis only".into());
@@ -215,7 +234,11 @@ fn layer_norm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let value = x.get(0)?;
     let eps = a.float("epsilon", 1e-5)?;
     a.only("stash_type", 1)?;
-    let last = g.shape(value).len().checked_sub(1).ok_or("a scalar has no axis to normalise")?;
+    let last = g
+        .shape(value)
+        .len()
+        .checked_sub(1)
+        .ok_or("a scalar has no axis to normalise")?;
     if shapes::axis(g, value, a.int("axis", -1)?)? != last {
         return Err("supports the last axis only".into());
     }
@@ -249,7 +272,13 @@ fn batch_norm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
 }
 
 /// Over the axes of an attribute or an input, or all of them.
-fn reduce(g: &mut Graph, x: &Operands, a: &Attributes, kind: ReduceKind, before: Option<UnaryKind>) -> Outputs {
+fn reduce(
+    g: &mut Graph,
+    x: &Operands,
+    a: &Attributes,
+    kind: ReduceKind,
+    before: Option<UnaryKind>,
+) -> Outputs {
     let mut y = x.get(0)?;
     let keep = a.flag("keepdims", true)?;
     let nothing = a.flag("noop_with_empty_axes", false)?;
@@ -258,7 +287,10 @@ fn reduce(g: &mut Graph, x: &Operands, a: &Attributes, kind: ReduceKind, before:
         None => shapes::integers(g, x.optional(1))?.unwrap_or_default(),
     };
     let rank = g.shape(y).len();
-    let mut axes = named.iter().map(|&axis| shapes::axis(g, y, axis)).collect::<Result<Vec<_>, _>>()?;
+    let mut axes = named
+        .iter()
+        .map(|&axis| shapes::axis(g, y, axis))
+        .collect::<Result<Vec<_>, _>>()?;
     axes.sort_unstable();
     axes.dedup();
     if axes.is_empty() && !nothing {
@@ -285,8 +317,15 @@ fn arg(g: &mut Graph, x: &Operands, a: &Attributes, op: Op) -> Outputs {
     let keep = a.flag("keepdims", true)?;
     let axis = shapes::axis(g, value, a.int("axis", 0)?)?;
     let mut shape = g.shape(value).to_vec();
-    if shape.iter().enumerate().any(|(i, dim)| i != axis && !dim.is_one()) {
-        return Err(format!("supports one row only, not {}", crate::graph::show(&shape)));
+    if shape
+        .iter()
+        .enumerate()
+        .any(|(i, dim)| i != axis && !dim.is_one())
+    {
+        return Err(format!(
+            "supports one row only, not {}",
+            crate::graph::show(&shape)
+        ));
     }
     if keep {
         shape[axis] = Dim::of(1);

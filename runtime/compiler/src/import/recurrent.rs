@@ -56,13 +56,23 @@ pub(super) fn lstm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     for (direction, &reverse) in reverse.iter().enumerate() {
         let cell = cell(g, x, direction)?;
         if hidden >= 0 && cell.hidden as i64 != hidden {
-            return Err(format!("has hidden_size = {hidden}, its weights have {}", cell.hidden));
+            return Err(format!(
+                "has hidden_size = {hidden}, its weights have {}",
+                cell.hidden
+            ));
         }
         let mut start = |i: usize| -> Result<Option<Id>, String> {
-            let Some(id) = x.optional(i) else { return Ok(None) };
-            let id = if batch_first { g.transpose(id, &[1, 0, 2])? } else { id };
+            let Some(id) = x.optional(i) else {
+                return Ok(None);
+            };
+            let id = if batch_first {
+                g.transpose(id, &[1, 0, 2])?
+            } else {
+                id
+            };
             let id = g.slice(id, 0, direction, 1)?;
-            g.reshape(id, &[Dim::of(batch), Dim::of(cell.hidden)]).map(Some)
+            g.reshape(id, &[Dim::of(batch), Dim::of(cell.hidden)])
+                .map(Some)
         };
         let (h, c) = (start(5)?, start(6)?);
         runs.push(run(g, value, &cell, (h, c), reverse)?);
@@ -82,8 +92,15 @@ fn check(x: &Operands, a: &Attributes) -> Result<(), String> {
     }
     if let Some(names) = a.texts("activations")? {
         let standard = ["sigmoid", "tanh", "tanh"];
-        if names.iter().enumerate().any(|(i, name)| name.to_lowercase() != standard[i % 3]) {
-            return Err(format!("supports the activations Sigmoid, Tanh, Tanh only, not {}", names.join(", ")));
+        if names
+            .iter()
+            .enumerate()
+            .any(|(i, name)| name.to_lowercase() != standard[i % 3])
+        {
+            return Err(format!(
+                "supports the activations Sigmoid, Tanh, Tanh only, not {}",
+                names.join(", ")
+            ));
         }
     }
     for name in ["activation_alpha", "activation_beta"] {
@@ -96,7 +113,10 @@ fn check(x: &Operands, a: &Attributes) -> Result<(), String> {
 
 fn cell(g: &mut Graph, x: &Operands, direction: usize) -> Result<Cell, String> {
     let mut matrix = |id: Id| -> Result<Id, String> {
-        let shape = g.known_shape(id).filter(|shape| shape.len() == 3).ok_or("needs weights of three axes")?;
+        let shape = g
+            .known_shape(id)
+            .filter(|shape| shape.len() == 3)
+            .ok_or("needs weights of three axes")?;
         let one = g.slice(id, 0, direction, 1)?;
         let one = g.reshape(one, &[Dim::of(shape[1]), Dim::of(shape[2])])?;
         g.transpose(one, &[1, 0])
@@ -105,21 +125,37 @@ fn cell(g: &mut Graph, x: &Operands, direction: usize) -> Result<Cell, String> {
     let shape = g.known_shape(recurrent).unwrap_or_default();
     let hidden = shape[0];
     if shape[1] != 4 * hidden {
-        return Err(format!("has recurrent weights of shape {shape:?}, not hidden by 4 hidden"));
+        return Err(format!(
+            "has recurrent weights of shape {shape:?}, not hidden by 4 hidden"
+        ));
     }
     let bias = match x.optional(3) {
         None => None,
         Some(id) => {
             let own = g.slice(id, 0, direction, 1)?;
             let flat = g.reshape(own, &[Dim::of(8 * hidden)])?;
-            let (input, recurrent) = (g.slice(flat, 0, 0, 4 * hidden)?, g.slice(flat, 0, 4 * hidden, 4 * hidden)?);
+            let (input, recurrent) = (
+                g.slice(flat, 0, 0, 4 * hidden)?,
+                g.slice(flat, 0, 4 * hidden, 4 * hidden)?,
+            );
             Some(g.binary(BinaryKind::Add, input, recurrent)?)
         }
     };
-    Ok(Cell { input, recurrent, bias, hidden })
+    Ok(Cell {
+        input,
+        recurrent,
+        bias,
+        hidden,
+    })
 }
 
-fn run(g: &mut Graph, x: Id, cell: &Cell, start: (Option<Id>, Option<Id>), reverse: bool) -> Result<Run, String> {
+fn run(
+    g: &mut Graph,
+    x: Id,
+    cell: &Cell,
+    start: (Option<Id>, Option<Id>),
+    reverse: bool,
+) -> Result<Run, String> {
     let shape = g.known_shape(x).unwrap_or_default();
     let (steps, batch, n) = (shape[0], shape[1], cell.hidden);
     let mut shares = g.matmul(x, cell.input)?;
@@ -138,7 +174,11 @@ fn run(g: &mut Graph, x: Id, cell: &Cell, start: (Option<Id>, Option<Id>), rever
         }
         let open = g.slice(gates, 1, 0, 3 * n)?;
         let open = g.unary(Unary::of(UnaryKind::Sigmoid), open)?;
-        let (i, o, f) = (g.slice(open, 1, 0, n)?, g.slice(open, 1, n, n)?, g.slice(open, 1, 2 * n, n)?);
+        let (i, o, f) = (
+            g.slice(open, 1, 0, n)?,
+            g.slice(open, 1, n, n)?,
+            g.slice(open, 1, 2 * n, n)?,
+        );
         let candidate = g.slice(gates, 1, 3 * n, n)?;
         let candidate = g.unary(Unary::of(UnaryKind::Tanh), candidate)?;
         let mut next = g.binary(BinaryKind::Mul, i, candidate)?;
@@ -154,16 +194,25 @@ fn run(g: &mut Graph, x: Id, cell: &Cell, start: (Option<Id>, Option<Id>), rever
     if reverse {
         all.reverse();
     }
-    let (Some(h), Some(c)) = (h, c) else { return Err("has no steps".into()) };
+    let (Some(h), Some(c)) = (h, c) else {
+        return Err("has no steps".into());
+    };
     Ok(Run { all, h, c })
 }
 
 /// `Y [steps, directions, batch, hidden]`, `Y_h` and `Y_c [directions, batch, hidden]`; with `layout` 1 the batch comes first.
 fn outputs(g: &mut Graph, runs: &[Run], steps: usize, batch_first: bool) -> Outputs {
     let last = |g: &mut Graph, pick: fn(&Run) -> Id| -> Result<Id, String> {
-        let parts = runs.iter().map(|run| lead(g, pick(run))).collect::<Result<Vec<_>, _>>()?;
+        let parts = runs
+            .iter()
+            .map(|run| lead(g, pick(run)))
+            .collect::<Result<Vec<_>, _>>()?;
         let y = g.concat(&parts, 0)?;
-        if batch_first { g.transpose(y, &[1, 0, 2]) } else { Ok(y) }
+        if batch_first {
+            g.transpose(y, &[1, 0, 2])
+        } else {
+            Ok(y)
+        }
     };
     let (h, c) = (last(g, |run| run.h)?, last(g, |run| run.c)?);
     let mut rows = vec![];
@@ -176,7 +225,11 @@ fn outputs(g: &mut Graph, runs: &[Run], steps: usize, batch_first: bool) -> Outp
     let mut shape = vec![Dim::of(steps), Dim::of(runs.len())];
     shape.extend_from_slice(&g.shape(y)[1..]);
     let y = g.reshape(y, &shape)?;
-    let y = if batch_first { g.transpose(y, &[2, 0, 1, 3])? } else { y };
+    let y = if batch_first {
+        g.transpose(y, &[2, 0, 1, 3])?
+    } else {
+        y
+    };
     Ok(vec![y, h, c])
 }
 

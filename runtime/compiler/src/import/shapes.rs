@@ -65,11 +65,16 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
 
 /// An axis that may count from the end.
 pub(super) fn axis(g: &Graph, x: Id, axis: i64) -> Result<usize, String> {
-    within(axis, g.shape(x).len()).ok_or_else(|| format!("names axis {axis} of {}", show(g.shape(x))))
+    within(axis, g.shape(x).len())
+        .ok_or_else(|| format!("names axis {axis} of {}", show(g.shape(x))))
 }
 
 fn within(axis: i64, rank: usize) -> Option<usize> {
-    let axis = if axis < 0 { axis.checked_add(rank as i64)? } else { axis };
+    let axis = if axis < 0 {
+        axis.checked_add(rank as i64)?
+    } else {
+        axis
+    };
     usize::try_from(axis).ok().filter(|&axis| axis < rank)
 }
 
@@ -80,7 +85,9 @@ pub(super) fn integers(g: &Graph, id: Option<Id>) -> Result<Option<Vec<i64>>, St
 
 fn wanted(g: &Graph, id: Id) -> Result<Vec<i64>, String> {
     let tensor = g.constant(id).and_then(|tensor| tensor.as_i64());
-    tensor.map(<[i64]>::to_vec).ok_or_else(|| "needs constant shapes, axes and indices".into())
+    tensor
+        .map(<[i64]>::to_vec)
+        .ok_or_else(|| "needs constant shapes, axes and indices".into())
 }
 
 fn cast(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
@@ -99,7 +106,9 @@ fn cast(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     };
     let cast = match (&tensor.data, to) {
         (Data::I64(data), FLOAT) => Tensor::f32(&shape, data.iter().map(|&x| x as f32).collect()),
-        (Data::F32(data), INT64 | INT32) => Tensor::i64(&shape, data.iter().map(|&x| x as i64).collect()),
+        (Data::F32(data), INT64 | INT32) => {
+            Tensor::i64(&shape, data.iter().map(|&x| x as i64).collect())
+        }
         _ => return Err(format!("to {} is not supported", name(to))),
     };
     Ok(vec![g.add_const(Arc::new(cast))])
@@ -113,7 +122,10 @@ fn constant(g: &mut Graph, a: &Attributes) -> Outputs {
     } else if let Some(values) = a.ints("value_ints")? {
         Arc::new(Tensor::i64(&[values.len()], values.to_vec()))
     } else {
-        let (float, int) = (a.float("value_float", f32::NAN)?, a.int("value_int", i64::MIN)?);
+        let (float, int) = (
+            a.float("value_float", f32::NAN)?,
+            a.int("value_int", i64::MIN)?,
+        );
         match (float.is_nan(), int) {
             (false, _) => Arc::new(Tensor::scalar(float)),
             (true, i64::MIN) => return Err("has no value that is supported".into()),
@@ -128,7 +140,9 @@ fn filled(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let shape: Option<Vec<usize>> = shape.iter().map(|&dim| usize::try_from(dim).ok()).collect();
     let shape = shape.filter(|shape| crate::tensor::elements(shape).is_some());
     let shape = shape.ok_or_else(|| format!("needs a shape of at most {MAX_ELEMENTS} elements"))?;
-    let value = a.tensor("value")?.unwrap_or_else(|| Arc::new(Tensor::f32(&[1], vec![0.0])));
+    let value = a
+        .tensor("value")?
+        .unwrap_or_else(|| Arc::new(Tensor::f32(&[1], vec![0.0])));
     let id = g.add_const(value);
     let dims: Vec<Dim> = shape.iter().map(|&dim| Dim::of(dim)).collect();
     let single = g.reshape(id, &[])?;
@@ -143,7 +157,9 @@ fn reshape(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> {
     let mut open = None;
     for (i, dim) in wanted(g, x.get(1)?)?.into_iter().enumerate() {
         shape.push(match dim {
-            0 if !keep_zero => *from.get(i).ok_or_else(|| format!("keeps axis {i} of {}", show(&from)))?,
+            0 if !keep_zero => *from
+                .get(i)
+                .ok_or_else(|| format!("keeps axis {i} of {}", show(&from)))?,
             -1 if open.is_none() => {
                 open = Some(i);
                 Dim::of(1)
@@ -153,13 +169,21 @@ fn reshape(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> {
     }
     if let Some(i) = open {
         // What is left of the elements, the symbolic axes aside.
-        let product = |dims: &[Dim]| dims.iter().filter(|dim| !dim.past).try_fold(1usize, |product, dim| product.checked_mul(dim.fixed));
+        let product = |dims: &[Dim]| {
+            dims.iter()
+                .filter(|dim| !dim.past)
+                .try_fold(1usize, |product, dim| product.checked_mul(dim.fixed))
+        };
         let (whole, rest) = (product(&from), product(&shape));
         let (Some(whole), Some(rest)) = (whole, rest) else {
             return Err("has a shape that is too large".into());
         };
         if rest == 0 || whole % rest != 0 {
-            return Err(format!("does not divide {} by {}", show(&from), show(&shape)));
+            return Err(format!(
+                "does not divide {} by {}",
+                show(&from),
+                show(&shape)
+            ));
         }
         shape[i] = Dim::of(whole / rest);
     }
@@ -170,7 +194,11 @@ fn flatten(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> {
     let value = x.get(0)?;
     let shape = g.known_shape(value).ok_or("supports static shapes only")?;
     let at = a.int("axis", 1)?;
-    let at = if at == shape.len() as i64 { shape.len() } else { axis(g, value, at)? };
+    let at = if at == shape.len() as i64 {
+        shape.len()
+    } else {
+        axis(g, value, at)?
+    };
     let (rows, cols) = shape.split_at(at);
     let shape = [rows, cols].map(|part| Dim::of(part.iter().product()));
     g.reshape(value, &shape)
@@ -188,13 +216,19 @@ fn squeeze(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> {
     let value = x.get(0)?;
     let shape = g.shape(value).to_vec();
     let named = match axes(g, x, a)? {
-        Some(axes) => axes.iter().map(|&i| axis(g, value, i)).collect::<Result<Vec<_>, _>>()?,
+        Some(axes) => axes
+            .iter()
+            .map(|&i| axis(g, value, i))
+            .collect::<Result<Vec<_>, _>>()?,
         None => (0..shape.len()).filter(|&i| shape[i].is_one()).collect(),
     };
     if let Some(&i) = named.iter().find(|&&i| !shape[i].is_one()) {
         return Err(format!("drops axis {i} of {}", show(&shape)));
     }
-    let left: Vec<Dim> = (0..shape.len()).filter(|i| !named.contains(i)).map(|i| shape[i]).collect();
+    let left: Vec<Dim> = (0..shape.len())
+        .filter(|i| !named.contains(i))
+        .map(|i| shape[i])
+        .collect();
     g.reshape(value, &left)
 }
 
@@ -205,22 +239,34 @@ fn unsqueeze(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> 
     let named: Option<Vec<usize>> = named.iter().map(|&i| within(i, rank)).collect();
     let named = named.ok_or("names an axis that does not exist")?;
     let mut rest = g.shape(value).to_vec().into_iter();
-    let shape: Option<Vec<Dim>> = (0..rank).map(|i| if named.contains(&i) { Some(Dim::of(1)) } else { rest.next() }).collect();
+    let shape: Option<Vec<Dim>> = (0..rank)
+        .map(|i| {
+            if named.contains(&i) {
+                Some(Dim::of(1))
+            } else {
+                rest.next()
+            }
+        })
+        .collect();
     g.reshape(value, &shape.ok_or("names an axis twice")?)
 }
 
 fn split(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let value = x.get(0)?;
     let along = axis(g, value, a.int("axis", 0)?)?;
-    let whole = g.shape(value)[along].known().ok_or("supports axes of known length only")?;
-    let outputs = x.given.len();
+    let whole = g.shape(value)[along]
+        .known()
+        .ok_or("supports axes of known length only")?;
+    let outputs = x.outputs;
     a.only("num_outputs", outputs as i64)?;
     let lens = match a.ints("split")? {
         Some(lens) => lens.to_vec(),
         None => integers(g, x.optional(1))?.unwrap_or_else(|| {
             // Equal parts, the last one smaller.
             let part = whole.div_ceil(outputs.max(1));
-            (0..outputs).map(|i| (whole.saturating_sub(i * part)).min(part) as i64).collect()
+            (0..outputs)
+                .map(|i| (whole.saturating_sub(i * part)).min(part) as i64)
+                .collect()
         }),
     };
     let mut start = 0;
@@ -231,7 +277,9 @@ fn split(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
         start += len;
     }
     if start != whole || parts.len() != outputs {
-        return Err(format!("splits {whole} elements into {outputs} parts of {start} in all"));
+        return Err(format!(
+            "splits {whole} elements into {outputs} parts of {start} in all"
+        ));
     }
     Ok(parts)
 }
@@ -246,11 +294,19 @@ fn slice(g: &mut Graph, x: &Operands) -> Result<Id, String> {
     }
     for (((start, end), along), step) in starts.into_iter().zip(ends).zip(axes).zip(steps) {
         let along = axis(g, value, along)?;
-        let len = g.shape(value)[along].known().ok_or("supports axes of known length only")? as i64;
+        let len = g.shape(value)[along]
+            .known()
+            .ok_or("supports axes of known length only")? as i64;
         if step != 1 {
             return Err(format!("supports step 1 only, not {step}"));
         }
-        let clamp = |at: i64| if at < 0 { at.saturating_add(len).max(0) } else { at.min(len) };
+        let clamp = |at: i64| {
+            if at < 0 {
+                at.saturating_add(len).max(0)
+            } else {
+                at.min(len)
+            }
+        };
         let (start, end) = (clamp(start), clamp(end));
         value = g.slice(value, along, start as usize, (end - start).max(0) as usize)?;
     }
@@ -267,21 +323,32 @@ fn gather(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> {
     let before = g.shape(value)[..along].to_vec();
     let after = g.shape(value)[along + 1..].to_vec();
     let shape = [&before[..], &index_shape, &after].concat();
-    let Some(rows) = g.constant(index).and_then(|tensor| tensor.as_i64()).map(<[i64]>::to_vec) else {
+    let Some(rows) = g
+        .constant(index)
+        .and_then(|tensor| tensor.as_i64())
+        .map(<[i64]>::to_vec)
+    else {
         if along != 0 {
             return Err("with an index that is not constant is supported along axis 0 only".into());
         }
         let row = g.gather_row(value, index)?;
         return g.reshape(row, &shape);
     };
-    let len = g.shape(value)[along].known().ok_or("supports axes of known length only")?;
+    let len = g.shape(value)[along]
+        .known()
+        .ok_or("supports axes of known length only")?;
     let rows: Option<Vec<usize>> = rows.iter().map(|&row| within(row, len)).collect();
-    let rows = rows.filter(|rows| !rows.is_empty()).ok_or_else(|| format!("has indices outside 0..{len}"))?;
+    let rows = rows
+        .filter(|rows| !rows.is_empty())
+        .ok_or_else(|| format!("has indices outside 0..{len}"))?;
     let consecutive = rows.windows(2).all(|pair| pair[0] + 1 == pair[1]);
     let picked = if consecutive {
         g.slice(value, along, rows[0], rows.len())?
     } else {
-        let parts = rows.iter().map(|&row| g.slice(value, along, row, 1)).collect::<Result<Vec<_>, _>>()?;
+        let parts = rows
+            .iter()
+            .map(|&row| g.slice(value, along, row, 1))
+            .collect::<Result<Vec<_>, _>>()?;
         g.concat(&parts, along)?
     };
     g.reshape(picked, &shape)

@@ -1,24 +1,17 @@
 //! The op or view of each kind of node.
 
 use lads_core::op::{
-    self, Activation, ArgMax, ArgMin, Attention, Binary, BinaryKind, Copy, GatherRow, LayerNorm, Linear, MatMul, Reduce, ReduceKind,
-    Softmax, Span, UnaryKind, WeightSpan,
+    self, Activation, ArgMax, ArgMin, Binary, BinaryKind, Copy, GatherRow, LayerNorm, Linear,
+    MatMul, Reduce, ReduceKind, Softmax, Span, UnaryKind, WeightSpan,
 };
-use lads_kernels::attention_scratch_len;
 
 use super::Lowering;
 use super::view::{View, four};
 use crate::graph::{Id, Op, Type, Unary};
 
-type Done = Result<(), String>;
+pub(super) type Done = Result<(), String>;
 
-/// A row-wise view: first element, elements from one row to the next, and all it spans.
-struct Rows {
-    span: Span,
-    stride: u32,
-}
-
-fn product(shape: &[usize]) -> usize {
+pub(super) fn product(shape: &[usize]) -> usize {
     shape.iter().product()
 }
 
@@ -40,7 +33,13 @@ impl Lowering<'_> {
             }
             Op::Slice { axis, start } => {
                 let view = self.view(x[0])?;
-                self.set(id, view.with(view.offset + start * view.strides[axis], view.strides.clone()));
+                self.set(
+                    id,
+                    view.with(
+                        view.offset + start * view.strides[axis],
+                        view.strides.clone(),
+                    ),
+                );
                 Ok(())
             }
             Op::Expand => {
@@ -57,8 +56,14 @@ impl Lowering<'_> {
             Op::LayerNorm { eps } => self.layer_norm(id, &x, f32::from_bits(eps)),
             Op::MatMul => self.matmul(id, x[0], x[1]),
             Op::GatherRow => self.gather_row(id, x[0], x[1]),
-            Op::Linear { bias, residual, activation } => self.linear(id, &x, bias, residual, activation),
-            Op::Attention { layer, scale, .. } => self.attention(id, &x, layer, f32::from_bits(scale)),
+            Op::Linear {
+                bias,
+                residual,
+                activation,
+            } => self.linear(id, &x, bias, residual, activation),
+            Op::Attention { layer, scale, .. } => {
+                self.attention(id, &x, layer, f32::from_bits(scale))
+            }
             Op::Record { layer, .. } => self.record(x[0], x[1], layer),
             Op::ArgMin => self.arg(id, x[0], |x, out| ArgMin { x, out }.into()),
             Op::ArgMax => self.arg(id, x[0], |x, out| ArgMax { x, out }.into()),
@@ -74,7 +79,9 @@ impl Lowering<'_> {
             Op::Input => known(id),
             Op::Const(_) => return Ok(()),
             Op::Reshape => known(node.inputs[0]),
-            Op::Shift(by) => known(node.inputs[0]).and_then(|(slot, shift)| Some((slot, shift.checked_add(by)?))),
+            Op::Shift(by) => {
+                known(node.inputs[0]).and_then(|(slot, shift)| Some((slot, shift.checked_add(by)?)))
+            }
             _ => None,
         };
         let int = int.ok_or("computes with integers, which only indices may be")?;
@@ -85,13 +92,12 @@ impl Lowering<'_> {
     fn reshape(&mut self, id: Id, x: Id) -> Done {
         let view = self.view(x)?;
         let (from, to) = (self.shape(x)?, self.shape(id)?);
-        let view = match view.reshaped(&from, &to) {
-            Some(strides) => view.with(view.offset, strides),
-            None => {
-                let buffer = self.buffer(product(&from));
-                self.copy(x, &View::contiguous(buffer, 0, &from), &from)?;
-                View::contiguous(buffer, 0, &to)
-            }
+        let view = if let Some(strides) = view.reshaped(&from, &to) {
+            view.with(view.offset, strides)
+        } else {
+            let buffer = self.buffer(product(&from));
+            self.copy(x, &View::contiguous(buffer, 0, &from), &from)?;
+            View::contiguous(buffer, 0, &to)
         };
         self.set(id, view);
         Ok(())
@@ -104,9 +110,14 @@ impl Lowering<'_> {
         let mut start = 0;
         for &part in parts {
             let part_shape = self.shape(part)?;
-            let place = whole.with(whole.offset + start * whole.strides[axis], whole.strides.clone());
+            let place = whole.with(
+                whole.offset + start * whole.strides[axis],
+                whole.strides.clone(),
+            );
             let there = self.view(part)?;
-            let same = there.buffer() == place.buffer() && there.offset == place.offset && there.is_contiguous(&part_shape);
+            let same = there.buffer() == place.buffer()
+                && there.offset == place.offset
+                && there.is_contiguous(&part_shape);
             if !(same && place.is_contiguous(&part_shape)) {
                 self.copy(part, &place, &part_shape)?;
             }
@@ -119,10 +130,20 @@ impl Lowering<'_> {
     /// Copies a value to a view.
     pub(super) fn copy(&mut self, x: Id, to: &View, shape: &[usize]) -> Done {
         let from = self.view(x)?;
-        let (dims, [x_strides, y_strides]) = four(shape, [&from.strides, &to.strides]).ok_or("moves more than four axes at once")?;
+        let (dims, [x_strides, y_strides]) =
+            four(shape, [&from.strides, &to.strides]).ok_or("moves more than four axes at once")?;
         let x = self.operand(&from, from.reach(shape));
         let y = self.span(to, to.reach(shape));
-        self.ops.push(Copy { x, y, dims, x_strides, y_strides }.into());
+        self.ops.push(
+            Copy {
+                x,
+                y,
+                dims,
+                x_strides,
+                y_strides,
+            }
+            .into(),
+        );
         Ok(())
     }
 
@@ -132,8 +153,12 @@ impl Lowering<'_> {
         if !self.placed.contains_key(&id) {
             for &x in operands {
                 let view = self.view(x)?;
-                let Some(buffer) = view.buffer() else { continue };
-                let fits = self.shape(x)? == shape && view.is_contiguous(&shape) && self.dies_here(buffer, id);
+                let Some(buffer) = view.buffer() else {
+                    continue;
+                };
+                let fits = self.shape(x)? == shape
+                    && view.is_contiguous(&shape)
+                    && self.dies_here(buffer, id);
                 // Another operand in the same buffer would have to be exactly the same elements.
                 let mut apart = true;
                 for &other in operands {
@@ -154,11 +179,21 @@ impl Lowering<'_> {
         let (view_a, view_b) = (self.view(a)?, self.view(b)?);
         let strides_a = view_a.broadcast(&self.shape(a)?, &shape);
         let strides_b = view_b.broadcast(&self.shape(b)?, &shape);
-        let (dims, [a_strides, b_strides, _]) =
-            four(&shape, [&strides_a, &strides_b, &y.strides]).ok_or("broadcasts over more than four axes")?;
-        let operand = |view: &View, strides: &[usize]| self.operand(view, view.with(0, strides.to_vec()).reach(&shape));
+        let (dims, [a_strides, b_strides, _]) = four(&shape, [&strides_a, &strides_b, &y.strides])
+            .ok_or("broadcasts over more than four axes")?;
+        let operand = |view: &View, strides: &[usize]| {
+            self.operand(view, view.with(0, strides.to_vec()).reach(&shape))
+        };
         let (a, b) = (operand(&view_a, &strides_a), operand(&view_b, &strides_b));
-        let op = Binary { kind, a, b, y: self.span(&y, product(&shape)), dims, a_strides, b_strides };
+        let op = Binary {
+            kind,
+            a,
+            b,
+            y: self.span(&y, product(&shape)),
+            dims,
+            a_strides,
+            b_strides,
+        };
         self.ops.push(op.into());
         self.set(id, y);
         Ok(())
@@ -168,12 +203,20 @@ impl Lowering<'_> {
         let shape = self.shape(id)?;
         let view = self.view(x)?;
         let (y, x) = if view.is_contiguous(&shape) {
-            (self.in_place(id, &[x])?, self.operand(&view, product(&shape)))
+            (
+                self.in_place(id, &[x])?,
+                self.operand(&view, product(&shape)),
+            )
         } else {
             let x = self.contiguous(x)?;
             (self.allocate(id, &shape), x.into())
         };
-        let op = op::Unary { kind: unary.kind.0, alpha: f32::from_bits(unary.alpha), x, y: self.span(&y, product(&shape)) };
+        let op = op::Unary {
+            kind: unary.kind.0,
+            alpha: f32::from_bits(unary.alpha),
+            x,
+            y: self.span(&y, product(&shape)),
+        };
         self.ops.push(op.into());
         self.set(id, y);
         Ok(())
@@ -184,7 +227,12 @@ impl Lowering<'_> {
         let x = self.contiguous(x)?;
         let y = self.allocate(id, &shape);
         let cols = shape.last().copied().unwrap_or(1);
-        let op = Softmax { x, y: self.span(&y, product(&shape)), rows: (product(&shape) / cols) as u32, cols: cols as u32 };
+        let op = Softmax {
+            x,
+            y: self.span(&y, product(&shape)),
+            rows: (product(&shape) / cols) as u32,
+            cols: cols as u32,
+        };
         self.ops.push(op.into());
         self.set(id, y);
         Ok(())
@@ -194,8 +242,18 @@ impl Lowering<'_> {
         let (from, shape) = (self.shape(x)?, self.shape(id)?);
         let x = self.contiguous(x)?.into();
         let y = self.allocate(id, &shape);
-        let (outer, inner) = (product(&from[..axis]) as u32, product(&from[axis + 1..]) as u32);
-        let op = Reduce { kind, x, y: self.span(&y, product(&shape)), outer, axis: from[axis] as u32, inner };
+        let (outer, inner) = (
+            product(&from[..axis]) as u32,
+            product(&from[axis + 1..]) as u32,
+        );
+        let op = Reduce {
+            kind,
+            x,
+            y: self.span(&y, product(&shape)),
+            outer,
+            axis: from[axis] as u32,
+            inner,
+        };
         self.ops.push(op.into());
         self.set(id, y);
         Ok(())
@@ -207,7 +265,15 @@ impl Lowering<'_> {
         let x = self.contiguous(x[0])?;
         let y = self.allocate(id, &shape);
         let cols = gamma.len;
-        let op = LayerNorm { x, y: self.span(&y, product(&shape)), gamma, beta, rows: x.len / cols, cols, eps };
+        let op = LayerNorm {
+            x,
+            y: self.span(&y, product(&shape)),
+            gamma,
+            beta,
+            rows: x.len / cols,
+            cols,
+            eps,
+        };
         self.ops.push(op.into());
         self.set(id, y);
         Ok(())
@@ -215,7 +281,11 @@ impl Lowering<'_> {
 
     /// A constant in the weights.
     fn plain(&mut self, id: Id) -> Result<WeightSpan, String> {
-        let tensor = self.g.constant(id).cloned().ok_or("reads weights that are not constant")?;
+        let tensor = self
+            .g
+            .constant(id)
+            .cloned()
+            .ok_or("reads weights that are not constant")?;
         self.weights.plain(&tensor)
     }
 
@@ -229,13 +299,19 @@ impl Lowering<'_> {
             let (lead_strides, matrix_strides) = view.strides.split_at(lead.len());
             let strides = view.with(0, lead_strides.to_vec()).broadcast(lead, batch);
             // The batch axes have to lie at one stride.
-            let (dims, [strides]) = four(batch, [&strides]).ok_or("has more than four batch axes")?;
+            let (dims, [strides]) =
+                four(batch, [&strides]).ok_or("has more than four batch axes")?;
             if dims[..3].iter().any(|&dim| dim != 1) {
                 return Err("broadcasts over several batch axes".into());
             }
             let batch_stride = strides[3];
-            let reach = view.with(0, matrix_strides.to_vec()).reach(matrix) + (product(batch) - 1) * batch_stride as usize;
-            let strides = [batch_stride, matrix_strides[0] as u32, matrix_strides[1] as u32];
+            let reach = view.with(0, matrix_strides.to_vec()).reach(matrix)
+                + (product(batch) - 1) * batch_stride as usize;
+            let strides = [
+                batch_stride,
+                matrix_strides[0] as u32,
+                matrix_strides[1] as u32,
+            ];
             Ok((view, strides, reach))
         };
         let k = self.shape(a)?.last().copied().unwrap_or(1) as u32;
@@ -261,19 +337,40 @@ impl Lowering<'_> {
     fn gather_row(&mut self, id: Id, table: Id, index: Id) -> Done {
         let shape = self.shape(id)?;
         let rows = self.shape(table)?[0] as u32;
-        let &(slot, shift) = self.ints.get(&index).ok_or("looks up with an index that is not computed")?;
+        let &(slot, shift) = self
+            .ints
+            .get(&index)
+            .ok_or("looks up with an index that is not computed")?;
         let shift = i32::try_from(shift).map_err(|_| "adds too much to an index")?;
         let table = self.plain(table)?;
         let y = self.allocate(id, &shape);
-        let op = GatherRow { table, row_len: product(&shape) as u32, rows, index: slot, shift, y: self.span(&y, product(&shape)) };
+        let op = GatherRow {
+            table,
+            row_len: product(&shape) as u32,
+            rows,
+            index: slot,
+            shift,
+            y: self.span(&y, product(&shape)),
+        };
         self.ops.push(op.into());
         self.set(id, y);
         Ok(())
     }
 
-    fn linear(&mut self, id: Id, x: &[Id], bias: bool, residual: bool, activation: Option<Unary>) -> Done {
+    fn linear(
+        &mut self,
+        id: Id,
+        x: &[Id],
+        bias: bool,
+        residual: bool,
+        activation: Option<Unary>,
+    ) -> Done {
         let shape = self.shape(id)?;
-        let matrix = self.g.constant(x[1]).cloned().ok_or("reads weights that are not constant")?;
+        let matrix = self
+            .g
+            .constant(x[1])
+            .cloned()
+            .ok_or("reads weights that are not constant")?;
         let w = self.weights.packed(&matrix)?;
         let bias = if bias { Some(self.plain(x[2])?) } else { None };
         let rows = self.contiguous(x[0])?;
@@ -302,75 +399,22 @@ impl Lowering<'_> {
     fn accumulator(&mut self, id: Id, x: Id, residual: Id) -> Result<View, String> {
         let shape = self.shape(id)?;
         let view = self.view(residual)?;
-        if let Some(buffer) = view.buffer() {
+        if let Some(buffer) = view.buffer()
+            && view.is_contiguous(&shape)
+        {
+            // A residual that was placed where the layer belongs has no other reader.
+            let there = self
+                .placed
+                .get(&id)
+                .map(|&place| place == (buffer, view.offset));
             let apart = self.view(x)?.buffer() != Some(buffer);
-            if apart && view.is_contiguous(&shape) && !self.placed.contains_key(&id) && self.dies_here(buffer, id) {
+            if there.unwrap_or_else(|| apart && self.dies_here(buffer, id)) {
                 return Ok(view);
             }
         }
         let y = self.allocate(id, &shape);
         self.copy(residual, &y, &shape)?;
         Ok(y)
-    }
-
-    /// Rows of a matrix, each contiguous.
-    fn rows(&mut self, id: Id) -> Result<Rows, String> {
-        let shape = self.shape(id)?;
-        let view = self.view(id)?;
-        let strided = view.buffer().is_some() && (shape[1] == 1 || view.strides[1] == 1) && view.strides[0] >= shape[1];
-        if strided {
-            return Ok(Rows { span: self.span(&view, view.reach(&shape)), stride: view.strides[0] as u32 });
-        }
-        Ok(Rows { span: self.contiguous(id)?, stride: shape[1] as u32 })
-    }
-
-    fn attention(&mut self, id: Id, x: &[Id], layer: usize, scale: f32) -> Done {
-        let shape = self.shape(id)?;
-        let (queries, tokens) = (shape[0], self.shape(x[1])?[0]);
-        let [q, k, v] = [self.rows(x[0])?, self.rows(x[1])?, self.rows(x[2])?];
-        let y = self.allocate(id, &shape);
-        let scratch = self.buffer(attention_scratch_len(queries, self.cache.capacity));
-        let op = Attention {
-            y: self.span(&y, product(&shape)),
-            queries: queries as u32,
-            scratch: self.buffers[scratch],
-            scale,
-            ..self.append(&k, &v, tokens, layer)
-        };
-        self.ops.push(Attention { q: q.span, q_stride: q.stride, ..op }.into());
-        self.set(id, y);
-        Ok(())
-    }
-
-    /// Only appends to the cache.
-    fn record(&mut self, k: Id, v: Id, layer: usize) -> Done {
-        let tokens = self.shape(k)?[0];
-        let (k, v) = (self.rows(k)?, self.rows(v)?);
-        let op = self.append(&k, &v, tokens, layer);
-        self.ops.push(op.into());
-        Ok(())
-    }
-
-    fn append(&self, k: &Rows, v: &Rows, tokens: usize, layer: usize) -> Attention {
-        let [cache_k, cache_v] = self.cache.spans(layer);
-        let none = Span::default();
-        Attention {
-            q: none,
-            q_stride: 0,
-            k: k.span,
-            k_stride: k.stride,
-            v: v.span,
-            v_stride: v.stride,
-            y: none,
-            cache_k,
-            cache_v,
-            heads: self.cache.heads as u32,
-            head_dim: self.cache.head_dim as u32,
-            tokens: tokens as u32,
-            queries: 0,
-            scale: 1.0,
-            scratch: none,
-        }
     }
 
     fn arg(&mut self, id: Id, x: Id, op: impl FnOnce(Span, op::IntSlot) -> op::Op) -> Done {

@@ -20,11 +20,19 @@ pub(super) struct View {
 
 impl View {
     pub fn contiguous(buffer: usize, offset: usize, shape: &[usize]) -> Self {
-        Self { base: Base::Buffer(buffer), offset, strides: crate::tensor::strides(shape) }
+        Self {
+            base: Base::Buffer(buffer),
+            offset,
+            strides: crate::tensor::strides(shape),
+        }
     }
 
     pub fn weights(offset: usize, shape: &[usize]) -> Self {
-        Self { base: Base::Weights, offset, strides: crate::tensor::strides(shape) }
+        Self {
+            base: Base::Weights,
+            offset,
+            strides: crate::tensor::strides(shape),
+        }
     }
 
     /// The buffer, if it is not in the weights.
@@ -37,7 +45,11 @@ impl View {
 
     /// The same memory, read otherwise.
     pub fn with(&self, offset: usize, strides: Vec<usize>) -> Self {
-        Self { base: self.base, offset, strides }
+        Self {
+            base: self.base,
+            offset,
+            strides,
+        }
     }
 
     pub fn is_contiguous(&self, shape: &[usize]) -> bool {
@@ -47,20 +59,32 @@ impl View {
 
     /// How many elements the view spans, gaps included.
     pub fn reach(&self, shape: &[usize]) -> usize {
-        1 + shape.iter().zip(&self.strides).map(|(dim, stride)| (dim - 1) * stride).sum::<usize>()
+        1 + shape
+            .iter()
+            .zip(&self.strides)
+            .map(|(dim, stride)| (dim - 1) * stride)
+            .sum::<usize>()
     }
 
     /// The strides with which a value of another shape reads this one: 0 where it broadcasts.
     pub fn broadcast(&self, from: &[usize], to: &[usize]) -> Vec<usize> {
         let missing = to.len() - from.len();
         (0..to.len())
-            .map(|i| i.checked_sub(missing).map_or(0, |i| if from[i] == 1 { 0 } else { self.strides[i] }))
+            .map(|i| {
+                i.checked_sub(missing)
+                    .map_or(0, |i| if from[i] == 1 { 0 } else { self.strides[i] })
+            })
             .collect()
     }
 
     /// The strides after a reshape, if it needs no copy: each group of axes with equal volume must lie at one stride.
     pub fn reshaped(&self, from: &[usize], to: &[usize]) -> Option<Vec<usize>> {
-        let kept: Vec<(usize, usize)> = from.iter().copied().zip(self.strides.iter().copied()).filter(|&(dim, _)| dim != 1).collect();
+        let kept: Vec<(usize, usize)> = from
+            .iter()
+            .copied()
+            .zip(self.strides.iter().copied())
+            .filter(|&(dim, _)| dim != 1)
+            .collect();
         let mut strides = vec![1; to.len()];
         let (mut i, mut j) = (0, 0);
         while i < kept.len() {
@@ -76,7 +100,10 @@ impl View {
                     i_end += 1;
                 }
             }
-            if kept[i..i_end].windows(2).any(|pair| pair[0].1 != pair[1].1 * pair[1].0) {
+            if kept[i..i_end]
+                .windows(2)
+                .any(|pair| pair[0].1 != pair[1].1 * pair[1].0)
+            {
                 return None;
             }
             let mut stride = kept[i_end - 1].1;
@@ -92,7 +119,10 @@ impl View {
 
 /// Several strided operands over one shape, brought to four dimensions: axes of length one go, neighbours that lie at one stride
 /// in every operand become one. `None` when more than four are left.
-pub(super) fn four<const N: usize>(shape: &[usize], strides: [&[usize]; N]) -> Option<([u32; 4], [[u32; 4]; N])> {
+pub(super) fn four<const N: usize>(
+    shape: &[usize],
+    strides: [&[usize]; N],
+) -> Option<([u32; 4], [[u32; 4]; N])> {
     let mut axes: Vec<(usize, [usize; N])> = vec![];
     for (i, &dim) in shape.iter().enumerate() {
         if dim == 1 {
@@ -100,7 +130,12 @@ pub(super) fn four<const N: usize>(shape: &[usize], strides: [&[usize]; N]) -> O
         }
         let own: [usize; N] = strides.map(|strides| strides[i]);
         match axes.last_mut() {
-            Some((len, outer)) if outer.iter().zip(own).all(|(&outer, own)| outer == own * dim) => {
+            Some((len, outer))
+                if outer
+                    .iter()
+                    .zip(own)
+                    .all(|(&outer, own)| outer == own * dim) =>
+            {
                 *len *= dim;
                 *outer = own;
             }

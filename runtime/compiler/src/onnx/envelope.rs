@@ -25,7 +25,11 @@ pub(super) fn check(bytes: &[u8]) -> Result<(), BundleError> {
         };
         // A file that fails in its first field never was a model; later, it was cut off.
         let Some(key) = varint(bytes, &mut at) else {
-            return Err(if fields == 0 { not_onnx("its first bytes are no field") } else { cut(bytes.len() as u64 + 1) });
+            return Err(if fields == 0 {
+                not_onnx("its first bytes are no field")
+            } else {
+                cut(bytes.len() as u64 + 1)
+            });
         };
         let (number, wire) = (key >> 3, key & 7);
         if number == 0 || number > LAST_MODEL_FIELD {
@@ -45,7 +49,11 @@ pub(super) fn check(bytes: &[u8]) -> Result<(), BundleError> {
             _ => return Err(not_onnx("its fields are not a model's")),
         };
         if end > bytes.len() as u64 {
-            return Err(if fields == 0 { not_onnx("its first field is longer than the file") } else { cut(end) });
+            return Err(if fields == 0 {
+                not_onnx("its first field is longer than the file")
+            } else {
+                cut(end)
+            });
         }
         at = end as usize;
         fields += 1;

@@ -20,6 +20,10 @@ const PORTS: [(&str, Port); 2] = [("x", Port::Observation), ("y", Port::Logits)]
 
 /// Where a spelling differs from the exporter's.
 #[derive(Clone)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "each is one deviation, tried on its own"
+)]
 struct Spelling {
     tokens: usize,
     mask: Vec<f32>,
@@ -37,11 +41,22 @@ struct Spelling {
 
 impl Spelling {
     fn new(tokens: usize) -> Self {
-        let mask = (0..tokens * tokens).map(|i| if i % tokens > i / tokens { -1e9 } else { 0.0 }).collect();
-        Self { tokens, mask, scales: [0.5, 0.5], scale_queries: false, swapped: false, past_mask: false, last_only: false }
+        let mask = (0..tokens * tokens)
+            .map(|i| if i % tokens > i / tokens { -1e9 } else { 0.0 })
+            .collect();
+        Self {
+            tokens,
+            mask,
+            scales: [0.5, 0.5],
+            scale_queries: false,
+            swapped: false,
+            past_mask: false,
+            last_only: false,
+        }
     }
 
     /// `y = attention(x·Wq, x·Wk, x·Wv)·Wo` over a cache of one layer.
+    #[expect(clippy::too_many_lines, reason = "one graph, node by node")]
     fn model(&self) -> Small {
         let n = self.tokens;
         let split = [1, n as i64, HEADS as i64, DIM as i64];
@@ -61,16 +76,41 @@ impl Spelling {
             g = g
                 .random(&name("_weight"), &[WIDTH, WIDTH])
                 .node("MatMul", &["x", &name("_weight")], &[&name("_flat")], &[])
-                .node("Reshape", &[&name("_flat"), "split"], &[&name("_split")], &[])
-                .node("Transpose", &[&name("_split")], &[part], &[ints("perm", &[0, 2, 1, 3])]);
+                .node(
+                    "Reshape",
+                    &[&name("_flat"), "split"],
+                    &[&name("_split")],
+                    &[],
+                )
+                .node(
+                    "Transpose",
+                    &[&name("_split")],
+                    &[part],
+                    &[ints("perm", &[0, 2, 1, 3])],
+                );
         }
         let turn = ints("perm", &[0, 1, 3, 2]);
         let q = if self.scale_queries { "q_scaled" } else { "q" };
         g = g
             .node("Mul", &["q", "scale_new"], &["q_scaled"], &[])
-            .node("Concat", &["past_key_values.0.key", "k"], &["present.0.key"], &[int("axis", 2)])
-            .node("Concat", &["past_key_values.0.value", "v"], &["present.0.value"], &[int("axis", 2)])
-            .node("Transpose", &["past_key_values.0.key"], &["past_turned"], std::slice::from_ref(&turn))
+            .node(
+                "Concat",
+                &["past_key_values.0.key", "k"],
+                &["present.0.key"],
+                &[int("axis", 2)],
+            )
+            .node(
+                "Concat",
+                &["past_key_values.0.value", "v"],
+                &["present.0.value"],
+                &[int("axis", 2)],
+            )
+            .node(
+                "Transpose",
+                &["past_key_values.0.key"],
+                &["past_turned"],
+                std::slice::from_ref(&turn),
+            )
             .node("Transpose", &["k"], &["k_turned"], &[turn])
             .node("MatMul", &[q, "past_turned"], &["past_product"], &[])
             .node("MatMul", &[q, "k_turned"], &["new_product"], &[]);
@@ -78,18 +118,37 @@ impl Spelling {
             ("past_product", "new_product")
         } else {
             g = g
-                .node("Mul", &["past_product", "scale_past"], &["past_scaled"], &[])
+                .node(
+                    "Mul",
+                    &["past_product", "scale_past"],
+                    &["past_scaled"],
+                    &[],
+                )
                 .node("Mul", &["new_product", "scale_new"], &["new_scaled"], &[]);
             ("past_scaled", "new_scaled")
         };
-        g = g.node("Add", &[new, "mask"], &["new_masked"], &[]).node("Add", &[past, "past_mask"], &["past_masked"], &[]);
+        g = g.node("Add", &[new, "mask"], &["new_masked"], &[]).node(
+            "Add",
+            &[past, "past_mask"],
+            &["past_masked"],
+            &[],
+        );
         let past = if self.past_mask { "past_masked" } else { past };
-        let both = if self.swapped { ["new_masked", past] } else { [past, "new_masked"] };
+        let both = if self.swapped {
+            ["new_masked", past]
+        } else {
+            [past, "new_masked"]
+        };
         g = g
             .node("Concat", &both, &["scores"], &[int("axis", 3)])
             .node("Softmax", &["scores"], &["weights"], &[int("axis", -1)])
             .node("MatMul", &["weights", "present.0.value"], &["mixed"], &[])
-            .node("Transpose", &["mixed"], &["mixed_turned"], &[ints("perm", &[0, 2, 1, 3])])
+            .node(
+                "Transpose",
+                &["mixed"],
+                &["mixed_turned"],
+                &[ints("perm", &[0, 2, 1, 3])],
+            )
             .node("Reshape", &["mixed_turned", "join"], &["joined"], &[])
             .random("out", &[WIDTH, WIDTH]);
         if self.last_only {
@@ -100,9 +159,12 @@ impl Spelling {
                 .node("Gather", &["all", "last"], &["y"], &[int("axis", 1)])
                 .output("y", &[1, 1, WIDTH]);
         } else {
-            g = g.node("MatMul", &["joined", "out"], &["y"], &[]).output("y", &[1, n, WIDTH]);
+            g = g
+                .node("MatMul", &["joined", "out"], &["y"], &[])
+                .output("y", &[1, n, WIDTH]);
         }
-        g.output_dims("present.0.key", Type::F32, &cache(Dim::past(n))).output_dims("present.0.value", Type::F32, &cache(Dim::past(n)))
+        g.output_dims("present.0.key", Type::F32, &cache(Dim::past(n)))
+            .output_dims("present.0.value", Type::F32, &cache(Dim::past(n)))
     }
 
     fn compile(&self) -> Result<Compiled, CompileError> {
@@ -129,7 +191,11 @@ fn agrees(spelling: &Spelling) -> Compiled {
         let mut random = Small::new();
         let x = random.numbers(spelling.tokens * WIDTH);
         let (keys, values) = (random.numbers(past * WIDTH), random.numbers(past * WIDTH));
-        let mut machine = Machine::new(&program.placed, &program.weights, vec![f32::NAN; cache().len().expect("a size") as usize]);
+        let mut machine = Machine::new(
+            &program.placed,
+            &program.weights,
+            vec![f32::NAN; cache().len().expect("a size") as usize],
+        );
         machine.set(&program.placed, Port::Observation, &x);
         for (span, rows) in cache().spans(0).into_iter().zip([&keys, &values]) {
             for (i, &value) in rows.iter().enumerate() {
@@ -142,9 +208,16 @@ fn agrees(spelling: &Spelling) -> Compiled {
         let inputs = HashMap::from([
             ("x".to_string(), tensor(&[1, spelling.tokens, WIDTH], &x)),
             ("past_key_values.0.key".to_string(), tensor(&shape, &keys)),
-            ("past_key_values.0.value".to_string(), tensor(&shape, &values)),
+            (
+                "past_key_values.0.value".to_string(),
+                tensor(&shape, &values),
+            ),
         ]);
-        close("y", &machine.output(&program.placed, Port::Logits), &oracle.run(&inputs)["y"]);
+        close(
+            "y",
+            &machine.output(&program.placed, Port::Logits),
+            &oracle.run(&inputs)["y"],
+        );
     }
     program
 }
@@ -166,34 +239,85 @@ fn any_number_of_tokens() {
 
 #[test]
 fn the_scale_may_stand_at_the_queries() {
-    agrees(&Spelling { scale_queries: true, ..Spelling::new(2) });
+    agrees(&Spelling {
+        scale_queries: true,
+        ..Spelling::new(2)
+    });
 }
 
 #[test]
 fn only_the_last_query_is_computed_if_no_other_is_read() {
-    assert_eq!(queries(&agrees(&Spelling { last_only: true, ..Spelling::new(3) })), [1]);
+    assert_eq!(
+        queries(&agrees(&Spelling {
+            last_only: true,
+            ..Spelling::new(3)
+        })),
+        [1]
+    );
 }
 
 #[test]
 fn only_recording_computes_no_query() {
     let small = Spelling::new(2).model();
-    let program = compiled(&small.model(18), &small.signature, &[], &PORTS, cache()).unwrap_or_else(|error| panic!("{error}"));
+    let program = compiled(&small.model(18), &small.signature, &[], &PORTS, cache())
+        .unwrap_or_else(|error| panic!("{error}"));
     assert_eq!(queries(&program), [0]);
-    assert_eq!(program.placed.ops.len(), 3, "keys, values, record: {:?}", program.placed.ops);
+    assert_eq!(
+        program.placed.ops.len(),
+        3,
+        "keys, values, record: {:?}",
+        program.placed.ops
+    );
 }
 
 #[test]
 fn other_attentions_are_refused() {
     let base = Spelling::new(2);
     let refused = |spelling: &Spelling, problem: &str| {
-        let Err(error) = spelling.compile() else { panic!("compiled, though {problem}") };
+        let Err(error) = spelling.compile() else {
+            panic!("compiled, though {problem}")
+        };
         let message = error.to_string();
-        assert!(message.contains(problem) && message.contains("layer 0") && message.contains("test/graph"), "{message}");
+        assert!(
+            message.contains(problem)
+                && message.contains("layer 0")
+                && message.contains("test/graph"),
+            "{message}"
+        );
     };
-    for mask in [vec![0.0; 4], vec![0.0, -10.0, 0.0, 0.0], vec![0.0, -1e9, -1e9, 0.0], vec![0.1, -1e9, 0.0, 0.0]] {
-        refused(&Spelling { mask, ..base.clone() }, "mask");
+    for mask in [
+        vec![0.0; 4],
+        vec![0.0, -10.0, 0.0, 0.0],
+        vec![0.0, -1e9, -1e9, 0.0],
+        vec![0.1, -1e9, 0.0, 0.0],
+    ] {
+        refused(
+            &Spelling {
+                mask,
+                ..base.clone()
+            },
+            "mask",
+        );
     }
-    refused(&Spelling { scales: [0.5, 0.4], ..base.clone() }, "different scales");
-    refused(&Spelling { swapped: true, ..base.clone() }, "past keys first");
-    refused(&Spelling { past_mask: true, ..base }, "mask over past tokens");
+    refused(
+        &Spelling {
+            scales: [0.5, 0.4],
+            ..base.clone()
+        },
+        "different scales",
+    );
+    refused(
+        &Spelling {
+            swapped: true,
+            ..base.clone()
+        },
+        "past keys first",
+    );
+    refused(
+        &Spelling {
+            past_mask: true,
+            ..base
+        },
+        "mask over past tokens",
+    );
 }

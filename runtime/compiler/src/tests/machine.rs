@@ -1,9 +1,11 @@
 //! A plain interpreter of ops, independent of the core's executor: loops, sums in `f64`.
 
-use lads_core::op::{Activation, INT_SLOTS, Op, Operand, Place, Port, Space, Span, UnaryKind, WeightSpan};
+use lads_core::op::{
+    Activation, INT_SLOTS, Op, Operand, Place, Port, Space, Span, UnaryKind, WeightSpan,
+};
 use lads_kernels::{PANEL, reference};
 
-use crate::graph::{Unary, Kind};
+use crate::graph::{Kind, Unary};
 use crate::plan::Placed;
 
 pub struct Machine<'w> {
@@ -16,18 +18,28 @@ pub struct Machine<'w> {
 /// Offsets of all elements of a strided layout, in order.
 fn offsets(dims: [u32; 4], strides: [u32; 4]) -> Vec<usize> {
     let (dims, strides) = (dims.map(|x| x as usize), strides.map(|x| x as usize));
-    (0..dims.iter().product()).map(|i| reference::offset(dims, strides, i)).collect()
+    (0..dims.iter().product())
+        .map(|i| reference::offset(dims, strides, i))
+        .collect()
 }
 
 fn element(activation: UnaryKind, alpha: f32, x: f32) -> f32 {
-    let unary = Unary { kind: Kind(activation), alpha: alpha.to_bits() };
+    let unary = Unary {
+        kind: Kind(activation),
+        alpha: alpha.to_bits(),
+    };
     crate::graph::apply(unary, x)
 }
 
 impl<'w> Machine<'w> {
     /// An arena full of NaN, so that nothing passes that was not written.
     pub fn new(program: &Placed, weights: &'w [f32], cache: Vec<f32>) -> Self {
-        Self { weights, arena: vec![f32::NAN; program.arena_len as usize], cache, ints: [-1; INT_SLOTS] }
+        Self {
+            weights,
+            arena: vec![f32::NAN; program.arena_len as usize],
+            cache,
+            ints: [-1; INT_SLOTS],
+        }
     }
 
     pub fn set(&mut self, program: &Placed, port: Port, values: &[f32]) {
@@ -37,14 +49,20 @@ impl<'w> Machine<'w> {
                     assert_eq!(span.len as usize, values.len());
                     self.arena[span.offset as usize..][..values.len()].copy_from_slice(values);
                 }
-                Place::Int(slot) if found == port => self.ints[usize::from(slot.0)] = values[0] as i64,
+                Place::Int(slot) if found == port => {
+                    self.ints[usize::from(slot.0)] = values[0] as i64;
+                }
                 _ => {}
             }
         }
     }
 
     pub fn output(&self, program: &Placed, port: Port) -> Vec<f32> {
-        let &(_, place) = program.outputs.iter().find(|(found, _)| *found == port).expect("an output");
+        let &(_, place) = program
+            .outputs
+            .iter()
+            .find(|(found, _)| *found == port)
+            .expect("an output");
         match place {
             Place::Span(span) => self.get(span).to_vec(),
             Place::Int(slot) => vec![self.ints[usize::from(slot.0)] as f32],
@@ -60,7 +78,11 @@ impl<'w> Machine<'w> {
     }
 
     fn operand(&self, operand: Operand) -> Vec<f32> {
-        let memory = if operand.space == Space::Arena { &self.arena[..] } else { self.weights };
+        let memory = if operand.space == Space::Arena {
+            &self.arena[..]
+        } else {
+            self.weights
+        };
         memory[operand.offset as usize..][..operand.len as usize].to_vec()
     }
 
@@ -75,6 +97,7 @@ impl<'w> Machine<'w> {
         }
     }
 
+    #[expect(clippy::too_many_lines, reason = "one arm per op, nothing shared")]
     fn op(&mut self, op: &Op, past: usize) {
         match op {
             Op::Linear(op) => {
@@ -84,34 +107,58 @@ impl<'w> Machine<'w> {
                 for i in 0..m * n {
                     let (row, col) = (i / n, i % n);
                     let panel = &w[col / PANEL * k * PANEL..];
-                    let products = (0..k).map(|l| f64::from(x[row * k + l]) * f64::from(panel[l * PANEL + col % PANEL]));
-                    let sum = products.sum::<f64>() + op.bias.map_or(0.0, |bias| f64::from(self.weights(bias)[col]));
+                    let products = (0..k).map(|l| {
+                        f64::from(x[row * k + l]) * f64::from(panel[l * PANEL + col % PANEL])
+                    });
+                    let sum = products.sum::<f64>()
+                        + op.bias
+                            .map_or(0.0, |bias| f64::from(self.weights(bias)[col]));
                     let sum = match op.activation {
                         Activation::None => sum as f32,
                         Activation::Relu => element(UnaryKind::Relu, 0.0, sum as f32),
-                        Activation::LeakyRelu(alpha) => element(UnaryKind::LeakyRelu, alpha, sum as f32),
+                        Activation::LeakyRelu(alpha) => {
+                            element(UnaryKind::LeakyRelu, alpha, sum as f32)
+                        }
                         Activation::Tanh => element(UnaryKind::Tanh, 0.0, sum as f32),
                         Activation::Sigmoid => element(UnaryKind::Sigmoid, 0.0, sum as f32),
                     };
-                    y.push(if op.accumulate { self.get(op.y)[i] + sum } else { sum });
+                    y.push(if op.accumulate {
+                        self.get(op.y)[i] + sum
+                    } else {
+                        sum
+                    });
                 }
                 self.put(op.y, &y);
             }
             Op::LayerNorm(op) => {
                 let mut y = vec![0.0; op.y.len as usize];
-                reference::layer_norm(self.get(op.x), self.weights(op.gamma), self.weights(op.beta), op.eps, &mut y);
+                reference::layer_norm(
+                    self.get(op.x),
+                    self.weights(op.gamma),
+                    self.weights(op.beta),
+                    op.eps,
+                    &mut y,
+                );
                 self.put(op.y, &y);
             }
             Op::Attention(op) => self.attention(op, past),
             Op::Binary(op) => {
                 let (a, b) = (self.operand(op.a), self.operand(op.b));
-                let pairs = offsets(op.dims, op.a_strides).into_iter().zip(offsets(op.dims, op.b_strides));
+                let pairs = offsets(op.dims, op.a_strides)
+                    .into_iter()
+                    .zip(offsets(op.dims, op.b_strides));
                 let kind = lads_kernels_kind(op.kind);
-                let y: Vec<f32> = pairs.map(|(i, j)| reference::binary(kind, a[i], b[j])).collect();
+                let y: Vec<f32> = pairs
+                    .map(|(i, j)| reference::binary(kind, a[i], b[j]))
+                    .collect();
                 self.put(op.y, &y);
             }
             Op::Unary(op) => {
-                let y: Vec<f32> = self.operand(op.x).iter().map(|&x| element(op.kind, op.alpha, x)).collect();
+                let y: Vec<f32> = self
+                    .operand(op.x)
+                    .iter()
+                    .map(|&x| element(op.kind, op.alpha, x))
+                    .collect();
                 self.put(op.y, &y);
             }
             Op::Softmax(op) => {
@@ -125,7 +172,8 @@ impl<'w> Machine<'w> {
                 let (len, inner) = (op.axis as usize, op.inner as usize);
                 let mut y = vec![];
                 for i in 0..op.y.len as usize {
-                    let row = (0..len).map(|a| f64::from(x[(i / inner * len + a) * inner + i % inner]));
+                    let row =
+                        (0..len).map(|a| f64::from(x[(i / inner * len + a) * inner + i % inner]));
                     y.push(match op.kind {
                         ReduceKind::Sum => row.sum::<f64>(),
                         ReduceKind::Mean => row.sum::<f64>() / len as f64,
@@ -138,11 +186,16 @@ impl<'w> Machine<'w> {
             }
             Op::MatMul(op) => {
                 let (a, b) = (self.operand(op.a), self.operand(op.b));
-                let at = |strides: [u32; 3], i: [u32; 3]| (0..3).map(|d| (strides[d] * i[d]) as usize).sum::<usize>();
+                let at = |strides: [u32; 3], i: [u32; 3]| {
+                    (0..3).map(|d| (strides[d] * i[d]) as usize).sum::<usize>()
+                };
                 let mut y = vec![];
                 for batch in 0..op.batch {
                     for (i, j) in (0..op.m).flat_map(|i| (0..op.n).map(move |j| (i, j))) {
-                        let product = |l| f64::from(a[at(op.a_strides, [batch, i, l])]) * f64::from(b[at(op.b_strides, [batch, l, j])]);
+                        let product = |l| {
+                            f64::from(a[at(op.a_strides, [batch, i, l])])
+                                * f64::from(b[at(op.b_strides, [batch, l, j])])
+                        };
                         y.push((0..op.k).map(product).sum::<f64>() as f32);
                     }
                 }
@@ -157,21 +210,32 @@ impl<'w> Machine<'w> {
             }
             Op::Copy(op) => {
                 let x = self.operand(op.x);
-                for (from, to) in offsets(op.dims, op.x_strides).into_iter().zip(offsets(op.dims, op.y_strides)) {
+                for (from, to) in offsets(op.dims, op.x_strides)
+                    .into_iter()
+                    .zip(offsets(op.dims, op.y_strides))
+                {
                     self.arena[op.y.offset as usize + to] = x[from];
                 }
             }
-            Op::ArgMin(op) => self.ints[usize::from(op.out.0)] = first_best(self.get(op.x), |a, b| a < b),
-            Op::ArgMax(op) => self.ints[usize::from(op.out.0)] = first_best(self.get(op.x), |a, b| a > b),
+            Op::ArgMin(op) => {
+                self.ints[usize::from(op.out.0)] = first_best(self.get(op.x), |a, b| a < b);
+            }
+            Op::ArgMax(op) => {
+                self.ints[usize::from(op.out.0)] = first_best(self.get(op.x), |a, b| a > b);
+            }
         }
     }
 
     fn attention(&mut self, op: &lads_core::op::Attention, past: usize) {
         let width = (op.heads * op.head_dim) as usize;
-        for (rows, stride, cache) in [(op.k, op.k_stride, op.cache_k), (op.v, op.v_stride, op.cache_v)] {
+        for (rows, stride, cache) in [
+            (op.k, op.k_stride, op.cache_k),
+            (op.v, op.v_stride, op.cache_v),
+        ] {
             for i in 0..op.tokens as usize {
                 let row = self.get(rows)[i * stride as usize..][..width].to_vec();
-                self.cache[cache.offset as usize + (past + i) * width..][..width].copy_from_slice(&row);
+                self.cache[cache.offset as usize + (past + i) * width..][..width]
+                    .copy_from_slice(&row);
             }
         }
         if op.queries == 0 {

@@ -6,8 +6,8 @@ use prost::Message;
 use crate::entries::{Signature, Value};
 use crate::graph::{Dim, Type};
 use crate::onnx::{
-    AttributeProto, DimensionProto, GraphProto, ModelProto, NodeProto, OperatorSetIdProto, TensorProto, TensorShapeProto, TensorTypeProto,
-    TypeProto, ValueInfoProto, data_type,
+    AttributeProto, DimensionProto, GraphProto, ModelProto, NodeProto, OperatorSetIdProto,
+    TensorProto, TensorShapeProto, TensorTypeProto, TypeProto, ValueInfoProto, data_type,
 };
 
 /// The entry that small models are.
@@ -21,19 +21,39 @@ pub struct Small {
 }
 
 pub fn int(name: &str, i: i64) -> AttributeProto {
-    AttributeProto { name: name.into(), kind: 2, i, ..Default::default() }
+    AttributeProto {
+        name: name.into(),
+        kind: 2,
+        i,
+        ..Default::default()
+    }
 }
 
 pub fn ints(name: &str, ints: &[i64]) -> AttributeProto {
-    AttributeProto { name: name.into(), kind: 7, ints: ints.to_vec(), ..Default::default() }
+    AttributeProto {
+        name: name.into(),
+        kind: 7,
+        ints: ints.to_vec(),
+        ..Default::default()
+    }
 }
 
 pub fn float(name: &str, f: f32) -> AttributeProto {
-    AttributeProto { name: name.into(), kind: 1, f, ..Default::default() }
+    AttributeProto {
+        name: name.into(),
+        kind: 1,
+        f,
+        ..Default::default()
+    }
 }
 
 pub fn text(name: &str, s: &str) -> AttributeProto {
-    AttributeProto { name: name.into(), kind: 3, s: Bytes::copy_from_slice(s.as_bytes()), ..Default::default() }
+    AttributeProto {
+        name: name.into(),
+        kind: 3,
+        s: Bytes::copy_from_slice(s.as_bytes()),
+        ..Default::default()
+    }
 }
 
 fn full(name: &str) -> String {
@@ -42,7 +62,15 @@ fn full(name: &str) -> String {
 
 impl Small {
     pub fn new() -> Self {
-        Self { graph: GraphProto::default(), signature: Signature { entry: ENTRY, inputs: vec![], outputs: vec![] }, random: 1 }
+        Self {
+            graph: GraphProto::default(),
+            signature: Signature {
+                entry: ENTRY,
+                inputs: vec![],
+                outputs: vec![],
+            },
+            random: 1,
+        }
     }
 
     /// Numbers between -1 and 1, always the same ones (xorshift, Marsaglia 2003).
@@ -61,17 +89,43 @@ impl Small {
         let dim = shape
             .iter()
             .map(|dim| match dim.known() {
-                Some(len) => DimensionProto { dim_value: Some(len as i64), dim_param: None },
-                None => DimensionProto { dim_value: None, dim_param: Some(dim.to_string()) },
+                Some(len) => DimensionProto {
+                    dim_value: Some(len as i64),
+                    dim_param: None,
+                },
+                None => DimensionProto {
+                    dim_value: None,
+                    dim_param: Some(dim.to_string()),
+                },
             })
             .collect();
-        let tensor = TensorTypeProto { elem_type, shape: Some(TensorShapeProto { dim }) };
-        ValueInfoProto { name: full(name), r#type: Some(TypeProto { tensor_type: Some(tensor) }) }
+        let tensor = TensorTypeProto {
+            elem_type,
+            shape: Some(TensorShapeProto { dim }),
+        };
+        ValueInfoProto {
+            name: full(name),
+            r#type: Some(TypeProto {
+                tensor_type: Some(tensor),
+            }),
+        }
     }
 
     fn edge(name: &str, ty: Type, shape: &[Dim]) -> (ValueInfoProto, Value) {
-        let code = if ty == Type::F32 { data_type::FLOAT } else { data_type::INT64 };
-        (Self::value(name, code, shape), Value { name: name.into(), ty, shape: shape.to_vec(), fields: "test" })
+        let code = if ty == Type::F32 {
+            data_type::FLOAT
+        } else {
+            data_type::INT64
+        };
+        (
+            Self::value(name, code, shape),
+            Value {
+                name: name.into(),
+                ty,
+                shape: shape.to_vec(),
+                fields: "test",
+            },
+        )
     }
 
     pub fn input_dims(mut self, name: &str, ty: Type, shape: &[Dim]) -> Self {
@@ -104,7 +158,11 @@ impl Small {
             name: full(name),
             dims: shape.iter().map(|&dim| dim as i64).collect(),
             data_type: data_type::FLOAT,
-            raw_data: values.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>().into(),
+            raw_data: values
+                .iter()
+                .flat_map(|x| x.to_le_bytes())
+                .collect::<Vec<u8>>()
+                .into(),
             ..Default::default()
         };
         self.graph.initializer.push(tensor);
@@ -131,8 +189,25 @@ impl Small {
     }
 
     /// A node; an empty name leaves an input or output out.
-    pub fn node(mut self, op_type: &str, inputs: &[&str], outputs: &[&str], attribute: &[AttributeProto]) -> Self {
-        let names = |names: &[&str]| names.iter().map(|name| if name.is_empty() { String::new() } else { full(name) }).collect();
+    pub fn node(
+        mut self,
+        op_type: &str,
+        inputs: &[&str],
+        outputs: &[&str],
+        attribute: &[AttributeProto],
+    ) -> Self {
+        let names = |names: &[&str]| {
+            names
+                .iter()
+                .map(|name| {
+                    if name.is_empty() {
+                        String::new()
+                    } else {
+                        full(name)
+                    }
+                })
+                .collect()
+        };
         let node = NodeProto {
             op_type: op_type.into(),
             name: format!("{op_type}_{}", self.graph.node.len()),
@@ -148,8 +223,14 @@ impl Small {
     pub fn model(&self, opset: i64) -> ModelProto {
         ModelProto {
             ir_version: 8,
-            opset_import: vec![OperatorSetIdProto { domain: String::new(), version: opset }],
-            graph: Some(GraphProto { name: "test".into(), ..self.graph.clone() }),
+            opset_import: vec![OperatorSetIdProto {
+                domain: String::new(),
+                version: opset,
+            }],
+            graph: Some(GraphProto {
+                name: "test".into(),
+                ..self.graph.clone()
+            }),
             ..Default::default()
         }
     }

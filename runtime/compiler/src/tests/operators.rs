@@ -14,7 +14,7 @@ use crate::graph::{Dim, Type};
 use crate::lower::Cache;
 
 /// The ports that stand for the inputs and outputs of small models.
-const PORTS: [(&str, Port); 7] = [
+pub(super) const PORTS: [(&str, Port); 7] = [
     ("a", Port::Observation),
     ("b", Port::Action),
     ("c", Port::Plan),
@@ -24,23 +24,40 @@ const PORTS: [(&str, Port); 7] = [
     ("j", Port::PlanIndex),
 ];
 
-fn cache() -> Cache {
+pub(super) fn cache() -> Cache {
     let tiny = Bundle::from_bytes(include_bytes!("../../tests/data/tiny.onnx")).expect("a bundle");
     Cache::new(tiny.contract())
 }
 
-fn compile(small: &Small) -> Result<Compiled, CompileError> {
-    let outputs: Vec<&str> = small.signature.outputs.iter().map(|output| output.name.as_str()).collect();
-    compiled(&small.model(18), &small.signature, &outputs, &PORTS, cache())
+pub(super) fn compile(small: &Small) -> Result<Compiled, CompileError> {
+    let outputs: Vec<&str> = small
+        .signature
+        .outputs
+        .iter()
+        .map(|output| output.name.as_str())
+        .collect();
+    compiled(
+        &small.model(18),
+        &small.signature,
+        &outputs,
+        &PORTS,
+        cache(),
+    )
 }
 
 /// Compiles, runs and compares.
 #[track_caller]
-fn agrees(mut small: Small) -> Compiled {
+pub(super) fn agrees(mut small: Small) -> Compiled {
     let program = compile(&small).unwrap_or_else(|error| panic!("{error}"));
     let oracle = Oracle::new(&small.bytes(18));
     let mut machine = Machine::new(&program.placed, &program.weights, vec![]);
-    let port = |name: &str| PORTS.iter().find(|(known, _)| *known == name).expect("a port").1;
+    let port = |name: &str| {
+        PORTS
+            .iter()
+            .find(|(known, _)| *known == name)
+            .expect("a port")
+            .1
+    };
     let mut inputs = HashMap::new();
     for input in small.signature.inputs.clone() {
         let shape: Vec<usize> = input.shape.iter().map(|dim| dim.fixed).collect();
@@ -55,40 +72,86 @@ fn agrees(mut small: Small) -> Compiled {
     }
     machine.run(&program.placed, 0);
     for (name, wanted) in oracle.run(&inputs) {
-        close(&name, &machine.output(&program.placed, port(&name)), &wanted);
+        close(
+            &name,
+            &machine.output(&program.placed, port(&name)),
+            &wanted,
+        );
     }
     program
 }
 
-fn names(program: &Compiled) -> Vec<&'static str> {
-    program.placed.ops.iter().map(lads_core::op::Op::name).collect()
+pub(super) fn names(program: &Compiled) -> Vec<&'static str> {
+    program
+        .placed
+        .ops
+        .iter()
+        .map(lads_core::op::Op::name)
+        .collect()
 }
 
 #[track_caller]
-fn refused(small: &Small, parts: &[&str]) {
-    let Err(error) = compile(small) else { panic!("compiled") };
+pub(super) fn refused(small: &Small, parts: &[&str]) {
+    let Err(error) = compile(small) else {
+        panic!("compiled")
+    };
     let message = error.to_string();
     for part in parts {
-        assert!(message.contains(part), "\"{message}\" does not say \"{part}\"");
+        assert!(
+            message.contains(part),
+            "\"{message}\" does not say \"{part}\""
+        );
     }
     assert!(!message.contains('\n'), "{message}");
 }
 
 #[test]
 fn unary_operators() {
-    for operator in ["Relu", "Tanh", "Sigmoid", "Exp", "Neg", "Abs", "Erf", "LeakyRelu", "Reciprocal"] {
-        agrees(Small::new().input("a", &[3, 5]).node(operator, &["a"], &["y"], &[]).output("y", &[3, 5]));
+    for operator in [
+        "Relu",
+        "Tanh",
+        "Sigmoid",
+        "Exp",
+        "Neg",
+        "Abs",
+        "Erf",
+        "LeakyRelu",
+        "Reciprocal",
+    ] {
+        agrees(
+            Small::new()
+                .input("a", &[3, 5])
+                .node(operator, &["a"], &["y"], &[])
+                .output("y", &[3, 5]),
+        );
     }
     // Of positive numbers.
     for operator in ["Sqrt", "Log"] {
-        let small = Small::new().input("a", &[3, 5]).node("Exp", &["a"], &["e"], &[]);
-        agrees(small.node(operator, &["e"], &["y"], &[]).output("y", &[3, 5]));
+        let small = Small::new()
+            .input("a", &[3, 5])
+            .node("Exp", &["a"], &["e"], &[]);
+        agrees(
+            small
+                .node(operator, &["e"], &["y"], &[])
+                .output("y", &[3, 5]),
+        );
     }
-    agrees(Small::new().input("a", &[7]).node("LeakyRelu", &["a"], &["y"], &[float("alpha", 0.2)]).output("y", &[7]));
-    let gelu = |kind| Small::new().input("a", &[9]).node("Gelu", &["a"], &["y"], &[text("approximate", kind)]).output("y", &[9]);
+    agrees(
+        Small::new()
+            .input("a", &[7])
+            .node("LeakyRelu", &["a"], &["y"], &[float("alpha", 0.2)])
+            .output("y", &[7]),
+    );
+    let gelu = |kind| {
+        Small::new()
+            .input("a", &[9])
+            .node("Gelu", &["a"], &["y"], &[text("approximate", kind)])
+            .output("y", &[9])
+    };
     for kind in ["none", "tanh"] {
         let small = gelu(kind);
-        let program = compiled(&small.model(20), &small.signature, &["y"], &PORTS, cache()).unwrap_or_else(|error| panic!("{error}"));
+        let program = compiled(&small.model(20), &small.signature, &["y"], &PORTS, cache())
+            .unwrap_or_else(|error| panic!("{error}"));
         let mut machine = Machine::new(&program.placed, &program.weights, vec![]);
         let values = Small::new().numbers(9);
         machine.set(&program.placed, Port::Observation, &values);
@@ -96,7 +159,11 @@ fn unary_operators() {
         let inputs = HashMap::from([("a".to_string(), tensor(&[9], &values))]);
         let wanted = Oracle::new(&small.bytes(20)).run(&inputs);
         // tract's own error function is good to 1e-4 only near zero; the exact one is checked in the kernels.
-        for (got, wanted) in machine.output(&program.placed, Port::Logits).iter().zip(&wanted["y"]) {
+        for (got, wanted) in machine
+            .output(&program.placed, Port::Logits)
+            .iter()
+            .zip(&wanted["y"])
+        {
             assert!((got - wanted).abs() < 1e-4, "{kind}: {got} {wanted}");
         }
     }
@@ -105,26 +172,70 @@ fn unary_operators() {
 #[test]
 fn binary_operators_broadcast() {
     for operator in ["Add", "Sub", "Mul", "Div", "Max", "Min"] {
-        agrees(Small::new().input("a", &[2, 3, 4]).input("b", &[3, 1]).node(operator, &["a", "b"], &["y"], &[]).output("y", &[2, 3, 4]));
-        agrees(Small::new().input("a", &[4]).random("b", &[2, 1, 4]).node(operator, &["a", "b"], &["y"], &[]).output("y", &[2, 1, 4]));
-        agrees(Small::new().input("a", &[5]).node(operator, &["a", "a"], &["y"], &[]).output("y", &[5]));
+        agrees(
+            Small::new()
+                .input("a", &[2, 3, 4])
+                .input("b", &[3, 1])
+                .node(operator, &["a", "b"], &["y"], &[])
+                .output("y", &[2, 3, 4]),
+        );
+        agrees(
+            Small::new()
+                .input("a", &[4])
+                .random("b", &[2, 1, 4])
+                .node(operator, &["a", "b"], &["y"], &[])
+                .output("y", &[2, 1, 4]),
+        );
+        agrees(
+            Small::new()
+                .input("a", &[5])
+                .node(operator, &["a", "a"], &["y"], &[])
+                .output("y", &[5]),
+        );
     }
     let power = |exponent: f32| {
-        let small = Small::new().input("a", &[3, 4]).weights("p", &[], &[exponent]).node("Exp", &["a"], &["e"], &[]);
-        small.node("Pow", &["e", "p"], &["y"], &[]).output("y", &[3, 4])
+        let small = Small::new()
+            .input("a", &[3, 4])
+            .weights("p", &[], &[exponent])
+            .node("Exp", &["a"], &["e"], &[]);
+        small
+            .node("Pow", &["e", "p"], &["y"], &[])
+            .output("y", &[3, 4])
     };
     for exponent in [2.0, 0.5, -0.5, -1.0, 1.7] {
         agrees(power(exponent));
     }
-    let three = Small::new().input("a", &[4]).input("b", &[4]).input("c", &[1]);
-    agrees(three.node("Sum", &["a", "b", "c"], &["y"], &[]).output("y", &[4]));
-    let clip = Small::new().input("a", &[8]).weights("low", &[], &[-0.25]).weights("high", &[], &[0.5]);
-    agrees(clip.node("Clip", &["a", "low", "high"], &["y"], &[]).output("y", &[8]));
+    let three = Small::new()
+        .input("a", &[4])
+        .input("b", &[4])
+        .input("c", &[1]);
+    agrees(
+        three
+            .node("Sum", &["a", "b", "c"], &["y"], &[])
+            .output("y", &[4]),
+    );
+    let clip = Small::new()
+        .input("a", &[8])
+        .weights("low", &[], &[-0.25])
+        .weights("high", &[], &[0.5]);
+    agrees(
+        clip.node("Clip", &["a", "low", "high"], &["y"], &[])
+            .output("y", &[8]),
+    );
 }
 
 #[test]
 fn reductions_and_softmax() {
-    for operator in ["ReduceSum", "ReduceMean", "ReduceMax", "ReduceMin", "ReduceProd", "ReduceSumSquare", "ReduceL1", "ReduceL2"] {
+    for operator in [
+        "ReduceSum",
+        "ReduceMean",
+        "ReduceMax",
+        "ReduceMin",
+        "ReduceProd",
+        "ReduceSumSquare",
+        "ReduceL1",
+        "ReduceL2",
+    ] {
         let with_axes = |axes: &[i64], keep: i64| {
             let small = Small::new().input("a", &[2, 3, 4]).integers("axes", axes);
             small.node(operator, &["a", "axes"], &["y"], &[int("keepdims", keep)])
@@ -135,185 +246,155 @@ fn reductions_and_softmax() {
     }
     for axis in [0, 1, -1] {
         for operator in ["Softmax", "LogSoftmax"] {
-            agrees(Small::new().input("a", &[2, 3, 4]).node(operator, &["a"], &["y"], &[int("axis", axis)]).output("y", &[2, 3, 4]));
+            agrees(
+                Small::new()
+                    .input("a", &[2, 3, 4])
+                    .node(operator, &["a"], &["y"], &[int("axis", axis)])
+                    .output("y", &[2, 3, 4]),
+            );
         }
     }
     for operator in ["ArgMin", "ArgMax"] {
-        let small = Small::new().input("a", &[1, 9]).node(operator, &["a"], &["j"], &[int("axis", 1), int("keepdims", 0)]);
+        let small = Small::new().input("a", &[1, 9]).node(
+            operator,
+            &["a"],
+            &["j"],
+            &[int("axis", 1), int("keepdims", 0)],
+        );
         agrees(small.output_dims("j", Type::I64, &[Dim::of(1)]));
     }
 }
 
 #[test]
 fn products() {
-    agrees(Small::new().input("a", &[2, 3]).input("b", &[3, 4]).node("MatMul", &["a", "b"], &["y"], &[]).output("y", &[2, 4]));
-    agrees(Small::new().input("a", &[5, 2, 3]).input("b", &[3, 4]).node("MatMul", &["a", "b"], &["y"], &[]).output("y", &[5, 2, 4]));
+    agrees(
+        Small::new()
+            .input("a", &[2, 3])
+            .input("b", &[3, 4])
+            .node("MatMul", &["a", "b"], &["y"], &[])
+            .output("y", &[2, 4]),
+    );
+    agrees(
+        Small::new()
+            .input("a", &[5, 2, 3])
+            .input("b", &[3, 4])
+            .node("MatMul", &["a", "b"], &["y"], &[])
+            .output("y", &[5, 2, 4]),
+    );
     let heads = Small::new().input("a", &[2, 5, 3]).input("b", &[4, 5, 3]);
-    let heads = heads.node("Transpose", &["a"], &["q"], &[ints("perm", &[1, 0, 2])]).node("Transpose", &["b"], &["k"], &[ints("perm", &[1, 2, 0])]);
-    agrees(heads.node("MatMul", &["q", "k"], &["y"], &[]).output("y", &[5, 2, 4]));
-    let linear = Small::new().input("a", &[2, 3]).random("w", &[3, 20]).node("MatMul", &["a", "w"], &["y"], &[]).output("y", &[2, 20]);
+    let heads = heads
+        .node("Transpose", &["a"], &["q"], &[ints("perm", &[1, 0, 2])])
+        .node("Transpose", &["b"], &["k"], &[ints("perm", &[1, 2, 0])]);
+    agrees(
+        heads
+            .node("MatMul", &["q", "k"], &["y"], &[])
+            .output("y", &[5, 2, 4]),
+    );
+    let linear = Small::new()
+        .input("a", &[2, 3])
+        .random("w", &[3, 20])
+        .node("MatMul", &["a", "w"], &["y"], &[])
+        .output("y", &[2, 20]);
     assert_eq!(names(&agrees(linear)), ["Linear"]);
-    let left = Small::new().random("w", &[4, 3]).input("a", &[3, 2]).node("MatMul", &["w", "a"], &["y"], &[]).output("y", &[4, 2]);
+    let left = Small::new()
+        .random("w", &[4, 3])
+        .input("a", &[3, 2])
+        .node("MatMul", &["w", "a"], &["y"], &[])
+        .output("y", &[4, 2]);
     assert_eq!(names(&agrees(left)), ["MatMul"]);
     let gemm = |attributes: &[crate::onnx::AttributeProto]| {
-        let small = Small::new().input("a", &[3, 2]).random("w", &[5, 3]).random("bias", &[5]);
-        small.node("Gemm", &["a", "w", "bias"], &["y"], attributes).output("y", &[2, 5])
+        let small = Small::new()
+            .input("a", &[3, 2])
+            .random("w", &[5, 3])
+            .random("bias", &[5]);
+        small
+            .node("Gemm", &["a", "w", "bias"], &["y"], attributes)
+            .output("y", &[2, 5])
     };
-    agrees(gemm(&[int("transA", 1), int("transB", 1), float("alpha", 0.5), float("beta", -2.0)]));
-}
-
-#[test]
-fn layers_take_in_what_follows() {
-    let batch_norm = Small::new()
-        .input("a", &[1, 6])
-        .random("w", &[8, 6])
-        .random("bias", &[8])
-        .random("scale", &[8])
-        .random("shift", &[8])
-        .random("mean", &[8])
-        .weights("var", &[8], &[0.5, 1.0, 1.5, 2.0, 0.25, 3.0, 0.1, 1.0])
-        .node("Gemm", &["a", "w", "bias"], &["p"], &[int("transB", 1)])
-        .node("BatchNormalization", &["p", "scale", "shift", "mean", "var"], &["n"], &[])
-        .node("LeakyRelu", &["n"], &["y"], &[float("alpha", 0.2)])
-        .output("y", &[1, 8]);
-    assert_eq!(names(&agrees(batch_norm)), ["Linear"]);
-
-    let residual = Small::new()
-        .input("a", &[2, 6])
-        .random("w", &[6, 6])
-        .random("v", &[6, 6])
-        .random("bias", &[6])
-        .node("MatMul", &["a", "w"], &["x"], &[])
-        .node("MatMul", &["x", "v"], &["p"], &[])
-        .node("Add", &["bias", "p"], &["q"], &[])
-        .node("Relu", &["q"], &["r"], &[])
-        .node("Add", &["x", "r"], &["y"], &[])
-        .output("y", &[2, 6]);
-    assert_eq!(names(&agrees(residual)), ["Linear", "Copy", "Linear"]);
-
-    // Somebody else reads the product: it stays.
-    let shared = Small::new()
-        .input("a", &[2, 6])
-        .random("w", &[6, 6])
-        .node("MatMul", &["a", "w"], &["z"], &[])
-        .node("Relu", &["z"], &["y"], &[])
-        .output("y", &[2, 6])
-        .output("z", &[2, 6]);
-    assert_eq!(names(&agrees(shared)), ["Linear", "Unary"]);
-}
-
-#[test]
-fn layer_norm() {
-    let small = Small::new().input("a", &[3, 8]).random("g", &[8]).random("b0", &[8]);
-    let small = small.node("LayerNormalization", &["a", "g", "b0"], &["y"], &[int("axis", -1), float("epsilon", 1e-3)]);
-    assert_eq!(names(&agrees(small.output("y", &[3, 8]))), ["LayerNorm"]);
+    agrees(gemm(&[
+        int("transA", 1),
+        int("transB", 1),
+        float("alpha", 0.5),
+        float("beta", -2.0),
+    ]));
 }
 
 #[test]
 fn moving_elements() {
     let small = || Small::new().input("a", &[2, 3, 4]);
-    agrees(small().node("Transpose", &["a"], &["t"], &[ints("perm", &[2, 0, 1])]).node("Neg", &["t"], &["y"], &[]).output("y", &[4, 2, 3]));
-    agrees(small().node("Transpose", &["a"], &["y"], &[]).output("y", &[4, 3, 2]));
-    let reshaped = small().node("Transpose", &["a"], &["t"], &[ints("perm", &[1, 0, 2])]).integers("s", &[-1, 4]);
-    agrees(reshaped.node("Reshape", &["t", "s"], &["y"], &[]).output("y", &[6, 4]));
-    agrees(small().integers("s", &[0, -1]).node("Reshape", &["a", "s"], &["y"], &[]).output("y", &[2, 12]));
-    agrees(small().node("Flatten", &["a"], &["y"], &[int("axis", 2)]).output("y", &[6, 4]));
-    let sliced = small().integers("from", &[1, -3]).integers("to", &[3, 9]).integers("axes", &[1, 2]);
-    agrees(sliced.node("Slice", &["a", "from", "to", "axes"], &["y"], &[]).output("y", &[2, 2, 3]));
-    let split = small().integers("parts", &[1, 3]).node("Split", &["a", "parts"], &["p", "q"], &[int("axis", 2)]);
-    agrees(split.node("Neg", &["p"], &["y"], &[]).node("Exp", &["q"], &["z"], &[]).output("y", &[2, 3, 1]).output("z", &[2, 3, 3]));
-    let gathered = small().integers("rows", &[2, 0]).node("Gather", &["a", "rows"], &["y"], &[int("axis", 1)]);
+    agrees(
+        small()
+            .node("Transpose", &["a"], &["t"], &[ints("perm", &[2, 0, 1])])
+            .node("Neg", &["t"], &["y"], &[])
+            .output("y", &[4, 2, 3]),
+    );
+    agrees(
+        small()
+            .node("Transpose", &["a"], &["y"], &[])
+            .output("y", &[4, 3, 2]),
+    );
+    let reshaped = small()
+        .node("Transpose", &["a"], &["t"], &[ints("perm", &[1, 0, 2])])
+        .integers("s", &[-1, 4]);
+    agrees(
+        reshaped
+            .node("Reshape", &["t", "s"], &["y"], &[])
+            .output("y", &[6, 4]),
+    );
+    agrees(
+        small()
+            .integers("s", &[0, -1])
+            .node("Reshape", &["a", "s"], &["y"], &[])
+            .output("y", &[2, 12]),
+    );
+    agrees(
+        small()
+            .node("Flatten", &["a"], &["y"], &[int("axis", 2)])
+            .output("y", &[6, 4]),
+    );
+    let sliced = small()
+        .integers("from", &[1, -3])
+        .integers("to", &[3, 9])
+        .integers("axes", &[1, 2]);
+    agrees(
+        sliced
+            .node("Slice", &["a", "from", "to", "axes"], &["y"], &[])
+            .output("y", &[2, 2, 3]),
+    );
+    let split = small().integers("parts", &[1, 3]).node(
+        "Split",
+        &["a", "parts"],
+        &["p", "q"],
+        &[int("axis", 2)],
+    );
+    agrees(
+        split
+            .node("Neg", &["p"], &["y"], &[])
+            .node("Exp", &["q"], &["z"], &[])
+            .output("y", &[2, 3, 1])
+            .output("z", &[2, 3, 3]),
+    );
+    let gathered =
+        small()
+            .integers("rows", &[2, 0])
+            .node("Gather", &["a", "rows"], &["y"], &[int("axis", 1)]);
     agrees(gathered.output("y", &[2, 2, 4]));
-    let axes = small().integers("one", &[1]).node("Unsqueeze", &["a", "one"], &["u"], &[]).node("Neg", &["u"], &["n"], &[]);
-    agrees(axes.node("Squeeze", &["n", "one"], &["y"], &[]).output("y", &[2, 3, 4]));
-    let expanded = Small::new().input("a", &[3, 1]).integers("s", &[2, 3, 4]).node("Expand", &["a", "s"], &["y"], &[]);
-    agrees(expanded.output("y", &[2, 3, 4]));
-    agrees(small().node("Identity", &["a"], &["y"], &[]).output("y", &[2, 3, 4]));
-}
-
-#[test]
-fn concatenations_are_computed_in_place() {
-    let rows = Small::new().input("a", &[1, 3]).input("b", &[1, 4]).node("Tanh", &["a"], &["t"], &[]);
-    let rows = rows.node("Concat", &["t", "b"], &["x"], &[int("axis", 1)]).random("w", &[7, 5]);
-    let program = agrees(rows.node("MatMul", &["x", "w"], &["y"], &[]).output("y", &[1, 5]));
-    assert_eq!(names(&program), ["Unary", "Linear"]);
-    let columns = Small::new().input("a", &[2, 3]).input("b", &[2, 4]).node("Concat", &["a", "b", "a"], &["y"], &[int("axis", 1)]);
-    assert_eq!(names(&agrees(columns.output("y", &[2, 10]))), ["Copy", "Copy", "Copy"]);
-    let twice = Small::new().input("a", &[3]).node("Neg", &["a"], &["n"], &[]);
-    let twice = twice.node("Concat", &["n", "n"], &["y"], &[int("axis", 0)]).node("Concat", &["n", "a"], &["z"], &[int("axis", 0)]);
-    agrees(twice.output("y", &[6]).output("z", &[6]));
-}
-
-#[test]
-fn tables_by_index() {
-    let small = Small::new()
-        .input_dims("i", Type::I64, &[Dim::of(1)])
-        .random("table", &[5, 6])
+    let axes = small()
         .integers("one", &[1])
-        .node("Sub", &["i", "one"], &["before"], &[])
-        .node("Gather", &["table", "before"], &["p"], &[])
-        .node("Gather", &["table", "i"], &["q"], &[])
-        .node("Add", &["p", "q"], &["y"], &[])
-        .output("y", &[1, 6]);
-    assert_eq!(names(&agrees(small)), ["GatherRow", "GatherRow", "Binary"]);
-}
-
-#[test]
-fn lstm() {
-    let (steps, batch, n, hidden) = (5, 2, 3, 4);
-    let base = |directions: usize| {
-        Small::new()
-            .input("a", &[steps, batch, n])
-            .random("w", &[directions, 4 * hidden, n])
-            .random("r", &[directions, 4 * hidden, hidden])
-            .random("bias", &[directions, 8 * hidden])
-    };
-    let operands = ["a", "w", "r", "bias"];
-    let size = int("hidden_size", hidden as i64);
-    let forward = base(1).node("LSTM", &operands, &["y", "z"], std::slice::from_ref(&size));
-    agrees(forward.output("y", &[steps, 1, batch, hidden]).output("z", &[1, batch, hidden]));
-    let plain = base(1).node("LSTM", &operands[..3], &["", "z"], std::slice::from_ref(&size));
-    agrees(plain.output("z", &[1, batch, hidden]));
-    // tract reads one direction as forward whatever the attribute says, so the oracle is our own forward run over time reversed.
-    let x = Small::new().numbers(steps * batch * n);
-    let reversed: Vec<f32> = x.chunks(batch * n).rev().flatten().copied().collect();
-    let last = |direction: &str, x: &[f32]| {
-        let small = base(1).node("LSTM", &operands, &["", "z"], &[size.clone(), text("direction", direction)]);
-        let program = compile(&small.output("z", &[1, batch, hidden])).unwrap_or_else(|error| panic!("{error}"));
-        let mut machine = Machine::new(&program.placed, &program.weights, vec![]);
-        machine.set(&program.placed, Port::Observation, x);
-        machine.run(&program.placed, 0);
-        machine.output(&program.placed, Port::Latent)
-    };
-    assert_eq!(last("reverse", &reversed), last("forward", &x));
-    assert_ne!(last("reverse", &x), last("forward", &x));
-    let both = base(2).node("LSTM", &operands, &["y", "z"], &[size.clone(), text("direction", "bidirectional")]);
-    agrees(both.output("y", &[steps, 2, batch, hidden]).output("z", &[2, batch, hidden]));
-    let start = base(1).random("h", &[1, batch, hidden]).random("c0", &[1, batch, hidden]);
-    let start = start.node("LSTM", &["a", "w", "r", "bias", "", "h", "c0"], &["", "y", "z"], &[size.clone()]);
-    agrees(start.output("y", &[1, batch, hidden]).output("z", &[1, batch, hidden]));
-    // Attributes that would change the result.
-    let clipped = base(1).node("LSTM", &operands, &["", "z"], &[size, float("clip", 1.0)]);
-    refused(&clipped.output("z", &[1, batch, hidden]), &["LSTM", "clip"]);
-}
-
-#[test]
-fn what_is_not_supported_is_named() {
-    let unknown = Small::new().input("a", &[3]).node("Softplus", &["a"], &["y"], &[]).output("y", &[3]);
-    refused(&unknown, &["test/graph", "Softplus_0", "Softplus", "not supported"]);
-    let attribute = Small::new().input("a", &[3]).node("Relu", &["a"], &["y"], &[int("clipped", 6)]).output("y", &[3]);
-    refused(&attribute, &["Relu_0", "clipped"]);
-    let last = Small::new().input("a", &[1, 3]).node("ArgMax", &["a"], &["j"], &[int("axis", 1), int("select_last_index", 1)]);
-    refused(&last.output_dims("j", Type::I64, &[Dim::of(1), Dim::of(1)]), &["ArgMax", "select_last_index"]);
-    let shape = Small::new().input("a", &[3]).input("b", &[4]).node("Add", &["a", "b"], &["y"], &[]).output("y", &[4]);
-    refused(&shape, &["Add_0", "[3]", "[4]", "broadcast"]);
-    let output = Small::new().input("a", &[3]).node("Relu", &["a"], &["y"], &[]).output("y", &[4]);
-    refused(&output, &["output test/graph/y", "[3]", "[4]"]);
-    let missing = Small::new().input("a", &[3]).node("Add", &["a", "nowhere"], &["y"], &[]).output("y", &[3]);
-    refused(&missing, &["Add_0", "nowhere"]);
-    let computed = Small::new().input("a", &[3]).node("Shape", &["a"], &["s"], &[]).node("Gather", &["a", "k"], &["y"], &[]);
-    refused(&computed.input_dims("k", Type::I64, &[Dim::of(1)]).output("y", &[1]), &["Gather", "table", "constant"]);
-    let opset = Small::new().input("a", &[3]).node("Relu", &["a"], &["y"], &[]).output("y", &[3]);
-    let Err(error) = compiled(&opset.model(9), &opset.signature, &["y"], &PORTS, cache()) else { panic!("compiled") };
-    assert!(error.to_string().contains("operator set 9"), "{error}");
+        .node("Unsqueeze", &["a", "one"], &["u"], &[])
+        .node("Neg", &["u"], &["n"], &[]);
+    agrees(
+        axes.node("Squeeze", &["n", "one"], &["y"], &[])
+            .output("y", &[2, 3, 4]),
+    );
+    let expanded = Small::new()
+        .input("a", &[3, 1])
+        .integers("s", &[2, 3, 4])
+        .node("Expand", &["a", "s"], &["y"], &[]);
+    agrees(expanded.output("y", &[2, 3, 4]));
+    agrees(
+        small()
+            .node("Identity", &["a"], &["y"], &[])
+            .output("y", &[2, 3, 4]),
+    );
 }

@@ -14,11 +14,21 @@ use crate::verify::{PlanFault, verify};
 
 /// All programs of the tiny bundle.
 fn programs() -> Vec<(Lowered, Placed)> {
-    let bundle = Bundle::from_bytes(include_bytes!("../../tests/data/tiny.onnx")).expect("a bundle");
+    let bundle =
+        Bundle::from_bytes(include_bytes!("../../tests/data/tiny.onnx")).expect("a bundle");
     let signatures = entries::signatures(bundle.contract());
     let compile = |recipe: &crate::compile::Recipe| {
-        let signature = signatures.iter().find(|signature| signature.entry == recipe.entry).expect("an entry");
-        let program = compiled(&bundle.model, signature, recipe.outputs, recipe.ports, Cache::new(bundle.contract()));
+        let signature = signatures
+            .iter()
+            .find(|signature| signature.entry == recipe.entry)
+            .expect("an entry");
+        let program = compiled(
+            &bundle.model,
+            signature,
+            recipe.outputs,
+            recipe.ports,
+            Cache::new(bundle.contract()),
+        );
         let program = program.unwrap_or_else(|error| panic!("{error}"));
         (program.lowered, program.placed)
     };
@@ -50,7 +60,10 @@ fn every_moved_span_is_found() {
                     if offsets(&wrong.ops[i]) == offsets(op) || scratch {
                         continue;
                     }
-                    assert!(verify(&lowered, &wrong).is_err(), "op {i} {op:?}, span {which} to {to}");
+                    assert!(
+                        verify(&lowered, &wrong).is_err(),
+                        "op {i} {op:?}, span {which} to {to}"
+                    );
                 }
             }
         }
@@ -75,7 +88,10 @@ fn two_live_buffers_in_one_place_are_found() {
 fn a_smaller_arena_is_found() {
     for (lowered, mut placed) in programs() {
         placed.arena_len -= 1;
-        assert!(matches!(verify(&lowered, &placed), Err(PlanFault::Bounds { .. })));
+        assert!(matches!(
+            verify(&lowered, &placed),
+            Err(PlanFault::Bounds { .. })
+        ));
     }
 }
 
@@ -85,10 +101,16 @@ fn a_changed_op_is_found() {
         let last = placed.ops.len() - 1;
         placed.ops.swap(0, last);
         if last > 0 {
-            assert!(matches!(verify(&lowered, &placed), Err(PlanFault::Changed { op: 0 })));
+            assert!(matches!(
+                verify(&lowered, &placed),
+                Err(PlanFault::Changed { op: 0 })
+            ));
         }
         placed.ops.pop();
-        assert!(matches!(verify(&lowered, &placed), Err(PlanFault::Changed { .. })));
+        assert!(matches!(
+            verify(&lowered, &placed),
+            Err(PlanFault::Changed { .. })
+        ));
     }
 }
 
@@ -96,12 +118,23 @@ fn a_changed_op_is_found() {
 fn plans_are_near_their_lower_bound() {
     for (recipe, (_, placed)) in RECIPES.iter().zip(programs()) {
         let aligned = placed.lower_bound + 16 * placed.ops.len() as u32;
-        assert!(placed.arena_len >= placed.lower_bound && placed.arena_len <= aligned, "{}: {}", recipe.name, placed.arena_len);
+        assert!(
+            placed.arena_len >= placed.lower_bound && placed.arena_len <= aligned,
+            "{}: {}",
+            recipe.name,
+            placed.arena_len
+        );
     }
 }
 
 fn unary(x: Span, y: Span) -> Op {
-    Unary { kind: UnaryKind::Neg, alpha: 0.0, x: x.into(), y }.into()
+    Unary {
+        kind: UnaryKind::Neg,
+        alpha: 0.0,
+        x: x.into(),
+        y,
+    }
+    .into()
 }
 
 #[test]
@@ -117,14 +150,33 @@ fn reads_of_nothing_are_found() {
     let sound = program(vec![unary(a, b), unary(b, c)]);
     assert_eq!(verify(&sound, &plan(&sound)), Ok(()));
     let unwritten = program(vec![unary(b, c)]);
-    assert!(matches!(verify(&unwritten, &plan(&unwritten)), Err(PlanFault::Unwritten { op: 0, .. })));
+    assert!(matches!(
+        verify(&unwritten, &plan(&unwritten)),
+        Err(PlanFault::Unwritten { op: 0, .. })
+    ));
     let no_output = program(vec![unary(a, b)]);
-    assert!(matches!(verify(&no_output, &plan(&no_output)), Err(PlanFault::Unwritten { op: 1, .. })));
+    assert!(matches!(
+        verify(&no_output, &plan(&no_output)),
+        Err(PlanFault::Unwritten { op: 1, .. })
+    ));
     // Every other element of the output stays unwritten, though its span is named.
-    let x = Operand { space: Space::Arena, offset: 0, len: 2 };
-    let half = Copy { x, y: c, dims: [1, 1, 1, 2], x_strides: [0, 0, 0, 1], y_strides: [0, 0, 0, 2] };
+    let x = Operand {
+        space: Space::Arena,
+        offset: 0,
+        len: 2,
+    };
+    let half = Copy {
+        x,
+        y: c,
+        dims: [1, 1, 1, 2],
+        x_strides: [0, 0, 0, 1],
+        y_strides: [0, 0, 0, 2],
+    };
     let half = program(vec![half.into()]);
-    assert!(matches!(verify(&half, &plan(&half)), Err(PlanFault::Unwritten { op: 1, .. })));
+    assert!(matches!(
+        verify(&half, &plan(&half)),
+        Err(PlanFault::Unwritten { op: 1, .. })
+    ));
 }
 
 proptest! {

@@ -28,14 +28,33 @@ fn check(path: &Path) {
     let cache = Cache::new(&roomy);
     let signatures = entries::signatures(bundle.contract());
     for recipe in &RECIPES {
-        let signature = signatures.iter().find(|signature| signature.entry == recipe.entry).expect("an entry");
-        let program = compiled(&bundle.model, signature, recipe.outputs, recipe.ports, cache).unwrap_or_else(|error| panic!("{error}"));
-        let cached = signature.inputs.iter().any(|input| input.name.starts_with("past_key_values"));
+        let signature = signatures
+            .iter()
+            .find(|signature| signature.entry == recipe.entry)
+            .expect("an entry");
+        let program = compiled(
+            &bundle.model,
+            signature,
+            recipe.outputs,
+            recipe.ports,
+            cache,
+        )
+        .unwrap_or_else(|error| panic!("{error}"));
+        let cached = signature
+            .inputs
+            .iter()
+            .any(|input| input.name.starts_with("past_key_values"));
         let pasts: &[usize] = if cached { &PASTS } else { &[0] };
         let oracle = Oracle::new(&bundle.entry_onnx(recipe.entry).expect("the entry"));
         for &past in pasts {
             let what = format!("{} {} past {past}", path.display(), recipe.name);
-            let case = Case { what, signature, program: &program, cache, past };
+            let case = Case {
+                what,
+                signature,
+                program: &program,
+                cache,
+                past,
+            };
             case.check(recipe.ports, &oracle);
         }
     }
@@ -52,14 +71,23 @@ struct Case<'a> {
 
 impl Case<'_> {
     fn check(&self, ports: &[(&str, Port)], oracle: &Oracle) {
-        let port = |name: &str| ports.iter().find(|(known, _)| *known == name).map(|&(_, port)| port);
+        let port = |name: &str| {
+            ports
+                .iter()
+                .find(|(known, _)| *known == name)
+                .map(|&(_, port)| port)
+        };
         let placed = &self.program.placed;
         let cache_len = self.cache.len().expect("a size") as usize;
         let mut machine = Machine::new(placed, &self.program.weights, vec![f32::NAN; cache_len]);
         let mut random = Small::new();
         let mut inputs: HashMap<String, Tensor> = HashMap::new();
         for input in &self.signature.inputs {
-            let shape: Vec<usize> = input.shape.iter().map(|dim| if dim.past { self.past } else { dim.fixed }).collect();
+            let shape: Vec<usize> = input
+                .shape
+                .iter()
+                .map(|dim| if dim.past { self.past } else { dim.fixed })
+                .collect();
             if input.ty == Type::I64 {
                 machine.set(placed, port(&input.name).expect("a port"), &[3.0]);
                 inputs.insert(input.name.clone(), integer(3));
@@ -69,7 +97,9 @@ impl Case<'_> {
             if let Some(port) = port(&input.name) {
                 machine.set(placed, port, &values);
             } else {
-                self.rows(&input.name, &shape).zip(&values).for_each(|(at, &value)| machine.cache[at] = value);
+                self.rows(&input.name, &shape)
+                    .zip(&values)
+                    .for_each(|(at, &value)| machine.cache[at] = value);
             }
             inputs.insert(input.name.clone(), tensor(&shape, &values));
         }
@@ -78,12 +108,25 @@ impl Case<'_> {
         for output in &self.signature.outputs {
             let wanted = &wanted[&output.name];
             let what = format!("{} {}", self.what, output.name);
-            let shape: Vec<usize> = output.shape.iter().map(|dim| dim.fixed + if dim.past { self.past } else { 0 }).collect();
+            let shape: Vec<usize> = output
+                .shape
+                .iter()
+                .map(|dim| dim.fixed + if dim.past { self.past } else { 0 })
+                .collect();
             if output.name.starts_with("present.") {
-                let got: Vec<f32> = self.rows(&output.name, &shape).map(|at| machine.cache[at]).collect();
+                let got: Vec<f32> = self
+                    .rows(&output.name, &shape)
+                    .map(|at| machine.cache[at])
+                    .collect();
                 close(&what, &got, wanted);
-            } else if port(&output.name).is_some_and(|port| placed.outputs.iter().any(|(found, _)| *found == port)) {
-                close(&what, &machine.output(placed, port(&output.name).expect("a port")), wanted);
+            } else if port(&output.name)
+                .is_some_and(|port| placed.outputs.iter().any(|(found, _)| *found == port))
+            {
+                close(
+                    &what,
+                    &machine.output(placed, port(&output.name).expect("a port")),
+                    wanted,
+                );
             }
         }
     }
@@ -104,12 +147,18 @@ impl Case<'_> {
 
 #[test]
 fn tiny_bundle() {
-    check(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/tiny.onnx")));
+    check(Path::new(concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/tests/data/tiny.onnx"
+    )));
 }
 
 #[test]
 fn shipped_bundle() {
-    let path = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../models/kitchen.onnx"));
+    let path = Path::new(concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../../models/kitchen.onnx"
+    ));
     if path.exists() {
         check(path);
     } else {

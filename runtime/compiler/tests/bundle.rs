@@ -1,0 +1,300 @@
+//! Bundles from the outside: what opens, what is refused and how, and whole episodes.
+
+use std::path::Path;
+
+use lads_compiler::{Bundle, BundleError, compile};
+use lads_core::{Controller, Instruction, Policy, Workspace};
+
+const TINY: &[u8] = include_bytes!("data/tiny.onnx");
+
+/// The tiny bundle with one byte string of its content replaced by another of the same length.
+fn edited(from: &str, to: &str) -> Vec<u8> {
+    assert_eq!(from.len(), to.len());
+    let mut bytes = TINY.to_vec();
+    let at = bytes
+        .windows(from.len())
+        .position(|window| window == from.as_bytes())
+        .expect("the text is there");
+    bytes[at..at + to.len()].copy_from_slice(to.as_bytes());
+    bytes
+}
+
+#[track_caller]
+fn refused(bytes: &[u8], parts: &[&str]) {
+    let Err(error) = Bundle::from_bytes(bytes) else {
+        panic!("it opened")
+    };
+    let message = error.to_string();
+    for part in parts {
+        assert!(
+            message.contains(part),
+            "\"{message}\" does not say \"{part}\""
+        );
+    }
+    assert!(!message.contains('\n'), "{message}");
+}
+
+fn paths() -> Vec<std::path::PathBuf> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let shipped = root.join("../../models/kitchen.onnx");
+    let mut paths = vec![root.join("tests/data/tiny.onnx")];
+    if shipped.exists() {
+        paths.push(shipped);
+    } else {
+        println!("skipped: models/kitchen.onnx is not there yet");
+    }
+    paths
+}
+
+#[test]
+fn opens_and_tells_what_it_holds() {
+    let bundle = Bundle::from_bytes(TINY).expect("a bundle");
+    assert_eq!(bundle.contract().environment.id, "tiny-bench");
+    assert_eq!(bundle.len_bytes(), TINY.len());
+    assert_eq!(bundle.sha256().len(), 64);
+    assert_eq!(
+        bundle
+            .metadata("joint_names")
+            .map(|names| names.contains("joint1")),
+        Some(true)
+    );
+    let entries = bundle.entries();
+    assert_eq!(entries.len(), 7, "{entries:?}");
+    assert!(entries.contains(&"trajectory_encoder/encode"));
+    let first = &bundle.contract().instructions[0];
+    assert_eq!(bundle.instruction_index(&first.id), Some(0));
+    assert_eq!(
+        bundle.instruction_index(&format!("  {} ", first.text.to_uppercase())),
+        Some(0)
+    );
+    assert_eq!(bundle.instruction_index("sing"), None);
+    let mut typo = first.text.clone();
+    typo.pop();
+    assert_eq!(bundle.nearest_instructions(&typo)[0], first.text);
+}
+
+#[test]
+fn golden_episodes_replay() {
+    for path in paths() {
+        let bundle = Bundle::open(&path).unwrap_or_else(|error| panic!("{error}"));
+        let image = compile(&bundle).unwrap_or_else(|error| panic!("{error}"));
+        assert!(image.as_bytes().as_ptr().addr().is_multiple_of(64));
+        let policy = Policy::new_checked(image.as_bytes()).expect("the image loads");
+        assert!(policy.checksum_matches());
+        let (mut arena, mut state) = (vec![0.0; policy.arena_len()], vec![0.0; policy.state_len()]);
+        let workspace = Workspace::new(&policy, &mut arena, &mut state).expect("enough memory");
+        let mut controller = Controller::new(policy, workspace);
+        let test = controller
+            .self_test()
+            .unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+        assert_eq!(test.steps as usize, bundle.golden().steps());
+        assert!(test.largest_error <= bundle.golden().tolerance);
+        assert_eq!(image.report().arena_len(), policy.arena_len());
+        // The same bundle gives the same image.
+        let again = compile(&bundle).expect("it compiled before");
+        assert_eq!(again.as_bytes(), image.as_bytes());
+    }
+}
+
+#[test]
+fn image_says_what_the_contract_says() {
+    let bundle = Bundle::from_bytes(TINY).expect("a bundle");
+    let image = compile(&bundle).expect("it compiles");
+    let policy = Policy::new_checked(image.as_bytes()).expect("the image loads");
+    let (wanted, got) = (bundle.contract(), policy.contract());
+    assert_eq!(got.environment_id(), wanted.environment.id);
+    assert_eq!(got.horizon(), wanted.horizon);
+    assert_eq!(got.codebook_len(), wanted.codebook.size);
+    assert_eq!(got.observation_len(), wanted.observation.len());
+    assert_eq!(got.action_len(), wanted.action.len());
+    assert_eq!(got.instruction_count(), wanted.instructions.len());
+    for (i, known) in wanted.instructions.iter().enumerate() {
+        let found = got.instruction(i).expect("an instruction");
+        assert_eq!(
+            (found.id, found.text),
+            (known.id.as_str(), known.text.as_str())
+        );
+        assert!(
+            !found.words.is_empty()
+                && found.words.len() <= wanted.context.words * wanted.language.dim
+        );
+    }
+    for (element, known) in got.observations().zip(&wanted.observation) {
+        assert_eq!(
+            (element.name, element.min, element.max),
+            (known.name.as_str(), known.min, known.max)
+        );
+    }
+}
+
+#[test]
+fn every_known_instruction_can_be_followed() {
+    let bundle = Bundle::from_bytes(TINY).expect("a bundle");
+    let image = compile(&bundle).expect("it compiles");
+    let policy = Policy::new_checked(image.as_bytes()).expect("the image loads");
+    let (mut arena, mut state) = (vec![0.0; policy.arena_len()], vec![0.0; policy.state_len()]);
+    let workspace = Workspace::new(&policy, &mut arena, &mut state).expect("enough memory");
+    let mut controller = Controller::new(policy, workspace);
+    let observation: Vec<f32> = bundle
+        .contract()
+        .observation
+        .iter()
+        .map(|element| f32::midpoint(element.min, element.max))
+        .collect();
+    let mut action = vec![0.0; bundle.contract().action.len()];
+    for id in 0..bundle.contract().instructions.len() as u32 {
+        controller
+            .set_instruction(Instruction::Id(id))
+            .expect("a known instruction");
+        for _ in 0..2 * bundle.contract().context.steps {
+            controller.step(&observation, &mut action).expect("a step");
+        }
+    }
+}
+
+#[test]
+fn a_file_that_is_not_there_is_named() {
+    let Err(error) = Bundle::open(Path::new("no/such/bundle.onnx")) else {
+        panic!("it opened")
+    };
+    let message = error.to_string();
+    assert!(
+        message.contains("no/such/bundle.onnx") && message.contains("cannot be read"),
+        "{message}"
+    );
+}
+
+#[test]
+fn what_is_no_onnx_is_refused() {
+    refused(b"", &["not an ONNX model", "empty"]);
+    refused(
+        b"hello, I am a text file of some length",
+        &["not an ONNX model"],
+    );
+    refused(
+        &[0x89, b'P', b'N', b'G', 13, 10, 26, 10, 0, 0, 0, 13],
+        &["not an ONNX model"],
+    );
+    refused(&[0x08, 0x08], &["not an ONNX model", "no graph"]);
+}
+
+#[test]
+fn truncated_files_are_refused_wherever_they_end() {
+    for len in (20..TINY.len()).step_by(101).chain([TINY.len() - 1]) {
+        let Err(error) = Bundle::from_bytes(&TINY[..len]) else {
+            panic!("it opened with {len} bytes")
+        };
+        let message = error.to_string();
+        assert!(
+            !message.contains('\n') && message.contains("; "),
+            "{message}"
+        );
+    }
+    refused(
+        &TINY[..TINY.len() / 2],
+        &[
+            "truncated",
+            &(TINY.len() / 2).to_string(),
+            "copy or export it again",
+        ],
+    );
+}
+
+#[test]
+fn a_model_without_a_contract_is_refused() {
+    refused(
+        &edited("lads.contract", "lads.kontract"),
+        &["lads.contract", "not a policy bundle"],
+    );
+    refused(
+        &edited("lads.golden", "lads.gulden"),
+        &["lads.golden", "missing"],
+    );
+}
+
+#[test]
+fn another_version_is_refused() {
+    let text = String::from_utf8_lossy(TINY).into_owned();
+    let spelled = if text.contains("\"version\":1,") {
+        "\"version\":1,"
+    } else {
+        "\"version\": 1,"
+    };
+    let other = spelled.replace('1', "7");
+    let Err(error) = Bundle::from_bytes(&edited(spelled, &other)) else {
+        panic!("it opened")
+    };
+    assert!(
+        matches!(error, BundleError::ContractVersion { .. }),
+        "{error}"
+    );
+    assert!(
+        error.to_string().contains("version 7") && error.to_string().contains("version 1"),
+        "{error}"
+    );
+}
+
+#[test]
+fn contracts_that_miss_or_contradict_something_are_refused() {
+    refused(&edited("\"horizon\"", "\"horizont"), &["contract", "JSON"]);
+    refused(
+        &edited("\"horizon\"", "\"horizom\""),
+        &["contract", "horizon"],
+    );
+    let text = String::from_utf8_lossy(TINY).into_owned();
+    let with = |name: &str, value: &str| {
+        [
+            format!("\"{name}\":{value}"),
+            format!("\"{name}\": {value}"),
+        ]
+        .into_iter()
+        .find(|spelled| text.contains(spelled))
+        .expect("the field")
+    };
+    let horizon = with("horizon", "4");
+    refused(
+        &edited(&horizon, &horizon.replace('4', "5")),
+        &[
+            "trajectory_encoder/encode/observations",
+            "`horizon`",
+            "[1, 5, 5]",
+            "[1, 4, 5]",
+        ],
+    );
+    refused(
+        &edited(&horizon, &horizon.replace('4', "0")),
+        &["`horizon` is 0"],
+    );
+    let size = with("size", "5");
+    refused(
+        &edited(&size, &size.replace('5', "6")),
+        &["logits", "`codebook.size`"],
+    );
+    refused(
+        &edited("\"joint2_velocity\"", "\"joint1_velocity\""),
+        &["action[1].name", "repeats"],
+    );
+}
+
+#[test]
+fn golden_episodes_that_do_not_read_are_refused() {
+    // The first bytes of the blob, in base64, are the length of its header.
+    let text = String::from_utf8_lossy(TINY).into_owned();
+    let at = text.find("AAAAAAB7").expect("the golden blob");
+    let start = &text[at..at + 8];
+    refused(&edited(start, "AAAAAA!!"), &["lads.golden", "base64"]);
+    refused(&edited(start, "//////97"), &["lads.golden", "safetensors"]);
+}
+
+#[test]
+fn a_missing_entry_is_named() {
+    // Renames the input's declaration only: the first place where the name stands is a node.
+    let name = b"low_level/act/plan";
+    let mut bytes = TINY.to_vec();
+    let places: Vec<usize> = (0..bytes.len() - name.len())
+        .filter(|&i| bytes[i..].starts_with(name))
+        .collect();
+    let last = *places.last().expect("the name is there");
+    bytes[last + name.len() - 1] = b'm';
+    refused(&bytes, &["low_level/act/pla"]);
+}
