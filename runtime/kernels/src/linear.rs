@@ -3,9 +3,11 @@
 //! The weights lie in panels of sixteen outputs, `[ceil(n / 16)][k][16]`, so that one sweep over a panel reads memory strictly
 //! in order and keeps sixteen sums in registers. Rows of `x` go through a panel in pairs: the two tokens of a control step
 //! read each weight once. Where registers allow it, several panels are swept side by side, because a sum waits for its last
-//! addition. Each output is one sum in the order of `k`, then the bias, whatever the number of rows or panels.
+//! addition, and the next panels are prefetched meanwhile: between two control steps a robot's or a simulator's other work takes
+//! the caches, and a step is as fast as its weights arrive. Each output is one sum in the order of `k`, then the bias, whatever
+//! the number of rows or panels.
 
-use crate::dispatch::{Isa, Kernel};
+use crate::dispatch::{Isa, Kernel, prefetch};
 use crate::lanes::{Block, LANES, add_scaled};
 use crate::math;
 
@@ -171,6 +173,8 @@ fn sweep<const P: usize, const R: usize>(w: [&[Block]; P], x: [&[f32]; R]) -> [[
     }
     for l in 0..k {
         for p in 0..P {
+            // The next panels, at the same place; behind the last ones, in an image in the order of use, the next layer's.
+            prefetch(w[p].as_ptr().wrapping_add(P * k + l));
             for r in 0..R {
                 add_scaled(&mut sums[r][p], x[r][l], &w[p][l]);
             }
