@@ -49,9 +49,9 @@ test-exporter: setup $(VENV)/stamp
 collect: setup
 	cargo run --release -p lads-sim --bin lads-collect -- --env kitchen --episodes-per-instruction 50 -o data/kitchen.safetensors
 
-## train: the shipped policy from data/kitchen.safetensors into runs/kitchen
+## train: the shipped policy from data/kitchen.safetensors into runs/kitchen; one thread, because sums depend on their number
 train: $(VENV)/stamp
-	$(PY) -m lads_exporter train --config exporter/configs/kitchen.toml --data data/kitchen.safetensors --out runs/kitchen
+	$(PY) -m lads_exporter train --config exporter/configs/kitchen.toml --data data/kitchen.safetensors --out runs/kitchen --threads 1
 
 ## export: runs/kitchen into models/kitchen.onnx
 export: $(VENV)/stamp
