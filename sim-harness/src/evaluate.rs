@@ -8,12 +8,13 @@ use std::panic::resume_unwind;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 
+use lads_compiler::Memory;
 use lads_core::{Decision, Policy, WorkspaceTooSmall};
 use thiserror::Error;
 
 use crate::environment::{Environment, EpisodeSeed};
 use crate::random::Stream;
-use crate::rollout::{Driver, Episode, Memory, RolloutError, Task, Timing};
+use crate::rollout::{Driver, Episode, RolloutError, Task, Timing};
 
 /// Fourth number of the entropy of the stream that seeds plan sampling; the environment's noise has only the first three.
 const DECISION_STREAM: u64 = 1;

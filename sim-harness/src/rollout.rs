@@ -5,10 +5,7 @@
 
 use std::time::{Duration, Instant};
 
-use lads_core::{
-    Controller, Decision, Instruction, InstructionError, Policy, StepError, Workspace,
-    WorkspaceTooSmall,
-};
+use lads_core::{Controller, Decision, Instruction, InstructionError, StepError};
 use rustix::time::{ClockId, clock_gettime};
 use thiserror::Error;
 
@@ -100,32 +97,6 @@ fn cpu_time() -> Duration {
 /// CPU time that this thread has used since it was `earlier`.
 fn cpu_since(earlier: Duration) -> Duration {
     cpu_time().saturating_sub(earlier)
-}
-
-/// The memory of one controller, allocated once.
-#[derive(Debug)]
-pub struct Memory {
-    arena: Vec<f32>,
-    state: Vec<f32>,
-}
-
-impl Memory {
-    /// As much as `policy` asks for.
-    pub fn of(policy: &Policy<'_>) -> Self {
-        Self {
-            arena: vec![0.0; policy.arena_len()],
-            state: vec![0.0; policy.state_len()],
-        }
-    }
-
-    /// A controller that works in this memory.
-    pub fn controller<'p, 'm>(
-        &'m mut self,
-        policy: &Policy<'p>,
-    ) -> Result<Controller<'p, 'm>, WorkspaceTooSmall> {
-        let workspace = Workspace::new(policy, &mut self.arena, &mut self.state)?;
-        Ok(Controller::new(*policy, workspace))
-    }
 }
 
 /// A controller in an environment, for one episode after the other.

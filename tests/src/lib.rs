@@ -4,7 +4,6 @@
 use std::path::{Path, PathBuf};
 
 use lads_compiler::{Bundle, Image, compile};
-use lads_core::{Controller, Policy, Workspace};
 
 /// A file or folder of the project, by its path from the root.
 pub fn project_path(path: &str) -> PathBuf {
@@ -40,35 +39,4 @@ pub fn bundles() -> Vec<PathBuf> {
 pub fn compiled(path: &Path) -> Image {
     let bundle = Bundle::open(path).unwrap_or_else(|error| panic!("{error}"));
     compile(&bundle).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
-}
-
-/// The memory of one controller.
-pub struct Memory {
-    /// Scratch.
-    pub arena: Vec<f32>,
-    /// What survives a control step.
-    pub state: Vec<f32>,
-}
-
-impl Memory {
-    /// As much as `policy` asks for.
-    pub fn of(policy: &Policy<'_>) -> Self {
-        Self {
-            arena: vec![0.0; policy.arena_len()],
-            state: vec![0.0; policy.state_len()],
-        }
-    }
-
-    /// A controller that works in it.
-    ///
-    /// # Panics
-    ///
-    /// When the memory is too small for the policy.
-    pub fn controller<'p, 'm>(&'m mut self, policy: &Policy<'p>) -> Controller<'p, 'm> {
-        let workspace = Workspace::new(policy, &mut self.arena, &mut self.state);
-        Controller::new(
-            *policy,
-            workspace.expect("the policy's own lengths are enough"),
-        )
-    }
 }

@@ -6,8 +6,9 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::hint::black_box;
 
+use lads_compiler::Memory;
 use lads_core::{Controller, Decision, Instruction, Policy};
-use lads_tests::{Memory, bundles, compiled};
+use lads_tests::{bundles, compiled};
 
 thread_local! {
     /// Allocations, reallocations and deallocations of this thread while counting; `None` while not.
@@ -89,7 +90,7 @@ fn a_controller_allocates_nothing() {
         let image = compiled(&path);
         let policy = Policy::new_checked(image.as_bytes()).unwrap();
         let mut memory = Memory::of(&policy);
-        let mut controller = memory.controller(&policy);
+        let mut controller = memory.controller(&policy).unwrap();
         let mut action = vec![0.0; policy.contract().action_len()];
         let calls = calls_during(|| work(&mut controller, &mut action));
         assert_eq!(calls, 0, "{}", path.display());

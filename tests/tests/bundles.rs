@@ -1,7 +1,8 @@
 //! Every bundle that ships, compiled and put to work on this machine.
 
+use lads_compiler::Memory;
 use lads_core::{Instruction, Policy, Workspace, WorkspaceTooSmall};
-use lads_tests::{Memory, bundles, compiled};
+use lads_tests::{bundles, compiled};
 
 #[test]
 fn golden_episodes_replay() {
@@ -17,7 +18,7 @@ fn golden_episodes_replay() {
             path.display()
         );
         let mut memory = Memory::of(&policy);
-        let passed = memory.controller(&policy).self_test();
+        let passed = memory.controller(&policy).unwrap().self_test();
         let passed = passed.unwrap_or_else(|error| panic!("{}: {error}", path.display()));
         assert_eq!(passed.steps as usize, golden.len());
     }
@@ -34,7 +35,7 @@ fn the_plans_of_a_golden_episode_differ_by_instruction() {
         let mut logits = Vec::new();
         for instruction in 0..policy.contract().instruction_count() as u32 {
             let mut memory = Memory::of(&policy);
-            let mut controller = memory.controller(&policy);
+            let mut controller = memory.controller(&policy).unwrap();
             controller
                 .set_instruction(Instruction::Id(instruction))
                 .unwrap();
@@ -74,7 +75,7 @@ fn a_controller_that_was_used_answers_like_a_fresh_one() {
                 .collect::<Vec<_>>()
         };
         let mut memory = Memory::of(&policy);
-        let mut controller = memory.controller(&policy);
+        let mut controller = memory.controller(&policy).unwrap();
         controller.set_instruction(Instruction::Id(1)).unwrap();
         let fresh = episode(&mut controller);
         controller.reset();

@@ -5,10 +5,11 @@
 
 use std::io::{BufRead, ErrorKind, Write};
 
+use lads_compiler::Memory;
 use lads_core::{Controller, Decision, Instruction, Policy};
 
 use crate::line;
-use crate::model::{Memory, Model};
+use crate::model::Model;
 use crate::refusal::Refusal;
 use crate::self_test;
 

@@ -6,7 +6,7 @@
 use std::path::{Path, PathBuf};
 
 use lads_compiler::{Bundle, Image, compile};
-use lads_core::{Controller, KnownInstruction, Policy, Workspace};
+use lads_core::{KnownInstruction, Policy};
 
 use crate::refusal::{Refusal, chain};
 
@@ -129,36 +129,4 @@ fn aligned(file: &[u8]) -> Bytes {
         *to = from;
     }
     Bytes::Read(words, file.len())
-}
-
-/// The memory of one controller, as long as the policy asks for.
-pub struct Memory {
-    arena: Vec<f32>,
-    state: Vec<f32>,
-}
-
-impl Memory {
-    /// Allocates it.
-    pub fn of(policy: &Policy<'_>) -> Self {
-        Self {
-            arena: vec![0.0; policy.arena_len()],
-            state: vec![0.0; policy.state_len()],
-        }
-    }
-
-    /// A controller that works in it.
-    pub fn controller<'p, 'm>(
-        &'m mut self,
-        policy: &Policy<'p>,
-    ) -> Result<Controller<'p, 'm>, Refusal> {
-        let workspace =
-            Workspace::new(policy, &mut self.arena, &mut self.state).map_err(|error| {
-                Refusal::new(
-                    "the policy's workspace",
-                    error,
-                    "compile it again from its bundle",
-                )
-            })?;
-        Ok(Controller::new(*policy, workspace))
-    }
 }

@@ -1,8 +1,9 @@
 //! `lads self-test`: replays the policy's golden episode on this machine and compares plans and actions.
 
+use lads_compiler::Memory;
 use lads_core::{Controller, Policy};
 
-use crate::model::{Memory, Model};
+use crate::model::Model;
 use crate::refusal::Refusal;
 
 /// Replays the golden episode and says in one line how it went; a policy without one is refused.

@@ -16,12 +16,11 @@ use std::time::{Duration, Instant};
 
 use clap::Parser;
 use indicatif::{ProgressBar, ProgressStyle};
-use lads_compiler::{Bundle, compile};
+use lads_compiler::{Bundle, Memory, compile};
 use lads_core::{Decision, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError};
 use lads_sim::results::{self, InstructionResult, Results};
-use lads_sim::rollout::Memory;
 use lads_sim::table::Table;
 use lads_sim::{assets, fit, output, registry};
 
