@@ -43,7 +43,7 @@ $(VENV)/stamp: exporter/pyproject.toml
 
 test-exporter: setup $(VENV)/stamp
 	cargo build -p lads-cli -p lads-sim
-	$(PY) -m pytest -q exporter/tests tests/parity
+	$(PY) -m pytest exporter/tests tests/parity
 
 ## collect: scripted demonstrations for the 22 seen instructions into data/kitchen.safetensors
 collect: setup
