@@ -29,6 +29,7 @@ use thiserror::Error;
 use crate::expert::Transition;
 use crate::instructions::Instruction;
 use crate::kitchen::spec::{ACTION_LEN, OBSERVATION_LEN};
+use crate::output;
 
 /// `format` of the metadata.
 pub const FORMAT: &str = "lads-dataset";
@@ -101,21 +102,13 @@ impl Dataset {
             path: path.to_path_buf(),
             source,
         };
-        let folder = path
-            .parent()
-            .filter(|folder| !folder.as_os_str().is_empty())
-            .unwrap_or(Path::new("."));
-        std::fs::create_dir_all(folder).map_err(io)?;
         let bytes = self.to_bytes().map_err(|error| DatasetError::Format {
             path: path.to_path_buf(),
             reason: error.to_string(),
         })?;
-        let mut file = tempfile::NamedTempFile::new_in(folder).map_err(io)?;
+        let mut file = output::temporary_with_folder(path).map_err(io)?;
         file.write_all(&bytes).map_err(io)?;
         file.as_file().sync_all().map_err(io)?;
-        // Temporary files are private; a dataset is an ordinary file.
-        let mode = std::os::unix::fs::PermissionsExt::from_mode(0o644);
-        file.as_file().set_permissions(mode).map_err(io)?;
         file.persist(path).map_err(|error| io(error.error))?;
         Ok(())
     }

@@ -5,6 +5,7 @@
 
 pub mod assets;
 pub mod collect;
+pub mod command;
 pub mod dataset;
 pub mod environment;
 pub mod evaluate;

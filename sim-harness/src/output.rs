@@ -30,11 +30,19 @@ pub fn temporary_beside(path: &Path) -> io::Result<tempfile::NamedTempFile> {
         _ => Path::new("."),
     };
     let mut builder = tempfile::Builder::new();
-    builder.prefix(".lads-run-").suffix(".tmp");
+    builder.prefix(".lads-").suffix(".tmp");
     // As `File::create` would: readable by all whom the umask lets.
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
     builder.tempfile_in(folder)
+}
+
+/// The same, in a folder that is made where it is missing.
+pub fn temporary_with_folder(path: &Path) -> io::Result<tempfile::NamedTempFile> {
+    if let Some(folder) = path.parent() {
+        std::fs::create_dir_all(folder)?;
+    }
+    temporary_beside(path)
 }
 
 #[cfg(test)]

@@ -12,6 +12,7 @@ use lads_sim::collect::{Settings, Tally, collect};
 use lads_sim::dataset::Dataset;
 use lads_sim::instructions::Instructions;
 use lads_sim::kitchen::{Noise, Scene};
+use lads_sim::{command, output};
 
 /// Collects scripted demonstrations of an environment's seen instructions.
 #[derive(Parser)]
@@ -47,12 +48,13 @@ enum EnvironmentName {
 }
 
 fn main() -> ExitCode {
-    match run(&Arguments::parse()) {
+    let arguments = match command::arguments("lads-collect") {
+        Ok(arguments) => arguments,
+        Err(code) => return code,
+    };
+    match run(&arguments) {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("lads-collect: {error}");
-            ExitCode::from(2)
-        }
+        Err(error) => command::refuse(error),
     }
 }
 
@@ -68,13 +70,15 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
             .or_else(|| std::thread::available_parallelism().ok())
             .unwrap_or(NonZeroUsize::MIN),
     };
-    if arguments.output.is_dir() {
-        return Err(format!(
-            "{} is a folder: name a file with -o",
-            arguments.output.display()
-        )
-        .into());
-    }
+    // Looked at before minutes of work, not after.
+    drop(
+        output::temporary_with_folder(&arguments.output).map_err(|error| {
+            format!(
+                "{}: cannot be written ({error}); name a file in a writable folder with -o",
+                arguments.output.display()
+            )
+        })?,
+    );
     let scene = Scene::load(&vendor_dir())?;
     let instructions = Instructions::kitchen().seen;
     let total = instructions.len() as u64 * settings.episodes_per_instruction as u64;

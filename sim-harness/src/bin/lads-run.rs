@@ -22,10 +22,8 @@ use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError};
 use lads_sim::results::{self, InstructionResult, Results};
 use lads_sim::table::Table;
-use lads_sim::{assets, fit, output, registry};
+use lads_sim::{assets, command, fit, output, registry};
 
-/// Exit code of everything that was refused.
-const REFUSED: u8 = 2;
 /// Exit code after an interrupt, as shells have it: 128 and the signal's number.
 const INTERRUPTED: u8 = 130;
 
@@ -72,20 +70,9 @@ fn refused(line: impl Display) -> End {
 }
 
 fn main() -> ExitCode {
-    let arguments = match Arguments::try_parse() {
+    let arguments = match command::arguments("lads-run") {
         Ok(arguments) => arguments,
-        Err(error) if error.use_stderr() => {
-            let text = error.to_string();
-            // The first paragraph is what is wrong; the rest is the usage.
-            let wrong = text.split("\n\n").next().unwrap_or_default();
-            eprintln!("{}; see lads-run --help", one_line(wrong));
-            return ExitCode::from(REFUSED);
-        }
-        Err(help) => {
-            // Help or version; a closed pipe is no failure.
-            let _ = help.print();
-            return ExitCode::SUCCESS;
-        }
+        Err(code) => return code,
     };
     match run(&arguments) {
         Ok(()) => ExitCode::SUCCESS,
@@ -93,16 +80,8 @@ fn main() -> ExitCode {
             eprintln!("interrupted: no results written");
             ExitCode::from(INTERRUPTED)
         }
-        Err(End::Refused(line)) => {
-            eprintln!("error: {}", one_line(&line));
-            ExitCode::from(REFUSED)
-        }
+        Err(End::Refused(line)) => command::refuse(line),
     }
-}
-
-/// Whatever the errors underneath contain: one line.
-fn one_line(text: &str) -> String {
-    text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
 fn run(arguments: &Arguments) -> Result<(), End> {
