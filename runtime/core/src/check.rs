@@ -66,19 +66,19 @@ fn reaches<const N: usize>(len: u32, dims: [u32; N], strides: [u32; N]) -> Check
     let last: u128 = dims
         .into_iter()
         .zip(strides)
-        .map(|(dim, stride)| u128::from(dim.saturating_sub(1)) * u128::from(stride))
+        .map(|(dim, stride)| u128::from(dim.saturating_sub(1)).saturating_mul(u128::from(stride)))
         .sum();
     require(last < u128::from(len), Fault::Shape)
 }
 
 /// `offset..offset + len` lies inside `0..space` and is not empty.
 fn inside(offset: u32, len: u32, space: usize) -> Checked {
-    let end = u64::from(offset) + u64::from(len);
+    let end = u64::from(offset).saturating_add(u64::from(len));
     require(len != 0 && end <= space as u64, Fault::Bounds)
 }
 
 fn overlap(a: [u32; 2], b: [u32; 2]) -> bool {
-    let end = |[offset, len]: [u32; 2]| u64::from(offset) + u64::from(len);
+    let end = |[offset, len]: [u32; 2]| u64::from(offset).saturating_add(u64::from(len));
     u64::from(a[0]) < end(b) && u64::from(b[0]) < end(a)
 }
 
@@ -101,11 +101,15 @@ pub(crate) fn arena_span(operand: Operand) -> Option<Span> {
 /// Strides of a contiguous layout, the way [`op::Binary`] writes them; dimensions of length one may say anything.
 pub(crate) fn is_contiguous(dims: [u32; 4], strides: [u32; 4]) -> bool {
     let mut expected = 1_u64;
-    dims.into_iter().zip(strides).rev().all(|(dim, stride)| {
-        let fits = dim == 1 || u64::from(stride) == expected;
-        expected = expected.saturating_mul(u64::from(dim));
-        fits
-    })
+    let [d0, d1, d2, d3] = dims;
+    let [s0, s1, s2, s3] = strides;
+    [(d3, s3), (d2, s2), (d1, s1), (d0, s0)]
+        .into_iter()
+        .all(|(dim, stride)| {
+            let fits = dim == 1 || u64::from(stride) == expected;
+            expected = expected.saturating_mul(u64::from(dim));
+            fits
+        })
 }
 
 /// Checks ops against the spaces of one program.
@@ -196,7 +200,7 @@ impl Checker {
             op.tokens == self.tokens && op.queries <= op.tokens,
             Fault::Tokens,
         )?;
-        let width = u64::from(op.heads) * u64::from(op.head_dim);
+        let width = u64::from(op.heads).saturating_mul(u64::from(op.head_dim));
         let width = u32::try_from(width).map_err(|_| Fault::Shape)?;
         for (span, stride) in [(op.k, op.k_stride), (op.v, op.v_stride)] {
             self.arena(span)?;
@@ -206,10 +210,10 @@ impl Checker {
         self.cache(op.cache_v)?;
         let caches = [op.cache_k, op.cache_v].map(|span| [span.offset, span.len]);
         require(!overlap(caches[0], caches[1]), Fault::Overlap)?;
-        let capacity = op.cache_k.len / width;
+        let capacity = op.cache_k.len.checked_div(width).ok_or(Fault::Shape)?;
         exactly(op.cache_k.len, [capacity, width])?;
         exactly(op.cache_v.len, [capacity, width])?;
-        let needed = self.spaces.past_max as u64 + u64::from(op.tokens);
+        let needed = (self.spaces.past_max as u64).saturating_add(u64::from(op.tokens));
         require(u64::from(capacity) >= needed, Fault::Capacity)?;
         if op.queries == 0 {
             let empty = op.q.len == 0 && op.y.len == 0 && op.scratch.len == 0;
@@ -297,7 +301,9 @@ impl Checker {
 
 /// A span holds `rows` rows of `width` elements that start `stride` elements apart.
 fn rows(span: Span, rows: u32, stride: u32, width: u32) -> Checked {
-    let len = u64::from(rows.saturating_sub(1)) * u64::from(stride) + u64::from(width);
+    let len = u64::from(rows.saturating_sub(1))
+        .saturating_mul(u64::from(stride))
+        .saturating_add(u64::from(width));
     let apart = rows == 1 || stride >= width;
     require(
         rows != 0 && width != 0 && apart && len == u64::from(span.len),

@@ -38,6 +38,20 @@ pub struct Element<'a> {
     pub max: f32,
 }
 
+impl Element<'_> {
+    /// The value, or the limit beyond which it lies. What is not a number stays so.
+    pub fn clamp(&self, value: f32) -> f32 {
+        // `f32::clamp` without its panic on limits in the wrong order, which a checked contract does not have.
+        if value < self.min {
+            self.min
+        } else if value > self.max {
+            self.max
+        } else {
+            value
+        }
+    }
+}
+
 /// One instruction that a policy knows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct KnownInstruction<'a> {
@@ -153,7 +167,7 @@ impl<'a> Contract<'a> {
             let known =
                 InstructionRecord::take(&mut Reader::new(words)).ok_or(ContractError::Record)?;
             self.check_texts(&[known.id, known.text, known.sub_tasks])?;
-            let len = u64::from(known.words_len) * u64::from(fixed.word_dim);
+            let len = u64::from(known.words_len).saturating_mul(u64::from(fixed.word_dim));
             let fits = (1..=fixed.words_len).contains(&known.words_len)
                 && len == u64::from(known.words.len);
             if !fits || self.span(known.words).is_none() {

@@ -17,7 +17,7 @@
 //! - An action that leaves the controller is finite and inside the contract's limits.
 //! - Nothing is allocated, no call blocks, and the work of a step is bounded by the longest context.
 
-use lads_kernels::Isa;
+use lads_kernels::{Isa, assign};
 
 use crate::contract::Decision;
 use crate::decision::{Decider, PlanIndex, margin};
@@ -138,7 +138,7 @@ impl<'a, 'm> Controller<'a, 'm> {
             Instruction::Words(words) => words,
         };
         let (dim, most) = (contract.word_dim(), contract.words_len());
-        let count = words.len() / dim.max(1);
+        let count = words.len().checked_div(dim).unwrap_or(0);
         if !words.len().is_multiple_of(dim) {
             return Err(InstructionError::Length {
                 got: words.len(),
@@ -187,7 +187,7 @@ impl<'a, 'm> Controller<'a, 'm> {
             });
         }
         let report = self.advance(observation)?;
-        action.copy_from_slice(self.workspace.now.action);
+        assign(action, self.workspace.now.action);
         Ok(report)
     }
 
@@ -216,7 +216,7 @@ impl<'a, 'm> Controller<'a, 'm> {
             .zip(action)
             .zip(contract.actions())
         {
-            *to = from.clamp(limits.min, limits.max);
+            *to = limits.clamp(from);
         }
         Ok(())
     }
@@ -329,14 +329,14 @@ impl<'a, 'm> Controller<'a, 'm> {
             .map_err(StepError::Program)?;
         take_finite(machine.output(act, Port::Action), next.action)?;
         for (action, limits) in next.action.iter_mut().zip(policy.contract().actions()) {
-            *action = action.clamp(limits.min, limits.max);
+            *action = limits.clamp(*action);
         }
 
         now.copy_from(next);
         self.decider = decider;
-        let past = clock.past + high.tokens();
+        let past = clock.past.saturating_add(high.tokens());
         self.clock = Clock {
-            timestep: clock.timestep + 1,
+            timestep: clock.timestep.saturating_add(1),
             past,
             plan,
             margin: plan_margin,
@@ -411,6 +411,6 @@ fn take_finite(from: &[f32], to: &mut [f32]) -> Result<(), StepError> {
     if from.len() != to.len() || !from.iter().all(|x| x.is_finite()) {
         return Err(StepError::NotFiniteResult);
     }
-    to.copy_from_slice(from);
+    assign(to, from);
     Ok(())
 }

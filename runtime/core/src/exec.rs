@@ -161,7 +161,7 @@ impl Machine<'_> {
 
     fn gather_row(&mut self, op: &op::GatherRow, weights: &[f32]) -> Result<(), ExecError> {
         let index = self.ints.get(usize::from(op.index.0)).copied().unwrap_or(0);
-        let row = i64::from(index) + i64::from(op.shift);
+        let row = i64::from(index).saturating_add(i64::from(op.shift));
         let found = usize::try_from(row).ok().and_then(|row| {
             let table = weights.get(weight_range(op.table))?;
             table.chunks_exact(op.row_len.max(1) as usize).nth(row)
@@ -174,7 +174,8 @@ impl Machine<'_> {
 }
 
 fn range(span: Span) -> Range<usize> {
-    span.offset as usize..span.offset as usize + span.len as usize
+    let start = span.offset as usize;
+    start..start.saturating_add(span.len as usize)
 }
 
 fn weight_range(span: WeightSpan) -> Range<usize> {
@@ -226,7 +227,7 @@ impl<'r> Readable<'r> {
             Space::Arena if range.end <= self.below.len() => self.below.get(range),
             Space::Arena => {
                 let start = range.start.checked_sub(self.above_start)?;
-                self.above.get(start..start + range.len())
+                self.above.get(start..start.saturating_add(range.len()))
             }
         }
     }
@@ -268,7 +269,7 @@ fn attention(
     cache: &mut [f32],
 ) -> Option<()> {
     let (heads, head_dim) = (op.heads as usize, op.head_dim as usize);
-    let width = heads * head_dim;
+    let width = heads.checked_mul(head_dim)?;
     let [cache_k, cache_v] = cache
         .get_disjoint_mut([state_range(op.cache_k), state_range(op.cache_v)])
         .ok()?;
@@ -297,7 +298,10 @@ fn attention(
         head_dim,
         scale: op.scale,
         q_stride: op.q_stride as usize,
-        visible: past + op.tokens as usize - op.queries as usize + 1,
+        visible: past
+            .saturating_add(op.tokens as usize)
+            .saturating_sub(op.queries as usize)
+            .saturating_add(1),
         cache_k,
         cache_v,
     };

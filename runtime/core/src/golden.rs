@@ -59,8 +59,8 @@ impl<'a> Golden<'a> {
 
     /// For each control step its observation, the plan in force and the action.
     pub fn steps(&self) -> impl Iterator<Item = (&'a [f32], u32, &'a [f32])> + use<'a> {
-        let observations = self.observations.chunks_exact(self.observation_len);
-        let actions = self.actions.chunks_exact(self.action_len);
+        let observations = self.observations.chunks_exact(self.observation_len.max(1));
+        let actions = self.actions.chunks_exact(self.action_len.max(1));
         observations
             .zip(self.plans)
             .zip(actions)

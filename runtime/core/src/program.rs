@@ -129,7 +129,7 @@ impl<'a> Program<'a> {
 /// The ports of a record: their number at word `start`, then the ports.
 fn ports(record: &[u32], start: usize) -> impl Iterator<Item = PortRecord> + '_ {
     let len = record.get(start).copied().unwrap_or(0);
-    let mut from = Reader::new(record.get(start + 1..).unwrap_or(&[]));
+    let mut from = Reader::new(record.get(start.saturating_add(1)..).unwrap_or(&[]));
     (0..len).map_while(move |_| PortRecord::take(&mut from))
 }
 

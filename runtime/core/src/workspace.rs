@@ -3,7 +3,7 @@
 use core::error::Error;
 use core::fmt;
 
-use lads_kernels::Isa;
+use lads_kernels::{Isa, assign};
 
 use crate::exec::Machine;
 use crate::op::INT_SLOTS;
@@ -20,9 +20,9 @@ pub(crate) struct Bank<'m> {
 impl Bank<'_> {
     /// Takes over another bank's values.
     pub fn copy_from(&mut self, other: &Bank) {
-        self.plan.copy_from_slice(other.plan);
-        self.action.copy_from_slice(other.action);
-        self.logits.copy_from_slice(other.logits);
+        assign(self.plan, other.plan);
+        assign(self.action, other.action);
+        assign(self.logits, other.logits);
     }
 }
 

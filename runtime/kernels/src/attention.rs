@@ -13,6 +13,7 @@
 //! and runs over all rows for each such pair of blocks, and the division by the sum comes last.
 
 use crate::dispatch::{Isa, Kernel};
+use crate::elementwise::assign;
 use crate::lanes::{LANES, add_products, add_scaled, tree};
 use crate::norm::exponentials;
 
@@ -29,7 +30,7 @@ pub fn append(x: &[f32], stride: usize, width: usize, cache: &mut [f32], first: 
         .zip(x.chunks(stride.max(1)))
     {
         if let Some(x) = x.get(..width) {
-            row.copy_from_slice(x);
+            assign(row, x);
         }
     }
 }
@@ -102,13 +103,14 @@ impl Kernel for Queries<'_> {
         let Attention {
             heads, head_dim, ..
         } = *self.attention;
-        let queries = self.q.chunks(self.attention.q_stride);
-        let ys = self.y.chunks_exact_mut(heads * head_dim);
+        let queries = self.q.chunks(self.attention.q_stride.max(1));
+        let ys = self.y.chunks_exact_mut((heads * head_dim).max(1));
         for (i, (q, y)) in queries.zip(ys).enumerate() {
             let Some(p) = self.scratch.get_mut(..self.attention.visible + i) else {
                 return;
             };
-            let parts = q.chunks_exact(head_dim).zip(y.chunks_exact_mut(head_dim));
+            let dim = head_dim.max(1);
+            let parts = q.chunks_exact(dim).zip(y.chunks_exact_mut(dim));
             for (head, (q, y)) in parts.enumerate() {
                 self.attention.head(q, head * head_dim, p, y);
             }
@@ -119,7 +121,7 @@ impl Kernel for Queries<'_> {
 /// `p[r] = scale * dot(q, K[r])`, where row `r` of the head starts at `r * width + first`.
 #[inline(always)]
 fn score(q: &[f32], keys: &[f32], [width, first]: [usize; 2], scale: f32, p: &mut [f32]) {
-    for (p, k) in p.iter_mut().zip(keys.chunks_exact(width)) {
+    for (p, k) in p.iter_mut().zip(keys.chunks_exact(width.max(1))) {
         *p = dot(q, k.get(first..first + q.len()).unwrap_or(&[])) * scale;
     }
 }
@@ -135,7 +137,7 @@ fn weigh<const B: usize>(
 ) {
     let mut sums = [[0.0; LANES]; B];
     let (blocks, _) = values.as_chunks::<LANES>();
-    for (&p, row) in p.iter().zip(blocks.chunks_exact(width / LANES)) {
+    for (&p, row) in p.iter().zip(blocks.chunks_exact((width / LANES).max(1))) {
         let row = row.get(first / LANES..).and_then(|row| row.first_chunk());
         let row: &[_; B] = row.unwrap_or(&[[0.0; LANES]; B]);
         for (sum, v) in sums.iter_mut().zip(row) {
@@ -151,7 +153,7 @@ fn weigh<const B: usize>(
 #[inline(always)]
 fn weigh_uneven(p: &[f32], values: &[f32], [width, first]: [usize; 2], scale: f32, y: &mut [f32]) {
     for (i, y) in y.iter_mut().enumerate() {
-        let column = values.iter().skip(first + i).step_by(width);
+        let column = values.iter().skip(first + i).step_by(width.max(1));
         *y = column.zip(p).fold(0.0, |sum, (&v, &p)| sum + p * v) * scale;
     }
 }

@@ -3,6 +3,14 @@
 use crate::dispatch::{Isa, Kernel};
 use crate::math;
 
+/// Copies element by element as far as both slices reach: `copy_from_slice` without its panic.
+#[inline(always)]
+pub fn assign(to: &mut [f32], from: &[f32]) {
+    for (to, &from) in to.iter_mut().zip(from) {
+        *to = from;
+    }
+}
+
 /// An operation on one element.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum UnaryKind {
@@ -46,9 +54,7 @@ pub struct Unary {
 impl Unary {
     /// `y[i] = kind(x[i])`
     pub fn run(self, isa: Isa, x: &[f32], y: &mut [f32]) {
-        for (y, &x) in y.iter_mut().zip(x) {
-            *y = x;
-        }
+        assign(y, x);
         self.run_in_place(isa, y);
     }
 

@@ -1,7 +1,7 @@
 //! Dense kernels for batch-1 policies: slices and shapes, nothing of ONNX or LADS.
 //!
 //! Invariants:
-//! - No allocation, no `std`, no panic, and no unsafe code but in `dispatch`: a slice that is too short leaves the rest of the result as it was.
+//! - No allocation, no `std`, no panic, and no unsafe code but in `dispatch` and one loop of `linear`: a slice that is too short leaves the rest of the result as it was.
 //!   Callers that want to be told check shapes beforehand; `lads-core` does so once per program.
 //! - The same bits on every target with IEEE 754 arithmetic: every sum has one fixed order (sixteen lanes, then a tree), no
 //!   multiply-add is fused, and `exp`, `tanh` and `sigmoid` are the polynomials of [`math`].
@@ -39,7 +39,7 @@ mod strided;
 
 pub use attention::{Attention, append, attention_scratch_len};
 pub use dispatch::Isa;
-pub use elementwise::{Unary, UnaryKind};
+pub use elementwise::{Unary, UnaryKind, assign};
 pub use linear::{Activation, Linear, PANEL, pack, packed_len};
 pub use matmul::MatMul;
 pub use norm::{LayerNorm, softmax};

@@ -102,11 +102,14 @@ impl Linear<'_> {
         let (k, n) = (self.k, self.n);
         let (w, _) = w.as_chunks::<PANEL>();
         let w: [_; P] = core::array::from_fn(|p| w.get(p * k..(p + 1) * k).unwrap_or(&[]));
-        let mut xs = x.chunks_exact(2 * k);
-        let mut ys = y.chunks_exact_mut(2 * n);
+        let mut xs = x.chunks_exact((2 * k).max(1));
+        let mut ys = y.chunks_exact_mut((2 * n).max(1));
         for (x, y) in xs.by_ref().zip(ys.by_ref()) {
-            let (x0, x1) = x.split_at(k);
-            let (y0, y1) = y.split_at_mut(n);
+            let (Some((x0, x1)), Some((y0, y1))) =
+                (x.split_at_checked(k), y.split_at_mut_checked(n))
+            else {
+                return;
+            };
             let [sums0, sums1] = sweep(w, [x0, x1]);
             self.finish(sums0, first, y0);
             self.finish(sums1, first, y1);
@@ -146,13 +149,13 @@ impl Kernel for Rows<'_> {
     #[inline(always)]
     fn run<const WIDE: usize>(self) {
         let panel = self.layer.k * PANEL;
-        let mut groups = self.layer.w.chunks_exact(WIDE * panel);
+        let mut groups = self.layer.w.chunks_exact((WIDE * panel).max(1));
         let mut first = 0;
         for w in groups.by_ref() {
             self.layer.panels::<WIDE>(w, first, self.x, self.y);
             first += WIDE * PANEL;
         }
-        for w in groups.remainder().chunks_exact(panel) {
+        for w in groups.remainder().chunks_exact(panel.max(1)) {
             self.layer.panels::<1>(w, first, self.x, self.y);
             first += PANEL;
         }
@@ -163,7 +166,11 @@ impl Kernel for Rows<'_> {
 #[inline(always)]
 #[expect(
     clippy::indexing_slicing,
-    reason = "the lengths are compared beforehand, and the sums stay in registers only without a branch in the loop"
+    reason = "arrays whose length is a constant, as is every index"
+)]
+#[expect(
+    unsafe_code,
+    reason = "the sums stay in registers only without a branch in the loop, and compilers keep some of the bounds checks"
 )]
 fn sweep<const P: usize, const R: usize>(w: [&[Block]; P], x: [&[f32]; R]) -> [[Block; P]; R] {
     let mut sums = [[[0.0; PANEL]; P]; R];
@@ -173,10 +180,14 @@ fn sweep<const P: usize, const R: usize>(w: [&[Block]; P], x: [&[f32]; R]) -> [[
     }
     for l in 0..k {
         for p in 0..P {
+            // SAFETY: `w[p]` has `k` elements, as compared above, and `l < k`.
+            let block = unsafe { w[p].get_unchecked(l) };
             // The next panels, at the same place; behind the last ones, in an image in the order of use, the next layer's.
-            prefetch(w[p].as_ptr().wrapping_add(P * k + l));
+            prefetch(core::ptr::from_ref(block).wrapping_add(P * k));
             for r in 0..R {
-                add_scaled(&mut sums[r][p], x[r][l], &w[p][l]);
+                // SAFETY: `x[r]` has `k` elements, as compared above, and `l < k`.
+                let x = unsafe { *x[r].get_unchecked(l) };
+                add_scaled(&mut sums[r][p], x, block);
             }
         }
     }

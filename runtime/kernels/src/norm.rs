@@ -1,6 +1,7 @@
 //! Layer norm and softmax, row by row.
 
 use crate::dispatch::{Isa, Kernel};
+use crate::elementwise::assign;
 use crate::lanes::{max_of, sum_of};
 use crate::math;
 
@@ -36,7 +37,7 @@ impl Kernel for LayerNormRows<'_> {
     #[inline(always)]
     fn run<const WIDE: usize>(self) {
         let LayerNorm { gamma, beta, eps } = self.norm;
-        let cols = gamma.len();
+        let cols = gamma.len().max(1);
         let rows = self.x.chunks_exact(cols);
         for (x, y) in rows.zip(self.y.chunks_exact_mut(cols)) {
             let mean = sum_of(x, |x| x) / cols as f32;
@@ -66,9 +67,10 @@ struct SoftmaxRows<'a> {
 impl Kernel for SoftmaxRows<'_> {
     #[inline(always)]
     fn run<const WIDE: usize>(self) {
-        let rows = self.x.chunks_exact(self.cols);
-        for (x, y) in rows.zip(self.y.chunks_exact_mut(self.cols)) {
-            y.copy_from_slice(x);
+        let cols = self.cols.max(1);
+        let rows = self.x.chunks_exact(cols);
+        for (x, y) in rows.zip(self.y.chunks_exact_mut(cols)) {
+            assign(y, x);
             let scale = 1.0 / exponentials(y);
             for y in y {
                 *y *= scale;

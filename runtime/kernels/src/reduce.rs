@@ -1,5 +1,6 @@
 //! Reductions of one axis, and the index of the smallest or largest element.
 
+use crate::elementwise::assign;
 use crate::lanes::{LANES, sum_of};
 use crate::math;
 
@@ -33,7 +34,7 @@ pub fn reduce(kind: ReduceKind, x: &[f32], axis: Axis, y: &mut [f32]) {
         return;
     }
     for (x, y) in x
-        .chunks_exact(axis.len * axis.inner)
+        .chunks_exact((axis.len * axis.inner).max(1))
         .zip(y.chunks_exact_mut(axis.inner))
     {
         match kind {
@@ -63,7 +64,7 @@ fn sum(x: &[f32], y: &mut [f32]) {
 fn fold(x: &[f32], y: &mut [f32], f: impl Fn(f32, f32) -> f32) {
     let mut rows = x.chunks_exact(y.len().max(1));
     if let Some(first) = rows.next() {
-        y.copy_from_slice(first);
+        assign(y, first);
     }
     for row in rows {
         for (y, &x) in y.iter_mut().zip(row) {
