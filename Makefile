@@ -8,7 +8,9 @@ MODEL  ?= models/kitchen.onnx
 ARGS   ?=
 RUNTIME := -p lads-core -p lads-kernels -p lads-compiler -p lads-ffi -p lads-cli
 
-.PHONY: run test setup lint test-runtime test-sim test-exporter collect train export bench clean help
+PREFIX  ?= /usr/local
+
+.PHONY: run test setup lint test-runtime test-sim test-exporter collect train export install bench clean help
 
 ## run: the shipped policy over the paper's seen and unseen instructions
 run: setup
@@ -56,6 +58,10 @@ train: $(VENV)/stamp
 ## export: runs/kitchen into models/kitchen.onnx
 export: $(VENV)/stamp
 	$(PY) -m lads_exporter export --run runs/kitchen -o models/kitchen.onnx
+
+## install: liblads.a, lads.h, lads.hpp, and their CMake and pkg-config files, into PREFIX (/usr/local)
+install:
+	runtime/ffi/install.sh "$(PREFIX)"
 
 ## bench: kernels, entries and the control step
 bench:

@@ -4,6 +4,8 @@
 //! - [`Workspace::new`] takes the caller's memory: [`Policy::arena_len`] and [`Policy::state_len`] elements.
 //! - [`Controller`] puts both to work: [`set_instruction`](Controller::set_instruction), then
 //!   [`step`](Controller::step) for every observation.
+//! - [`GuardedController`] puts a guard before it that watches the observations and the clock and limits the actions; what
+//!   drives a machine drives it through this one.
 //!
 //! Invariants: no `std`, no allocation, no unsafe code, no panic. Sizes (contract), weights (image) and mutable state
 //! (workspace) are three types. Everything about a model is checked when it is opened; afterwards only what the caller passes
@@ -57,6 +59,7 @@ mod decision;
 mod errors;
 mod exec;
 mod golden;
+mod guard;
 pub mod image;
 pub mod op;
 mod policy;
@@ -71,6 +74,10 @@ pub use decision::PlanIndex;
 pub use errors::{EncodeError, InstructionError, StepError};
 pub use exec::ExecError;
 pub use golden::Golden;
+pub use guard::{
+    ActionLength, Counters, Fallback, GuardConfig, GuardError, GuardReport, GuardedController,
+    Intervention, Limits, Tick,
+};
 pub use lads_kernels::Isa;
 pub use policy::{Policy, PolicyError};
 pub use program::{Program, ProgramError};

@@ -126,6 +126,11 @@ impl<'a> Policy<'a> {
         self.weights
     }
 
+    /// The image, without what lies behind it.
+    pub fn image(&self) -> &'a [u8] {
+        self.image
+    }
+
     /// Bytes of the image.
     pub fn image_bytes(&self) -> usize {
         self.image.len()

@@ -1,31 +1,32 @@
-//! The C boundary of the runtime: open a program image, build a controller in memory that the caller owns, step it.
+//! The C boundary of the runtime: open a program image, set up a guarded controller in memory of the caller, step it.
+//!
+//! C programs include `include/lads.h`, which is made from this crate, and link `liblads.a`; `make install PREFIX=...` makes both.
 //!
 //! ```c
-//! struct lads_policy_info info;
-//! lads_policy_open(image, image_bytes, &info);                 // 0, or lads_status_text(status)
-//! void  *memory = aligned_alloc(LADS_CONTROLLER_ALIGN, lads_controller_bytes());   // or static arrays
-//! float *arena  = malloc(info.arena_len * sizeof(float));
-//! float *state  = malloc(info.state_len * sizeof(float));
-//! lads_controller_init(memory, lads_controller_bytes(), &(struct lads_areas){ image, image_bytes, arena, info.arena_len, state, info.state_len });
-//! lads_self_test(memory, NULL);
-//! lads_set_instruction(memory, 3);
-//! for (;;) lads_step(memory, observation, info.observation_len, action, info.action_len, &report);
+//! static lads_policy policy;                                   // all memory is yours
+//! lads_status status = lads_policy_open(image, image_bytes, &policy);
+//! if (status != LADS_OK) fail(lads_status_text(status));
+//! void *workspace = aligned_alloc(LADS_WORKSPACE_ALIGN, lads_workspace_bytes(&policy));
+//! lads_controller *controller;
+//! lads_controller_init(&policy, workspace, lads_workspace_bytes(&policy), NULL, &controller);
+//! lads_self_test(controller, NULL);                            // arms
+//! lads_set_instruction(controller, 3);
+//! for (;;) {                                                   // every control period; `action` may always be executed
+//!     status = lads_step(controller, observation, n, &tick, action, m, NULL);
+//! }
 //! ```
 //!
 //! Rules for every function:
-//! - It returns a [`Status`], an `int32_t`; anything but 0 means that nothing has changed (what [`lads_set_instruction`] and
-//!   [`lads_self_test`] say differently apart).
-//! - It allocates nothing, never blocks, never unwinds. Null and misaligned pointers are refused.
-//! - It cannot check that a pointer is that of the memory it claims to be; that is the caller's part, and each function's
-//!   safety section says which.
-//! - One controller is used by one thread at a time; different controllers, even of one image, are independent.
-//!
-//! As a static library for a C program (`lads_panic` comes from that program, see `panic.rs`):
-//! `cargo rustc -p lads-ffi --release --features static-library --crate-type staticlib -- -C panic=abort`
+//! - It returns a [`Status`], an `int32_t`. What is refused changes nothing, unless the function says so.
+//! - It allocates nothing, never blocks, never unwinds, has no global state, and calls nothing but `memcpy` and `memset`.
+//! - Null and misaligned pointers, areas that overlap, and policies and controllers that were never set up are refused.
+//! - It cannot check that memory is what a pointer says; that is the caller's part, and each safety section says which.
+//! - One controller is used by one thread at a time. Different controllers, even of one policy, are independent.
 #![no_std]
 #![cfg_attr(
     not(test),
     deny(
+        clippy::arithmetic_side_effects,
         clippy::indexing_slicing,
         clippy::unwrap_used,
         clippy::expect_used,
@@ -33,85 +34,33 @@
     )
 )]
 
+mod handle;
+mod layout;
 mod memory;
 #[cfg(all(feature = "static-library", not(test)))]
 mod panic;
 mod status;
+mod types;
 
 use core::ffi::{c_char, c_void};
-use core::ptr;
+use core::ops::Range;
 
-use lads_core::{Controller, Decision, Instruction, Policy, Workspace};
+use lads_core::{Decision, Instruction, Intervention, Tick};
 
+use crate::handle::Handle;
+use crate::memory::{addresses, apart, check, get, give, read, zeroed};
+
+pub use layout::LADS_WORKSPACE_ALIGN;
 pub use status::Status;
+pub use types::*;
 
-/// Alignment of the memory for a controller, in bytes.
-pub const LADS_CONTROLLER_ALIGN: usize = 16;
+/// Version of this interface; it grows when a program compiled for an older header would no longer work.
+pub const LADS_ABI_VERSION: u32 = 1;
 
-const _: () = assert!(align_of::<Handle>() <= LADS_CONTROLLER_ALIGN);
-
-/// What lies in the memory of a controller. It borrows the image, the arena and the state for as long as it is used, which C
-/// promises and Rust calls `'static`.
-type Handle = Controller<'static, 'static>;
-
-/// Sizes of a policy and of the memory that it needs.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-#[repr(C)]
-pub struct PolicyInfo {
-    /// Elements of scratch memory (`float`).
-    pub arena_len: usize,
-    /// Elements of memory that survives a step (`float`).
-    pub state_len: usize,
-    /// Elements of an observation.
-    pub observation_len: usize,
-    /// Elements of an action.
-    pub action_len: usize,
-    /// Control steps from one decision to the next.
-    pub horizon: usize,
-    /// Entries of the codebook.
-    pub codebook_len: usize,
-    /// The most words of an instruction.
-    pub words_len: usize,
-    /// Elements of a word embedding.
-    pub word_dim: usize,
-    /// Instructions that the policy knows by number.
-    pub instruction_count: usize,
-    /// Control steps that a context holds.
-    pub context_steps: usize,
-    /// Time from one control step to the next, in seconds.
-    pub control_period_s: f32,
-}
-
-/// The memory that a controller uses as long as it exists.
-#[derive(Debug, Clone, Copy)]
-#[repr(C)]
-pub struct Areas {
-    /// Program image, aligned to 4 bytes (64 is better).
-    pub image: *const u8,
-    /// Bytes of the image.
-    pub image_bytes: usize,
-    /// [`PolicyInfo::arena_len`] elements.
-    pub arena: *mut f32,
-    /// Elements of the arena.
-    pub arena_len: usize,
-    /// [`PolicyInfo::state_len`] elements.
-    pub state: *mut f32,
-    /// Elements of the state.
-    pub state_len: usize,
-}
-
-/// What happened in a control step.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-#[repr(C)]
-pub struct Report {
-    /// Control steps since the context began.
-    pub timestep: u32,
-    /// The plan in force: an index into the codebook.
-    pub plan: u32,
-    /// 1 when this step decided the plan, else 0.
-    pub decided: u32,
-    /// The largest logit of the last decision minus the second largest.
-    pub margin: f32,
+/// `LADS_ABI_VERSION` of the archive: compare it with the header's.
+#[unsafe(no_mangle)]
+pub extern "C" fn lads_abi_version() -> u32 {
+    LADS_ABI_VERSION
 }
 
 /// Turns a result into the number that C gets.
@@ -119,114 +68,247 @@ fn status(result: Result<(), Status>) -> Status {
     result.err().unwrap_or(Status::Ok)
 }
 
-/// One line in English for a status; never null. The text is static.
+/// One line in English for a status; never null. The text is static and ends with a zero.
 #[unsafe(no_mangle)]
 pub extern "C" fn lads_status_text(status: i32) -> *const c_char {
-    let known = Status::ALL.iter().find(|&&known| known as i32 == status);
-    known
-        .map_or(c"unknown status", |known| known.text())
-        .as_ptr()
+    let known = Status::ALL
+        .iter()
+        .find(|(known, _)| *known as i32 == status);
+    known.map_or(c"unknown status", |(_, text)| text).as_ptr()
 }
 
-/// Bytes of memory for a controller, aligned to [`LADS_CONTROLLER_ALIGN`].
-#[unsafe(no_mangle)]
-pub extern "C" fn lads_controller_bytes() -> usize {
-    size_of::<Handle>()
-}
-
-/// Checks an image, its checksum included, and tells the sizes of its policy.
+/// Opens a program image: checks all of it, its checksum included, and copies nothing. The image is aligned to 4 bytes (64 is
+/// better); bytes behind its own length are ignored. After a failure `policy` holds no policy.
 ///
 /// # Safety
-/// `image` points to `image_bytes` readable bytes; `info` to a `PolicyInfo` that may be written.
+/// `image` points to `image_bytes` readable bytes that do not change as long as the policy or a controller of it is used;
+/// `policy` may be written, and stays where it is.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_policy_open(
     image: *const u8,
     image_bytes: usize,
-    info: *mut PolicyInfo,
+    policy: *mut LadsPolicy,
 ) -> Status {
-    // SAFETY: the caller guarantees the image.
-    let policy = match unsafe { open(image, image_bytes) } {
-        Ok(policy) if policy.checksum_matches() => policy,
-        Ok(_) => return Status::ImageChecksum,
-        Err(status) => return status,
-    };
-    let contract = policy.contract();
-    let sizes = PolicyInfo {
-        arena_len: policy.arena_len(),
-        state_len: policy.state_len(),
-        observation_len: contract.observation_len(),
-        action_len: contract.action_len(),
-        horizon: contract.horizon(),
-        codebook_len: contract.codebook_len(),
-        words_len: contract.words_len(),
-        word_dim: contract.word_dim(),
-        instruction_count: contract.instruction_count(),
-        context_steps: contract.context_steps(),
-        control_period_s: contract.control_period_s(),
-    };
-    // SAFETY: the caller guarantees that `info` may be written.
-    status(unsafe { give(info, sizes) })
+    // SAFETY: the caller guarantees both.
+    status(unsafe { handle::open(image, image_bytes, policy) })
 }
 
-/// Builds a controller in `memory`, which then is the handle that the other functions take. The arena and the state need not be
-/// initialised. Nothing has to be undone: to end the controller, stop using it.
+/// Tells what a policy expects and promises. The texts live as long as the image.
 ///
 /// # Safety
-/// `memory` points to `memory_bytes` writable bytes and `areas` to areas that are what they say. From now on, as long as the
-/// controller is used, the image does not change and nobody else uses the memory, the arena or the state.
+/// `policy` is null or a `lads_policy`, zeroed or opened; `contract` may be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn lads_policy_contract(
+    policy: *const LadsPolicy,
+    contract: *mut LadsContract,
+) -> Status {
+    // SAFETY: the caller guarantees both.
+    status(unsafe { handle::policy(policy).and_then(|p| give(contract, LadsContract::of(p))) })
+}
+
+/// Tells about element `index` of an observation: name, unit, joint, limits.
+///
+/// # Safety
+/// As `lads_policy_contract`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn lads_policy_observation(
+    policy: *const LadsPolicy,
+    index: usize,
+    element: *mut LadsElement,
+) -> Status {
+    // SAFETY: the caller guarantees both.
+    status(unsafe {
+        handle::policy(policy).and_then(|policy| {
+            let mut all = policy.contract().observations();
+            let found = all.nth(index).ok_or(Status::NoElement)?;
+            give(element, LadsElement::new(&found))
+        })
+    })
+}
+
+/// Tells about element `index` of an action: name, unit, joint, limits.
+///
+/// # Safety
+/// As `lads_policy_contract`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn lads_policy_action(
+    policy: *const LadsPolicy,
+    index: usize,
+    element: *mut LadsElement,
+) -> Status {
+    // SAFETY: the caller guarantees both.
+    status(unsafe {
+        handle::policy(policy).and_then(|policy| {
+            let mut all = policy.contract().actions();
+            let found = all.nth(index).ok_or(Status::NoElement)?;
+            give(element, LadsElement::new(&found))
+        })
+    })
+}
+
+/// Tells about an instruction that the policy knows, by its number.
+///
+/// # Safety
+/// As `lads_policy_contract`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn lads_policy_instruction(
+    policy: *const LadsPolicy,
+    number: u32,
+    instruction: *mut LadsInstruction,
+) -> Status {
+    // SAFETY: the caller guarantees both.
+    status(unsafe {
+        handle::policy(policy).and_then(|policy| {
+            let contract = policy.contract();
+            let found = contract.instruction(number as usize);
+            let found = found.ok_or(Status::UnknownInstruction)?;
+            give(
+                instruction,
+                LadsInstruction::new(&found, contract.word_dim()),
+            )
+        })
+    })
+}
+
+/// Finds the number of an instruction by its id or its text, byte for byte.
+///
+/// # Safety
+/// As `lads_policy_contract`; `name` points to `name_len` bytes, no zero needed; `number` may be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn lads_policy_find_instruction(
+    policy: *const LadsPolicy,
+    name: *const c_char,
+    name_len: usize,
+    number: *mut u32,
+) -> Status {
+    // SAFETY: the caller guarantees all three.
+    status(unsafe {
+        handle::policy(policy).and_then(|policy| {
+            let name = read(name.cast::<u8>(), name_len)?;
+            let mut all = policy.contract().instructions();
+            // Byte by byte: comparing slices would call `bcmp`, which not every C library has.
+            let is_it = |text: &str| text.bytes().eq(name.iter().copied());
+            let found = all.position(|known| is_it(known.id) || is_it(known.text));
+            let found = found.ok_or(Status::UnknownInstruction)?;
+            give(number, found as u32)
+        })
+    })
+}
+
+/// Bytes of workspace for one controller of a policy; 0 when the policy was not opened.
+///
+/// # Safety
+/// `policy` is null or a `lads_policy`, zeroed or opened.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn lads_workspace_bytes(policy: *const LadsPolicy) -> usize {
+    // SAFETY: the caller guarantees it.
+    let layout = unsafe { handle::policy(policy) }.and_then(|policy| handle::layout(policy));
+    layout.map_or(0, |layout| layout.total)
+}
+
+/// Sets up a controller with its guard in `workspace`, aligned to `LADS_WORKSPACE_ALIGN`, which need not be initialised.
+/// `options` may be null; so may `controller`, the handle for the other functions, which is the address of the workspace. It is
+/// not armed unless `LADS_ARM_WITHOUT_SELF_TEST` is set. To end it, stop using it: nothing has to be undone.
+///
+/// # Safety
+/// `policy` is null or a `lads_policy`, zeroed or opened; `workspace` points to `workspace_bytes` writable bytes that nobody
+/// else uses or moves as long as the controller is used; lists in the options are as long as an action; `controller` is null or
+/// may be written.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_controller_init(
-    memory: *mut c_void,
-    memory_bytes: usize,
-    areas: *const Areas,
+    policy: *const LadsPolicy,
+    workspace: *mut c_void,
+    workspace_bytes: usize,
+    options: *const LadsOptions,
+    controller: *mut *mut LadsController,
 ) -> Status {
+    if !controller.is_aligned() {
+        return Status::Misaligned;
+    }
     // SAFETY: the caller guarantees all of it.
-    status(unsafe { init(memory, memory_bytes, areas) })
+    status(unsafe {
+        handle::set_up(policy, workspace, workspace_bytes, options).and_then(|made| {
+            if controller.is_null() {
+                return Ok(());
+            }
+            give(controller, made)
+        })
+    })
 }
 
-/// Follows a known instruction, by its number, from the next step on: a new episode. [`Status::InstructFailed`], which a sound
-/// image never causes, leaves the controller without an instruction.
+/// Replays the recorded episode, compares plans and actions, and arms the controller if it passes, disarms it if not. Afterwards
+/// there is no instruction. `largest_error`, which may be null, gets the largest difference of an action element.
 ///
 /// # Safety
-/// `controller` was set up by [`lads_controller_init`], and no other call uses it now.
+/// `controller` is null or a workspace, zeroed or set up by `lads_controller_init`, and no other call uses it now;
+/// `largest_error` is null or may be written.
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn lads_set_instruction(controller: *mut c_void, id: u32) -> Status {
+pub unsafe extern "C" fn lads_self_test(
+    controller: *mut LadsController,
+    largest_error: *mut f32,
+) -> Status {
+    if !largest_error.is_aligned() {
+        return Status::Misaligned;
+    }
+    // SAFETY: the caller guarantees both.
+    status(unsafe {
+        handle::handle(controller).and_then(|handle| {
+            let passed = handle.guarded.self_test()?;
+            if largest_error.is_null() {
+                return Ok(());
+            }
+            give(largest_error, passed.largest_error)
+        })
+    })
+}
+
+/// Follows a known instruction, by its number, from the next step on: a new episode. `LADS_INSTRUCT_FAILED`, which a sound image
+/// never causes, leaves the controller without an instruction.
+///
+/// # Safety
+/// As `lads_self_test`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn lads_set_instruction(
+    controller: *mut LadsController,
+    number: u32,
+) -> Status {
     // SAFETY: the caller guarantees the controller.
-    let handle = unsafe { handle(controller) };
-    status(handle.and_then(|handle| {
-        handle
-            .set_instruction(Instruction::Id(id))
-            .map_err(Status::from)
+    status(unsafe { handle::handle(controller) }.and_then(|handle| {
+        handle.guarded.set_instruction(Instruction::Id(number))?;
+        Ok(())
     }))
 }
 
-/// Follows an instruction given as word embeddings, `len = n * word_dim` elements.
+/// Follows an instruction given as word embeddings, `len = n * word_dim` elements, as `lads_set_instruction` does.
 ///
 /// # Safety
-/// As [`lads_set_instruction`]; `words` points to `len` readable elements.
+/// As `lads_self_test`; `words` points to `len` readable elements outside the workspace.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_set_words(
-    controller: *mut c_void,
+    controller: *mut LadsController,
     words: *const f32,
     len: usize,
 ) -> Status {
     // SAFETY: the caller guarantees the controller and the words.
-    let given = unsafe { (handle(controller), memory::read(words, len)) };
-    status(match given {
-        (Ok(handle), Ok(words)) => handle
-            .set_instruction(Instruction::Words(words))
-            .map_err(Status::from),
-        (Err(status), _) | (_, Err(status)) => Err(status),
+    status(unsafe {
+        handle::handle(controller).and_then(|handle| {
+            if !apart(&handle.addresses(), &addresses(words, len)) {
+                return Err(Status::Overlap);
+            }
+            let words = read(words, len)?;
+            handle.guarded.set_instruction(Instruction::Words(words))?;
+            Ok(())
+        })
     })
 }
 
-/// Picks plans by argmax (`temperature` 0) or at random with the softmax of the logits over the temperature.
+/// Picks plans by argmax (`temperature` not above 0) or at random with the softmax of the logits over the temperature.
 ///
 /// # Safety
-/// As [`lads_set_instruction`].
+/// As `lads_self_test`.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_set_decision(
-    controller: *mut c_void,
+    controller: *mut LadsController,
     temperature: f32,
     seed: u64,
 ) -> Status {
@@ -236,200 +318,161 @@ pub unsafe extern "C" fn lads_set_decision(
         Decision::Argmax
     };
     // SAFETY: the caller guarantees the controller.
-    status(unsafe { handle(controller) }.map(|handle| handle.set_decision(rule)))
+    status(unsafe { handle::handle(controller) }.map(|handle| handle.guarded.set_decision(rule)))
 }
 
-/// One control step: writes the action for an observation. `report` may be null.
+/// One control period: writes an action that is finite and inside limits and rates, whatever the observation is. `LADS_OK` says
+/// that it is the policy's; any other status why it is the fallback's. A null `observation` says that there is none. `tick` may
+/// be null, then nothing is stale or late; so may `report`.
+///
+/// Only when the call itself is wrong, nothing happens and nothing is written: `controller` not set up, `action` of another
+/// length than the contract's, null or overlapping the workspace, `tick` or `report` misaligned.
 ///
 /// # Safety
-/// As [`lads_set_instruction`]; `observation` and `action` point to as many elements as they say, `action` to initialised ones
-/// that may be written; they do not overlap each other, the arena or the state.
+/// As `lads_self_test`; `observation` and `action` point to as many elements as they say; `tick` and `report` are null or may
+/// be read and written.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_step(
-    controller: *mut c_void,
+    controller: *mut LadsController,
     observation: *const f32,
     observation_len: usize,
+    tick: *const LadsTick,
     action: *mut f32,
     action_len: usize,
-    report: *mut Report,
+    report: *mut LadsReport,
 ) -> Status {
-    let areas = [
-        memory::addresses(observation, observation_len),
-        memory::addresses(action, action_len),
-    ];
-    if !memory::disjoint(&areas) {
+    // SAFETY: the caller guarantees the controller.
+    let handle = match unsafe { handle::handle(controller) } {
+        Ok(handle) => handle,
+        Err(status) => return status,
+    };
+    let output = addresses(action, action_len);
+    if !apart(&handle.addresses(), &output) {
         return Status::Overlap;
     }
-    // SAFETY: the caller guarantees the controller and both arrays.
-    let given = unsafe {
-        (
-            handle(controller),
-            memory::read(observation, observation_len),
-            memory::write(action, action_len),
-        )
-    };
-    let (handle, observation, action) = match given {
-        (Ok(handle), Ok(observation), Ok(action)) => (handle, observation, action),
-        (Err(status), ..) | (_, Err(status), _) | (.., Err(status)) => return status,
-    };
-    if !report.is_null() && !report.is_aligned() {
+    if !tick.is_aligned() || !report.is_aligned() {
         return Status::Misaligned;
     }
-    let made = match handle.step(observation, action) {
-        Ok(made) => made,
-        Err(error) => return error.into(),
+    if let Err(status) = check(action, action_len) {
+        return status;
+    }
+    if action_len != handle.guarded.controller().policy().contract().action_len() {
+        return Status::ActionLength;
+    }
+    // SAFETY: the caller guarantees all three.
+    let (input, tick, action) = unsafe {
+        (
+            input(handle, &output, observation, observation_len),
+            get(tick).ok(),
+            zeroed(action, action_len).unwrap_or_default(),
+        )
+    };
+    let tick = tick.map(|&LadsTick { timestamp, missed }| Tick { timestamp, missed });
+    let made = match input {
+        Ok(observation) => handle.guarded.step(observation, tick, action),
+        Err(_) => handle.guarded.step_blind(action),
+    };
+    let Ok(made) = made else {
+        return Status::ActionLength;
+    };
+    let why = match (made.intervention, input) {
+        (None, _) => Status::Ok,
+        (Some(Intervention::NoObservation), Err(wrong)) => wrong,
+        (Some(intervention), _) => intervention.into(),
     };
     if !report.is_null() {
-        let made = Report {
-            timestep: made.timestep,
-            plan: made.plan.0,
-            decided: u32::from(made.decided),
-            margin: made.margin,
-        };
         // SAFETY: not null and aligned; the caller guarantees that it may be written.
-        unsafe { report.write(made) };
+        unsafe { report.write(LadsReport::new(why, &made)) };
     }
-    Status::Ok
+    why
 }
 
-/// Tells what was really executed since the last step, where that is not the action that [`lads_step`] wrote.
+/// The observation of a step, or why there is none.
 ///
 /// # Safety
-/// As [`lads_set_instruction`]; `action` points to `action_len` readable elements.
+/// As [`lads_step`].
+unsafe fn input<'a>(
+    handle: &Handle,
+    output: &Range<usize>,
+    observation: *const f32,
+    len: usize,
+) -> Result<&'a [f32], Status> {
+    if observation.is_null() {
+        return Err(Status::NoObservation);
+    }
+    let used = addresses(observation, len);
+    if !apart(&used, output) || !apart(&used, &handle.addresses()) {
+        return Err(Status::Overlap);
+    }
+    // SAFETY: the caller guarantees the observation.
+    unsafe { read(observation, len) }
+}
+
+/// Tells what was really executed since the last step, where that is not the action that `lads_step` wrote; the next step
+/// continues from there.
+///
+/// # Safety
+/// As `lads_self_test`; `action` points to `action_len` readable elements outside the workspace.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_executed(
-    controller: *mut c_void,
+    controller: *mut LadsController,
     action: *const f32,
     action_len: usize,
 ) -> Status {
     // SAFETY: the caller guarantees the controller and the action.
-    let given = unsafe { (handle(controller), memory::read(action, action_len)) };
-    status(match given {
-        (Ok(handle), Ok(action)) => handle.executed(action).map_err(Status::from),
-        (Err(status), _) | (_, Err(status)) => Err(status),
+    status(unsafe {
+        handle::handle(controller).and_then(|handle| {
+            if !apart(&handle.addresses(), &addresses(action, action_len)) {
+                return Err(Status::Overlap);
+            }
+            handle.guarded.executed(read(action, action_len)?)?;
+            Ok(())
+        })
     })
 }
 
-/// Starts a new episode with the same instruction.
+/// Starts a new episode with the same instruction. A stop stays a stop.
 ///
 /// # Safety
-/// As [`lads_set_instruction`].
+/// As `lads_self_test`.
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn lads_reset(controller: *mut c_void) -> Status {
+pub unsafe extern "C" fn lads_reset(controller: *mut LadsController) -> Status {
     // SAFETY: the caller guarantees the controller.
-    status(unsafe { handle(controller) }.map(Handle::reset))
+    status(unsafe { handle::handle(controller) }.map(|handle| handle.guarded.reset()))
 }
 
-/// Replays the recorded episode and compares. Whatever the outcome, the controller is afterwards without an instruction.
-/// `largest_error`, which may be null, gets the largest difference of an action element if the test passes.
+/// Stops as `LADS_FALLBACK_STOP` does, from the next step on.
 ///
 /// # Safety
-/// As [`lads_set_instruction`]; `largest_error` is null or may be written.
+/// As `lads_self_test`.
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn lads_self_test(
-    controller: *mut c_void,
-    largest_error: *mut f32,
+pub unsafe extern "C" fn lads_stop(controller: *mut LadsController) -> Status {
+    // SAFETY: the caller guarantees the controller.
+    status(unsafe { handle::handle(controller) }.map(|handle| handle.guarded.stop()))
+}
+
+/// Ends a stop. The episode goes on where it was; `lads_reset` starts a new one.
+///
+/// # Safety
+/// As `lads_self_test`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn lads_resume(controller: *mut LadsController) -> Status {
+    // SAFETY: the caller guarantees the controller.
+    status(unsafe { handle::handle(controller) }.map(|handle| handle.guarded.resume()))
+}
+
+/// Tells what the guard has done since the controller was set up.
+///
+/// # Safety
+/// As `lads_self_test`; `counters` may be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn lads_counters(
+    controller: *mut LadsController,
+    counters: *mut LadsCounters,
 ) -> Status {
-    // SAFETY: the caller guarantees the controller.
-    let handle = match unsafe { handle(controller) } {
-        Ok(handle) => handle,
-        Err(status) => return status,
-    };
-    let passed = match handle.self_test() {
-        Ok(passed) => passed,
-        Err(error) => return error.into(),
-    };
-    if largest_error.is_null() {
-        return Status::Ok;
-    }
-    // SAFETY: the caller guarantees that a pointer that is not null may be written.
-    status(unsafe { give(largest_error, passed.largest_error) })
-}
-
-/// # Safety
-/// As [`lads_policy_open`], for as long as the policy is used.
-unsafe fn open(image: *const u8, image_bytes: usize) -> Result<Policy<'static>, Status> {
-    if image.is_null() {
-        return Err(Status::Null);
-    }
-    // SAFETY: the caller guarantees the image.
-    Ok(Policy::new_checked(unsafe {
-        memory::read(image, image_bytes)
-    }?)?)
-}
-
-/// # Safety
-/// As [`lads_controller_init`].
-unsafe fn init(
-    memory: *mut c_void,
-    memory_bytes: usize,
-    areas: *const Areas,
-) -> Result<(), Status> {
-    if memory.is_null() {
-        return Err(Status::Null);
-    }
-    if !memory.addr().is_multiple_of(LADS_CONTROLLER_ALIGN) {
-        return Err(Status::Misaligned);
-    }
-    if memory_bytes < size_of::<Handle>() {
-        return Err(Status::ControllerTooSmall);
-    }
-    // SAFETY: the caller guarantees the areas.
-    let [areas] = unsafe { memory::read(areas, 1) }? else {
-        return Err(Status::Null);
-    };
-    let used = [
-        memory::addresses(memory.cast::<u8>(), size_of::<Handle>()),
-        memory::addresses(areas.image, areas.image_bytes),
-        memory::addresses(areas.arena, areas.arena_len),
-        memory::addresses(areas.state, areas.state_len),
-    ];
-    if !memory::disjoint(&used) {
-        return Err(Status::Overlap);
-    }
-    // SAFETY: the caller guarantees that the image stays as it is while the controller is used.
-    let policy = unsafe { open(areas.image, areas.image_bytes) }?;
-    if areas.arena_len < policy.arena_len() || areas.state_len < policy.state_len() {
-        return Err(Status::WorkspaceTooSmall);
-    }
-    // SAFETY: the caller guarantees both; they do not overlap, as checked above.
-    let (arena, state) = unsafe {
-        (
-            memory::zeroed(areas.arena, areas.arena_len)?,
-            memory::zeroed(areas.state, areas.state_len)?,
-        )
-    };
-    let workspace = Workspace::new(&policy, arena, state).map_err(|_| Status::WorkspaceTooSmall)?;
-    let controller = Controller::new(policy, workspace);
-    // SAFETY: not null, aligned and large enough, as checked above; the caller guarantees that it may be written.
-    unsafe { memory.cast::<Handle>().write(controller) };
-    Ok(())
-}
-
-/// The controller behind a pointer.
-///
-/// # Safety
-/// `controller` is null or was set up by [`lads_controller_init`], and nobody else uses it during `'c`.
-unsafe fn handle<'c>(controller: *mut c_void) -> Result<&'c mut Handle, Status> {
-    if !controller.addr().is_multiple_of(LADS_CONTROLLER_ALIGN) {
-        return Err(Status::Misaligned);
-    }
-    // SAFETY: aligned, and null becomes `None`; the rest is the caller's guarantee.
-    unsafe { controller.cast::<Handle>().as_mut() }.ok_or(Status::Null)
-}
-
-/// Writes a result of the call.
-///
-/// # Safety
-/// If the pointer is not null, a `T` may be written there.
-unsafe fn give<T>(to: *mut T, value: T) -> Result<(), Status> {
-    if to.is_null() {
-        return Err(Status::Null);
-    }
-    if !to.is_aligned() {
-        return Err(Status::Misaligned);
-    }
-    // SAFETY: not null and aligned; the caller guarantees that it may be written.
-    unsafe { ptr::write(to, value) };
-    Ok(())
+    // SAFETY: the caller guarantees both.
+    status(unsafe {
+        handle::handle(controller)
+            .and_then(|handle| give(counters, handle.guarded.counters().into()))
+    })
 }

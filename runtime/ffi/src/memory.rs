@@ -1,12 +1,12 @@
 //! From C's pointer and length to a slice: what can be checked is checked here, what cannot is the caller's promise.
 
 use core::ops::Range;
-use core::slice;
+use core::{ptr, slice};
 
 use crate::status::Status;
 
 /// Checks that a pointer may be that of `len` elements: not null, aligned, no longer than memory can be.
-fn check<T>(pointer: *const T, len: usize) -> Result<(), Status> {
+pub fn check<T>(pointer: *const T, len: usize) -> Result<(), Status> {
     if pointer.is_null() {
         return Err(Status::Null);
     }
@@ -33,17 +33,29 @@ pub unsafe fn read<'a, T>(pointer: *const T, len: usize) -> Result<&'a [T], Stat
     Ok(unsafe { slice::from_raw_parts(pointer, len) })
 }
 
-/// `len` elements to read and write, their old values kept.
+/// `len` elements to read, or `None` for a null pointer.
 ///
 /// # Safety
-/// If the pointer is not null, `len` initialised elements are there, and nobody else uses them during `'a`.
-pub unsafe fn write<'a, T>(pointer: *mut T, len: usize) -> Result<&'a mut [T], Status> {
-    if len == 0 {
-        return Ok(&mut []);
+/// As [`read`].
+pub unsafe fn read_optional<'a, T>(
+    pointer: *const T,
+    len: usize,
+) -> Result<Option<&'a [T]>, Status> {
+    if pointer.is_null() {
+        return Ok(None);
     }
-    check(pointer, len)?;
-    // SAFETY: checked above to be non-null, aligned and of a possible length; the caller guarantees the memory.
-    Ok(unsafe { slice::from_raw_parts_mut(pointer, len) })
+    // SAFETY: the caller guarantees it.
+    unsafe { read(pointer, len) }.map(Some)
+}
+
+/// The value behind a pointer.
+///
+/// # Safety
+/// If the pointer is not null, there is an initialised `T` that nobody writes during `'a`.
+pub unsafe fn get<'a, T>(pointer: *const T) -> Result<&'a T, Status> {
+    check(pointer, 1)?;
+    // SAFETY: checked above to be non-null and aligned; the caller guarantees the memory.
+    Ok(unsafe { &*pointer })
 }
 
 /// `len` elements of memory that need not be initialised; they become zero.
@@ -51,13 +63,27 @@ pub unsafe fn write<'a, T>(pointer: *mut T, len: usize) -> Result<&'a mut [T], S
 /// # Safety
 /// If the pointer is not null, `len` writable elements are there, and nobody else uses them during `'a`.
 pub unsafe fn zeroed<'a>(pointer: *mut f32, len: usize) -> Result<&'a mut [f32], Status> {
-    if len != 0 {
-        check(pointer, len)?;
-        // SAFETY: checked above; the caller guarantees that the memory is writable. All bits zero is the number zero.
-        unsafe { pointer.write_bytes(0, len) };
+    if len == 0 {
+        return Ok(&mut []);
     }
-    // SAFETY: initialised just now; the rest is the caller's guarantee.
-    unsafe { write(pointer, len) }
+    check(pointer, len)?;
+    // SAFETY: checked above to be non-null, aligned and of a possible length; the caller guarantees that the memory is writable
+    // and nobody else's. All bits zero is the number zero.
+    unsafe {
+        pointer.write_bytes(0, len);
+        Ok(slice::from_raw_parts_mut(pointer, len))
+    }
+}
+
+/// Writes a result of the call.
+///
+/// # Safety
+/// If the pointer is not null, a `T` may be written there.
+pub unsafe fn give<T>(to: *mut T, value: T) -> Result<(), Status> {
+    check(to, 1)?;
+    // SAFETY: not null and aligned; the caller guarantees that it may be written.
+    unsafe { ptr::write(to, value) };
+    Ok(())
 }
 
 /// The addresses of `len` elements.
@@ -66,11 +92,7 @@ pub fn addresses<T>(pointer: *const T, len: usize) -> Range<usize> {
     start..start.saturating_add(len.saturating_mul(size_of::<T>()))
 }
 
-/// True when no two of the ranges share an address.
-pub fn disjoint(ranges: &[Range<usize>]) -> bool {
-    let apart = |a: &Range<usize>, b: &Range<usize>| a.end <= b.start || b.end <= a.start;
-    ranges
-        .iter()
-        .enumerate()
-        .all(|(i, a)| ranges.iter().skip(i + 1).all(|b| apart(a, b)))
+/// True when the ranges share no address.
+pub fn apart(a: &Range<usize>, b: &Range<usize>) -> bool {
+    a.end <= b.start || b.end <= a.start
 }

@@ -1,20 +1,20 @@
-//! The panic handler of the static library.
+//! The panic handler of the static library, which nothing reaches.
 //!
-//! The runtime has no code that panics on purpose, and what the compiler leaves of bounds checks is not reachable with checked
-//! images; but a library without `std` has to say what a panic does. It calls `lads_panic`, which the integrator defines:
-//! stop the motors and do not return.
+//! Core, kernels and this crate have no panic that the optimised build keeps. The handler that Rust asks for all the same refers
+//! to a symbol that nobody defines: where a panic could be reached, linking the archive would fail, and building it does
+//! (`runtime/ffi/archive.sh` drops what is not reachable and then looks for the symbol).
 
 use core::panic::PanicInfo;
 
 unsafe extern "C" {
-    /// Defined by the integrator: bring the machine to a safe state, never return.
-    fn lads_panic() -> !;
+    /// Does not exist.
+    fn lads_a_panic_is_reachable() -> !;
 }
 
 #[panic_handler]
 fn panic(_: &PanicInfo) -> ! {
-    // SAFETY: the integrator guarantees a function of this name and signature that never returns.
-    unsafe { lads_panic() }
+    // SAFETY: a program with this call in it does not link.
+    unsafe { lads_a_panic_is_reachable() }
 }
 
 /// The precompiled `core` refers to this symbol on hosted targets, where it was built to unwind. Nothing calls it: panics abort.

@@ -1,0 +1,255 @@
+//! A controller behind a guard.
+
+use super::limiter::{Changed, Limiter};
+use super::{
+    ActionLength, Counters, Fallback, GuardConfig, GuardError, GuardReport, Intervention, Tick,
+};
+use crate::contract::Decision;
+use crate::controller::{Controller, Instruction, StepReport};
+use crate::errors::{InstructionError, StepError};
+use crate::policy::Policy;
+use crate::self_test::{SelfTest, SelfTestError};
+
+/// A [`Controller`] whose inputs are watched and whose output is limited. See the module's description for what it promises.
+///
+/// ```no_run
+/// # use lads_core::{Controller, GuardConfig, GuardedController, Instruction, Tick};
+/// # fn run(controller: Controller) -> Result<(), Box<dyn std::error::Error>> {
+/// let mut memory = vec![0.0; GuardedController::memory_len(controller.policy())];
+/// let mut guarded = GuardedController::new(controller, &GuardConfig::default(), &mut memory)?;
+/// guarded.self_test()?; // arms
+/// guarded.set_instruction(Instruction::Id(0))?;
+/// # let (observation, mut action, timestamp) = ([0.0; 60], [0.0; 9], 0);
+/// let tick = Tick { timestamp, missed: 0 };
+/// let report = guarded.step(&observation, Some(tick), &mut action)?; // `action` may go to the motors, whatever the report says
+/// # Ok(())
+/// # }
+/// ```
+#[derive(Debug)]
+pub struct GuardedController<'a, 'm> {
+    controller: Controller<'a, 'm>,
+    limiter: Limiter<'m>,
+    fallback: Fallback,
+    /// Of what is left, per period, when decaying.
+    share: f32,
+    late_after: u32,
+    stop_after: u32,
+    armed: bool,
+    stopped: bool,
+    /// Interventions since the last action of the policy.
+    in_a_row: u32,
+    timestamp: Option<u64>,
+    counters: Counters,
+}
+
+impl<'a, 'm> GuardedController<'a, 'm> {
+    /// Elements of memory that the guard needs besides the controller's workspace.
+    pub fn memory_len(policy: &Policy) -> usize {
+        Limiter::memory_len(policy.contract().action_len())
+    }
+
+    /// Puts a guard before a controller. It is not armed.
+    pub fn new(
+        controller: Controller<'a, 'm>,
+        config: &GuardConfig,
+        memory: &'m mut [f32],
+    ) -> Result<Self, GuardError> {
+        let contract = controller.policy().contract();
+        let share = match config.fallback {
+            Fallback::Decay { time_constant_s } => {
+                if !time_constant_s.is_finite() || time_constant_s <= 0.0 {
+                    return Err(GuardError::TimeConstant);
+                }
+                contract.control_period_s() / (contract.control_period_s() + time_constant_s)
+            }
+            Fallback::Stop | Fallback::Hold => 1.0,
+        };
+        Ok(Self {
+            limiter: Limiter::new(&contract, &config.limits, memory)?,
+            controller,
+            fallback: config.fallback,
+            share,
+            late_after: config.late_after,
+            stop_after: config.stop_after,
+            armed: false,
+            stopped: false,
+            in_a_row: 0,
+            timestamp: None,
+            counters: Counters::default(),
+        })
+    }
+
+    /// The controller behind the guard.
+    pub fn controller(&self) -> &Controller<'a, 'm> {
+        &self.controller
+    }
+
+    /// Replays the recorded episode and arms if it passes, disarms if it does not. Afterwards there is no instruction.
+    pub fn self_test(&mut self) -> Result<SelfTest, SelfTestError> {
+        let outcome = self.controller.self_test();
+        self.armed = outcome.is_ok();
+        outcome
+    }
+
+    /// Arms without a self-test. Whoever calls this vouches for the policy on this machine.
+    pub fn arm_untested(&mut self) {
+        self.armed = true;
+    }
+
+    /// Whether the policy's actions are let through.
+    pub fn is_armed(&self) -> bool {
+        self.armed
+    }
+
+    /// Stops as [`Fallback::Stop`] does, from the next step on.
+    pub fn stop(&mut self) {
+        self.stopped = true;
+    }
+
+    /// Whether it is stopped.
+    pub fn is_stopped(&self) -> bool {
+        self.stopped
+    }
+
+    /// Ends a stop. The episode goes on where it was; [`reset`](Self::reset) starts a new one.
+    pub fn resume(&mut self) {
+        self.stopped = false;
+        self.in_a_row = 0;
+    }
+
+    /// What the guard has done so far.
+    pub fn counters(&self) -> Counters {
+        self.counters
+    }
+
+    /// As [`Controller::set_instruction`].
+    pub fn set_instruction(&mut self, instruction: Instruction) -> Result<(), InstructionError> {
+        self.controller.set_instruction(instruction)
+    }
+
+    /// As [`Controller::set_decision`].
+    pub fn set_decision(&mut self, decision: Decision) {
+        self.controller.set_decision(decision);
+    }
+
+    /// As [`Controller::reset`]. A stop stays a stop.
+    pub fn reset(&mut self) {
+        self.controller.reset();
+    }
+
+    /// As [`Controller::executed`]; the rate counts from there. What the guard itself has changed it has told the controller.
+    pub fn executed(&mut self, action: &[f32]) -> Result<(), StepError> {
+        self.controller.executed(action)?;
+        self.limiter.executed(action);
+        Ok(())
+    }
+
+    /// One control period: writes an action that may be executed, whatever the report says. Without a tick, an observation is
+    /// neither stale nor late.
+    pub fn step(
+        &mut self,
+        observation: &[f32],
+        tick: Option<Tick>,
+        action: &mut [f32],
+    ) -> Result<GuardReport, ActionLength> {
+        self.fits(action)?;
+        let outcome = self
+            .watch(tick)
+            .and_then(|()| self.advance(observation, action));
+        Ok(self.conclude(outcome, action))
+    }
+
+    /// One control period without an observation.
+    pub fn step_blind(&mut self, action: &mut [f32]) -> Result<GuardReport, ActionLength> {
+        self.fits(action)?;
+        let outcome = self.watch(None).and(Err(Intervention::NoObservation));
+        Ok(self.conclude(outcome, action))
+    }
+
+    fn fits(&self, action: &[f32]) -> Result<(), ActionLength> {
+        let (got, needed) = (action.len(), self.limiter.last().len());
+        if got == needed {
+            Ok(())
+        } else {
+            Err(ActionLength { got, needed })
+        }
+    }
+
+    /// Everything that can be wrong before the observation is looked at.
+    fn watch(&mut self, tick: Option<Tick>) -> Result<(), Intervention> {
+        let missed = tick.map_or(0, |tick| tick.missed);
+        self.counters.missed = self.counters.missed.saturating_add(u64::from(missed));
+        let stale = tick.is_some_and(|tick| {
+            let last = self.timestamp;
+            self.timestamp = last.max(Some(tick.timestamp));
+            last.is_some_and(|last| tick.timestamp <= last)
+        });
+        if !self.armed {
+            Err(Intervention::NotArmed)
+        } else if self.stopped {
+            Err(Intervention::Stopped)
+        } else if stale {
+            Err(Intervention::Stale)
+        } else if missed > self.late_after {
+            Err(Intervention::Late { missed })
+        } else {
+            Ok(())
+        }
+    }
+
+    fn advance(
+        &mut self,
+        observation: &[f32],
+        action: &mut [f32],
+    ) -> Result<StepReport, Intervention> {
+        self.controller
+            .step(observation, action)
+            .map_err(Intervention::Refused)
+    }
+
+    /// Writes what goes out, counts, and tells the controller what really happens.
+    fn conclude(
+        &mut self,
+        outcome: Result<StepReport, Intervention>,
+        action: &mut [f32],
+    ) -> GuardReport {
+        let changed = match outcome {
+            Ok(_) => {
+                self.in_a_row = 0;
+                self.limiter.write(action)
+            }
+            Err(intervention) => self.intervene(intervention, action),
+        };
+        let report = GuardReport {
+            step: outcome.ok(),
+            intervention: outcome.err(),
+            saturated: changed.saturated,
+            rate_limited: changed.rate_limited,
+        };
+        self.counters.add(&report);
+        // Fails before the first step of an episode, when there is no token of an action yet.
+        let _ = self.controller.executed(action);
+        report
+    }
+
+    fn intervene(&mut self, intervention: Intervention, action: &mut [f32]) -> Changed {
+        // Nothing is wrong yet, or has already been dealt with.
+        let waits = matches!(
+            intervention,
+            Intervention::NotArmed
+                | Intervention::Stopped
+                | Intervention::Refused(StepError::NoInstruction)
+        );
+        if !waits {
+            self.in_a_row = self.in_a_row.saturating_add(1);
+            let enough = self.stop_after > 0 && self.in_a_row >= self.stop_after;
+            self.stopped |= enough || matches!(self.fallback, Fallback::Stop);
+        }
+        let share = match self.fallback {
+            _ if waits || self.stopped => 1.0,
+            Fallback::Hold => 0.0,
+            Fallback::Stop | Fallback::Decay { .. } => self.share,
+        };
+        self.limiter.write_towards_safe(share, action)
+    }
+}

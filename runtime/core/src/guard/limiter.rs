@@ -1,0 +1,266 @@
+//! The arithmetic of a guard: limits, rates, the way to the safe action.
+//!
+//! Invariants of a [`Limiter`]: its last action is finite and inside the limits; the safe action too. [`Limiter::write`] keeps
+//! both, and the distance to the last action, compared exactly (in `f64`), never exceeds rate times period.
+
+use lads_kernels::assign;
+
+use super::GuardError;
+use crate::contract::{Contract, Element};
+
+/// What a guard keeps an action inside of; each list has one value per element of the action.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Limits<'c> {
+    /// Smallest values, where the contract's are not narrower.
+    pub min: Option<&'c [f32]>,
+    /// Largest values, where the contract's are not narrower.
+    pub max: Option<&'c [f32]>,
+    /// Largest change, in units of the action per second; none unless given.
+    pub max_rate: Option<&'c [f32]>,
+    /// Where to go when nothing else is known, and where the first action starts from; unless given, zero or the limit nearest
+    /// to it.
+    pub safe_action: Option<&'c [f32]>,
+}
+
+/// How an action was changed on its way out.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Changed {
+    pub saturated: bool,
+    pub rate_limited: bool,
+}
+
+/// One element of the action.
+struct Slot<'s> {
+    min: f32,
+    max: f32,
+    /// The farthest from one action to the next; infinite for no limit.
+    max_step: f32,
+    safe: f32,
+    last: &'s mut f32,
+}
+
+/// Limits at work, in memory of the caller.
+#[derive(Debug)]
+pub(super) struct Limiter<'m> {
+    min: &'m mut [f32],
+    max: &'m mut [f32],
+    max_step: &'m mut [f32],
+    safe: &'m mut [f32],
+    last: &'m mut [f32],
+}
+
+impl<'m> Limiter<'m> {
+    /// Elements of memory for actions of `action_len` elements.
+    pub const fn memory_len(action_len: usize) -> usize {
+        action_len.saturating_mul(5)
+    }
+
+    pub fn new(
+        contract: &Contract,
+        limits: &Limits,
+        memory: &'m mut [f32],
+    ) -> Result<Self, GuardError> {
+        let (got, needed) = (memory.len(), Self::memory_len(contract.action_len()));
+        let mut limiter =
+            Self::split(memory, contract.action_len()).ok_or(GuardError::Memory { got, needed })?;
+        limiter.configure(contract, limits)?;
+        Ok(limiter)
+    }
+
+    fn split(memory: &'m mut [f32], len: usize) -> Option<Self> {
+        let (min, memory) = memory.split_at_mut_checked(len)?;
+        let (max, memory) = memory.split_at_mut_checked(len)?;
+        let (max_step, memory) = memory.split_at_mut_checked(len)?;
+        let (safe, memory) = memory.split_at_mut_checked(len)?;
+        let (last, _) = memory.split_at_mut_checked(len)?;
+        Some(Self {
+            min,
+            max,
+            max_step,
+            safe,
+            last,
+        })
+    }
+
+    fn configure(&mut self, contract: &Contract, limits: &Limits) -> Result<(), GuardError> {
+        let needed = contract.action_len();
+        for list in [limits.min, limits.max, limits.max_rate, limits.safe_action] {
+            let got = list.map_or(needed, <[f32]>::len);
+            if got != needed {
+                return Err(GuardError::Length { got, needed });
+            }
+        }
+        let at = |list: Option<&[f32]>, index: usize| list.and_then(|l| l.get(index).copied());
+        let period = f64::from(contract.control_period_s());
+        let places = self
+            .min
+            .iter_mut()
+            .zip(self.max.iter_mut())
+            .zip(self.max_step.iter_mut())
+            .zip(self.safe.iter_mut());
+        for ((index, element), (((to_min, to_max), to_step), to_safe)) in
+            contract.actions().enumerate().zip(places)
+        {
+            let [min, max] = [at(limits.min, index), at(limits.max, index)];
+            let given = [min, max].into_iter().flatten().all(f32::is_finite);
+            let min = min.map_or(element.min, |min| min.max(element.min));
+            let max = max.map_or(element.max, |max| max.min(element.max));
+            if !given || min > max {
+                return Err(GuardError::Limits { index });
+            }
+            let rate = at(limits.max_rate, index);
+            if rate.is_some_and(|rate| !rate.is_finite() || rate <= 0.0) {
+                return Err(GuardError::Rate { index });
+            }
+            let inside = Element {
+                min,
+                max,
+                ..element
+            };
+            let safe = at(limits.safe_action, index).unwrap_or_else(|| inside.clamp(0.0));
+            if !safe.is_finite() || inside.clamp(safe) != safe {
+                return Err(GuardError::SafeAction { index });
+            }
+            *to_min = min;
+            *to_max = max;
+            *to_step = rate.map_or(f32::INFINITY, |rate| down(f64::from(rate) * period));
+            *to_safe = safe;
+        }
+        assign(self.last, self.safe);
+        Ok(())
+    }
+
+    /// The last action that was written.
+    pub fn last(&self) -> &[f32] {
+        self.last
+    }
+
+    /// Takes an action that somebody else has executed for the last one, as far as the limits allow.
+    pub fn executed(&mut self, action: &[f32]) {
+        for (slot, &value) in self.slots().zip(action) {
+            if value.is_finite() {
+                *slot.last = within(value, slot.min, slot.max);
+            }
+        }
+    }
+
+    /// Replaces an action by the nearest one that the limits and the rates allow.
+    pub fn write(&mut self, action: &mut [f32]) -> Changed {
+        let mut changed = Changed::default();
+        for (slot, value) in self.slots().zip(action) {
+            // What is not a number never gets here; if it did, the last action would be the answer.
+            let wanted = if value.is_nan() { *slot.last } else { *value };
+            changed.saturated |= wanted <= slot.min || wanted >= slot.max;
+            let inside = within(wanted, slot.min, slot.max);
+            let reached = near(inside, *slot.last, slot.max_step);
+            changed.rate_limited |= reached != inside;
+            *slot.last = reached;
+            *value = reached;
+        }
+        changed
+    }
+
+    /// The way from the last action to the safe one: `share` of what is left, from 0 (none) to 1 (all).
+    pub fn write_towards_safe(&mut self, share: f32, action: &mut [f32]) -> Changed {
+        for (slot, value) in self.slots().zip(action.iter_mut()) {
+            *value = if share < 1.0 {
+                let [last, safe, share] = [*slot.last, slot.safe, share].map(f64::from);
+                (last + (safe - last) * share) as f32
+            } else {
+                slot.safe
+            };
+        }
+        let changed = self.write(action);
+        // The safe action may lie at a limit; that is nobody's fault.
+        Changed {
+            saturated: false,
+            ..changed
+        }
+    }
+
+    fn slots(&mut self) -> impl Iterator<Item = Slot<'_>> {
+        self.min
+            .iter()
+            .zip(self.max.iter())
+            .zip(self.max_step.iter())
+            .zip(self.safe.iter())
+            .zip(self.last.iter_mut())
+            .map(|((((&min, &max), &max_step), &safe), last)| Slot {
+                min,
+                max,
+                max_step,
+                safe,
+                last,
+            })
+    }
+}
+
+fn within(value: f32, min: f32, max: f32) -> f32 {
+    if value < min {
+        min
+    } else if value > max {
+        max
+    } else {
+        value
+    }
+}
+
+/// The value nearest to `wanted` that is no further than `step` from `last`.
+fn near(wanted: f32, last: f32, step: f32) -> f32 {
+    let (wide, from, step) = (f64::from(wanted), f64::from(last), f64::from(step));
+    if (wide - from).abs() <= step {
+        wanted
+    } else if wide > from {
+        down(from + step)
+    } else {
+        -down(step - from)
+    }
+}
+
+/// The largest `f32` that is not above `x`.
+fn down(x: f64) -> f32 {
+    let rounded = x as f32;
+    if f64::from(rounded) > x {
+        rounded.next_down()
+    } else {
+        rounded
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rounding_never_passes_the_step() {
+        let mut seed = 1_u32;
+        let mut next = || {
+            seed = seed.wrapping_mul(1664525).wrapping_add(1013904223);
+            f32::from_bits(seed)
+        };
+        let mut tried = 0;
+        while tried < 100_000 {
+            let [wanted, last, step] = [next(), next(), next().abs()];
+            if ![wanted, last, step].iter().all(|x| x.is_finite()) {
+                continue;
+            }
+            tried += 1;
+            let reached = near(wanted, last, step);
+            let [reached, from] = [reached, last].map(f64::from);
+            assert!(
+                (reached - from).abs() <= f64::from(step),
+                "{wanted} {last} {step}"
+            );
+            // It is on the way.
+            assert!((f64::from(wanted) - from) * (reached - from) >= 0.0);
+        }
+    }
+
+    #[test]
+    fn without_a_rate_everything_is_near() {
+        assert_eq!(near(f32::MAX, f32::MIN, f32::INFINITY), f32::MAX);
+        assert_eq!(near(1.0, 0.0, 0.25), 0.25);
+        assert_eq!(near(-1.0, 0.0, 0.25), -0.25);
+        assert_eq!(down(0.1), 0.099999994);
+    }
+}

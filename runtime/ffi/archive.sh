@@ -1,0 +1,36 @@
+#!/bin/sh
+# Builds liblads.a: one object that exports lads_* and nothing else, and that cannot panic.
+# usage: runtime/ffi/archive.sh <output file> [<target>]
+# Needs cargo and binutils; for another target set LD, OBJCOPY, AR and NM to its tools.
+set -eu
+output=$1
+target=${2:-}
+root=$(cd "$(dirname "$0")/../.." && pwd)
+: "${LD:=ld}" "${OBJCOPY:=objcopy}" "${AR:=ar}" "${NM:=nm}" "${CARGO:=cargo}"
+
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT INT TERM
+case $output in /*) ;; *) output=$PWD/$output ;; esac
+mkdir -p "$(dirname "$output")"
+
+build=${CARGO_TARGET_DIR:-$root/target}/archive-build
+(cd "$root" && "$CARGO" rustc --quiet --locked -p lads-ffi --profile archive --features static-library \
+    --crate-type staticlib --target-dir "$build" ${target:+--target "$target"})
+
+# Beside the crate's own object, a staticlib carries all of Rust's compiler builtins; the linker takes from it what is used.
+# What only a panic would reach is dropped: no root leads there.
+roots=$("$NM" --defined-only "$build/${target:+$target/}archive/liblads_ffi.a" 2>/dev/null |
+    sed -n 's/^[0-9a-f]* T \(lads_[a-z0-9_]*\)$/\1/p' | sort -u)
+[ -n "$roots" ] || { echo "archive.sh: the library exports no lads_ function" >&2; exit 1; }
+# shellcheck disable=SC2046
+"$LD" -r --gc-sections $(printf -- '-u %s ' $roots) -o "$work/lads.o" "$build/${target:+$target/}archive/liblads_ffi.a"
+"$OBJCOPY" --strip-debug --wildcard --keep-global-symbol='lads_*' "$work/lads.o"
+
+if "$NM" "$work/lads.o" | grep -E 'lads_a_panic_is_reachable|panicking|rust_begin_unwind' >"$work/panics"; then
+    echo "archive.sh: a panic is reachable:" >&2
+    cat "$work/panics" >&2
+    exit 1
+fi
+rm -f "$work/liblads.a"
+"$AR" rcs "$work/liblads.a" "$work/lads.o"
+mv "$work/liblads.a" "$output"

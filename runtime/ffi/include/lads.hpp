@@ -1,0 +1,194 @@
+/**
+ * lads.hpp: the C interface of lads.h for C++17. Header only; throws nothing, needs neither exceptions nor RTTI.
+ *
+ * A Policy is a checked view on an image; a Controller owns its workspace, or works in memory that it is lent. Nothing allocates
+ * but Controller::allocate, which is called once, before the loop. Both stay where they are: they cannot be copied or moved.
+ *
+ *     lads::Policy policy;
+ *     if (auto status = policy.open(image); !status) return fail(status.text());
+ *     lads::Controller controller;
+ *     if (auto status = controller.allocate(policy); !status) ...
+ *     if (auto status = controller.self_test(); !status) ...      // arms
+ *     controller.set_instruction("mkbh");
+ *     auto status = controller.step(observation, action, tick);   // every control period; `action` may always be executed
+ */
+#ifndef LADS_HPP
+#define LADS_HPP
+
+#include <cstddef>
+#include <cstdint>
+#include <new>
+#include <string_view>
+#include <type_traits>
+#include <utility>
+
+#include "lads.h"
+
+namespace lads {
+
+/** A view on elements of somebody else; made from anything with data() and size(), or from an array. */
+template <typename T>
+class Span {
+public:
+    constexpr Span() noexcept = default;
+    constexpr Span(T *data, std::size_t size) noexcept : data_(data), size_(size) {}
+    template <std::size_t N>
+    constexpr Span(T (&array)[N]) noexcept : data_(array), size_(N) {}
+    template <typename C, typename = std::enable_if_t<std::is_convertible_v<
+                              std::remove_pointer_t<decltype(std::declval<C &>().data())> (*)[], T (*)[]>>>
+    constexpr Span(C &&container) noexcept : data_(container.data()), size_(container.size()) {}
+
+    constexpr T *data() const noexcept { return data_; }
+    constexpr std::size_t size() const noexcept { return size_; }
+    constexpr T *begin() const noexcept { return data_; }
+    constexpr T *end() const noexcept { return data_ + size_; }
+    constexpr T &operator[](std::size_t index) const noexcept { return data_[index]; }
+
+private:
+    T *data_ = nullptr;
+    std::size_t size_ = 0;
+};
+
+/** What came of a call: true for good. */
+class [[nodiscard]] Status {
+public:
+    constexpr Status(lads_status code = LADS_STATUS_OK) noexcept : code_(code) {}
+    constexpr explicit operator bool() const noexcept { return code_ == LADS_STATUS_OK; }
+    constexpr lads_status code() const noexcept { return code_; }
+    const char *text() const noexcept { return lads_status_text(code_); }
+    friend constexpr bool operator==(Status a, Status b) noexcept { return a.code_ == b.code_; }
+    friend constexpr bool operator!=(Status a, Status b) noexcept { return !(a == b); }
+
+private:
+    lads_status code_;
+};
+
+/** A text inside the image. */
+inline std::string_view view(lads_text text) noexcept { return {text.data, text.len}; }
+
+/** A checked view on an image, which has to outlive it. */
+class Policy {
+public:
+    Policy() noexcept = default;
+    Policy(const Policy &) = delete;
+    Policy &operator=(const Policy &) = delete;
+
+    Status open(Span<const std::uint8_t> image) noexcept {
+        contract_ = {};
+        const Status status = lads_policy_open(image.data(), image.size(), &policy_);
+        return status ? Status(lads_policy_contract(&policy_, &contract_)) : status;
+    }
+
+    const lads_contract &contract() const noexcept { return contract_; }
+    std::size_t workspace_bytes() const noexcept { return lads_workspace_bytes(&policy_); }
+    const lads_policy *get() const noexcept { return &policy_; }
+
+    Status observation(std::size_t index, lads_element &element) const noexcept {
+        return lads_policy_observation(&policy_, index, &element);
+    }
+    Status action(std::size_t index, lads_element &element) const noexcept {
+        return lads_policy_action(&policy_, index, &element);
+    }
+    Status instruction(std::uint32_t number, lads_instruction &known) const noexcept {
+        return lads_policy_instruction(&policy_, number, &known);
+    }
+    /** By id or text, byte for byte. */
+    Status find_instruction(std::string_view name, std::uint32_t &number) const noexcept {
+        return lads_policy_find_instruction(&policy_, name.data(), name.size(), &number);
+    }
+
+private:
+    lads_policy policy_{};
+    lads_contract contract_{};
+};
+
+/** A controller with its guard. */
+class Controller {
+public:
+    Controller() noexcept = default;
+    Controller(const Controller &) = delete;
+    Controller &operator=(const Controller &) = delete;
+    ~Controller() { release(); }
+
+    /** Allocates a workspace and sets the controller up in it. */
+    Status allocate(const Policy &policy, const lads_options &options = {}) noexcept {
+        const std::size_t bytes = policy.workspace_bytes();
+        if (bytes == 0) {
+            return LADS_STATUS_NOT_SET_UP;
+        }
+        release();
+        owned_ = ::operator new(bytes, alignment, std::nothrow);
+        return owned_ == nullptr ? Status(LADS_STATUS_WORKSPACE_TOO_SMALL) : init(policy, owned_, bytes, options);
+    }
+
+    /** Sets the controller up in lent memory, aligned to LADS_WORKSPACE_ALIGN, which has to outlive it. */
+    Status use(const Policy &policy, void *workspace, std::size_t bytes, const lads_options &options = {}) noexcept {
+        release();
+        return init(policy, workspace, bytes, options);
+    }
+
+    /** Replays the recorded episode, and arms if it passes. */
+    Status self_test(float *largest_error = nullptr) noexcept { return lads_self_test(controller_, largest_error); }
+
+    Status set_instruction(std::uint32_t number) noexcept { return lads_set_instruction(controller_, number); }
+    Status set_instruction(std::string_view name) noexcept {
+        if (policy_ == nullptr) {
+            return LADS_STATUS_NULL;
+        }
+        std::uint32_t number = 0;
+        const Status status = policy_->find_instruction(name, number);
+        return status ? set_instruction(number) : status;
+    }
+    Status set_words(Span<const float> words) noexcept {
+        return lads_set_words(controller_, words.data(), words.size());
+    }
+    Status set_decision(float temperature, std::uint64_t seed) noexcept {
+        return lads_set_decision(controller_, temperature, seed);
+    }
+
+    /** One control period; see lads_step. */
+    Status step(Span<const float> observation, Span<float> action, const lads_tick &tick,
+                lads_report *report = nullptr) noexcept {
+        return lads_step(controller_, observation.data(), observation.size(), &tick, action.data(), action.size(), report);
+    }
+    /** The same without a clock: nothing is stale or late. */
+    Status step(Span<const float> observation, Span<float> action, lads_report *report = nullptr) noexcept {
+        return lads_step(controller_, observation.data(), observation.size(), nullptr, action.data(), action.size(), report);
+    }
+
+    Status executed(Span<const float> action) noexcept {
+        return lads_executed(controller_, action.data(), action.size());
+    }
+    Status reset() noexcept { return lads_reset(controller_); }
+    Status stop() noexcept { return lads_stop(controller_); }
+    Status resume() noexcept { return lads_resume(controller_); }
+    Status counters(lads_counters_t &counters) noexcept { return lads_counters(controller_, &counters); }
+
+    lads_controller *get() noexcept { return controller_; }
+
+private:
+    static constexpr std::align_val_t alignment{LADS_WORKSPACE_ALIGN};
+
+    Status init(const Policy &policy, void *workspace, std::size_t bytes, const lads_options &options) noexcept {
+        const Status status = lads_controller_init(policy.get(), workspace, bytes, &options, &controller_);
+        policy_ = status ? &policy : nullptr;
+        return status;
+    }
+
+    void release() noexcept {
+        controller_ = nullptr;
+        policy_ = nullptr;
+        if (owned_ != nullptr) {
+            ::operator delete(owned_, alignment, std::nothrow);
+            owned_ = nullptr;
+        }
+    }
+
+    void *owned_ = nullptr;
+    const Policy *policy_ = nullptr;
+    lads_controller *controller_ = nullptr;
+};
+
+} // namespace lads
+
+#endif // LADS_HPP

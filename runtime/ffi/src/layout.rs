@@ -1,0 +1,44 @@
+//! How a workspace is divided: the controller's own memory, then arena, state and the guard's memory, each on a cache line.
+
+use core::ffi::c_void;
+
+use lads_core::{GuardedController, Policy};
+
+/// Alignment of a workspace, in bytes: a cache line, which is also the widest vector.
+pub const LADS_WORKSPACE_ALIGN: usize = 64;
+
+/// Offsets in bytes.
+#[derive(Debug, Clone, Copy)]
+pub struct Layout {
+    pub arena: usize,
+    pub state: usize,
+    pub guard: usize,
+    pub total: usize,
+}
+
+impl Layout {
+    /// The division for a policy; `None` when it needs more than there are addresses.
+    pub fn of(policy: &Policy, handle: usize) -> Option<Self> {
+        let after = |start: usize, elements: usize| {
+            start
+                .checked_add(elements.checked_mul(size_of::<f32>())?)?
+                .checked_next_multiple_of(LADS_WORKSPACE_ALIGN)
+        };
+        let arena = handle.checked_next_multiple_of(LADS_WORKSPACE_ALIGN)?;
+        let state = after(arena, policy.arena_len())?;
+        let guard = after(state, policy.state_len())?;
+        let total = after(guard, GuardedController::memory_len(policy))?;
+        isize::try_from(total).ok()?;
+        Some(Self {
+            arena,
+            state,
+            guard,
+            total,
+        })
+    }
+}
+
+/// The elements at an offset of a workspace.
+pub fn at(workspace: *mut c_void, offset: usize) -> *mut f32 {
+    workspace.wrapping_byte_add(offset).cast()
+}

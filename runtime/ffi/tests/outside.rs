@@ -1,0 +1,272 @@
+//! What a user of the installed library gets: the archive's symbols and size, and programs in C and C++ that are built outside
+//! the tree, through pkg-config and `CMake`, as strictly as compilers can, and that pass the shipped policy's self-test.
+
+use std::ffi::OsStr;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::OnceLock;
+
+use lads_compiler::{Bundle, Image, compile};
+
+/// What an archive may ask of its environment: the functions that compilers call on their own.
+const ENVIRONMENT: [&str; 2] = ["memcpy", "memset"];
+
+const STRICT: [&str; 4] = ["-Wall", "-Wextra", "-Werror", "-pedantic"];
+
+/// Bytes of machine code and constants in a stripped program, at most.
+const MOST_TEXT: usize = 200 * 1024;
+
+fn crate_path(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
+}
+
+fn scratch(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_TARGET_TMPDIR")).join(path)
+}
+
+/// The installed library.
+fn prefix() -> &'static Path {
+    static PREFIX: OnceLock<PathBuf> = OnceLock::new();
+    PREFIX.get_or_init(|| {
+        let prefix = scratch("prefix");
+        let _ = fs::remove_dir_all(&prefix);
+        run(Command::new(crate_path("install.sh")).arg(&prefix));
+        prefix
+    })
+}
+
+/// The shipped policy's image, in a file.
+fn kitchen() -> &'static Path {
+    static IMAGE: OnceLock<PathBuf> = OnceLock::new();
+    IMAGE.get_or_init(|| {
+        let path = scratch("kitchen.lads");
+        fs::write(&path, compiled("../../models/kitchen.onnx").as_bytes())
+            .expect("it can be written");
+        path
+    })
+}
+
+fn compiled(bundle: &str) -> Image {
+    let bundle = Bundle::open(&crate_path(bundle)).expect("the bundle is sound");
+    compile(&bundle).expect("it compiles")
+}
+
+/// Runs a command that has to succeed.
+fn run(command: &mut Command) -> String {
+    let Output {
+        status,
+        stdout,
+        stderr,
+    } = command
+        .output()
+        .unwrap_or_else(|e| panic!("{command:?}: {e}"));
+    let [stdout, stderr] = [stdout, stderr].map(|text| String::from_utf8_lossy(&text).into_owned());
+    assert!(status.success(), "{command:?}: {status}\n{stdout}{stderr}");
+    stdout
+}
+
+/// Whether a program is there; says that the test is skipped if not.
+fn have(program: &str) -> bool {
+    let there = Command::new(program).arg("--version").output().is_ok();
+    if !there {
+        eprintln!("skipped: {program} is not installed");
+    }
+    there
+}
+
+/// `nm`'s lines: kind and name.
+fn symbols(path: &Path, options: &[&str]) -> Vec<(char, String)> {
+    let listing = run(Command::new("nm").args(options).arg(path));
+    let lines = listing.lines().filter_map(|line| {
+        let mut words = line.split_whitespace().rev();
+        let (name, kind) = (words.next()?, words.next()?);
+        (kind.len() == 1).then(|| (kind.chars().next().unwrap_or(' '), name.to_owned()))
+    });
+    lines.collect()
+}
+
+/// Compiles and links one source with the flags of pkg-config.
+fn build(compiler: &str, source: &str, name: &str, flags: &[&str]) -> PathBuf {
+    let root = prefix().display();
+    let pkg_config = if have("pkg-config") {
+        run(Command::new("pkg-config")
+            .args(["--cflags", "--libs", "lads"])
+            .env("PKG_CONFIG_PATH", prefix().join("lib/pkgconfig")))
+    } else {
+        format!("-I{root}/include -L{root}/lib -llads")
+    };
+    let program = scratch(name);
+    run(Command::new(compiler)
+        .args(STRICT)
+        .args(flags)
+        .arg(crate_path("tests/outside").join(source))
+        .arg("-o")
+        .arg(&program)
+        .args(pkg_config.split_whitespace()));
+    program
+}
+
+#[test]
+fn the_archive_exports_lads_functions_and_asks_for_nothing_else() {
+    let archive = prefix().join("lib/liblads.a");
+    let header = fs::read_to_string(prefix().join("include/lads.h")).expect("it is installed");
+    let all = symbols(&archive, &[]);
+    let exported = symbols(&archive, &["--extern-only", "--defined-only"]);
+    assert!(exported.len() > 15, "{exported:?}");
+    for (_, name) in &exported {
+        assert!(name.starts_with("lads_"), "{name} is exported");
+        assert!(
+            header.contains(&format!("{name}(")),
+            "{name} is not in lads.h"
+        );
+    }
+    for (kind, name) in &all {
+        let asked = *kind == 'U' && !exported.iter().any(|(_, defined)| defined == name);
+        assert!(
+            !asked || ENVIRONMENT.contains(&name.as_str()),
+            "the archive asks for {name}"
+        );
+        for panicking in [
+            "panicking",
+            "begin_unwind",
+            "panic_is_reachable",
+            "slice_index",
+            "unwrap_failed",
+        ] {
+            assert!(!name.contains(panicking), "{name} is in the archive");
+        }
+    }
+}
+
+#[test]
+fn a_c_program_links_without_panics_and_stays_small() {
+    let program = build("cc", "c/main.c", "user_c", &["-std=c99", "-O2"]);
+    let printed = run(Command::new(&program).arg(kitchen()));
+    assert!(
+        printed.contains("franka-kitchen") && printed.contains("100 steps, 1 fallback"),
+        "{printed}"
+    );
+    for (_, name) in symbols(&program, &[]) {
+        assert!(
+            !name.contains("panic") && !name.contains("unwind"),
+            "{name} is linked"
+        );
+    }
+    run(Command::new("strip").arg(&program));
+    let sizes = run(Command::new("size").arg(&program));
+    let text: usize = sizes
+        .lines()
+        .nth(1)
+        .and_then(|line| line.split_whitespace().next()?.parse().ok())
+        .expect("size prints a table");
+    println!("text of the stripped program: {text} bytes");
+    assert!(
+        text <= MOST_TEXT,
+        "text has {text} bytes, at most {MOST_TEXT}"
+    );
+}
+
+#[test]
+fn a_cpp_program_builds_without_exceptions() {
+    if !have("c++") {
+        return;
+    }
+    let flags = ["-std=c++17", "-O2", "-fno-exceptions", "-fno-rtti"];
+    let program = build("c++", "cpp/main.cpp", "user_cpp", &flags);
+    let printed = run(Command::new(&program).arg(kitchen()));
+    assert!(printed.contains("100 steps"), "{printed}");
+}
+
+#[test]
+fn the_headers_need_nothing_before_them() {
+    let include = prefix().join("include");
+    for (compiler, standard, header) in [
+        ("cc", "-std=c99", "lads.h"),
+        ("c++", "-std=c++17", "lads.h"),
+        ("c++", "-std=c++17", "lads.hpp"),
+    ] {
+        if !have(compiler) {
+            continue;
+        }
+        let language = if compiler == "cc" { "c" } else { "c++" };
+        let source = scratch(&format!("alone.{header}.{language}"));
+        fs::write(&source, format!("#include <{header}>\n")).expect("it can be written");
+        run(Command::new(compiler)
+            .args(STRICT)
+            .args([standard, "-x", language, "-fsyntax-only", "-I"])
+            .arg(&include)
+            .arg(&source));
+    }
+}
+
+#[test]
+fn a_project_outside_the_tree_builds_through_cmake() {
+    if !have("cmake") || !have("c++") {
+        return;
+    }
+    let build = scratch("cmake");
+    let _ = fs::remove_dir_all(&build);
+    run(Command::new("cmake")
+        .arg("-S")
+        .arg(crate_path("tests/outside"))
+        .arg("-B")
+        .arg(&build)
+        .arg(format!("-DCMAKE_PREFIX_PATH={}", prefix().display())));
+    run(Command::new("cmake").arg("--build").arg(&build));
+    for user in ["user_c", "user_cpp"] {
+        run(Command::new(build.join(user)).arg(kitchen()));
+    }
+}
+
+#[test]
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+fn no_c_library_is_needed() {
+    let image = compiled("../compiler/tests/data/tiny.onnx");
+    let path = scratch("tiny.lads");
+    fs::write(&path, image.as_bytes()).expect("it can be written");
+    let assembly = scratch("tiny.s");
+    let text = format!(
+        ".section .rodata\n.balign 64\n.globl image_start, image_end\nimage_start: .incbin \"{}\"\nimage_end:\n.section .note.GNU-stack,\"\"\n",
+        path.display()
+    );
+    fs::write(&assembly, text).expect("it can be written");
+    let bytes = 1 << 20;
+    let program = scratch("freestanding");
+    let libs = prefix().join("lib/liblads.a");
+    let include = format!("-I{}", prefix().join("include").display());
+    let arguments: [&OsStr; 4] = [
+        assembly.as_ref(),
+        libs.as_ref(),
+        "-o".as_ref(),
+        program.as_ref(),
+    ];
+    run(Command::new("cc")
+        .args([
+            "-std=gnu11",
+            "-O2",
+            "-ffreestanding",
+            "-nostdlib",
+            "-static",
+            "-fno-builtin",
+            "-fno-stack-protector",
+        ])
+        .arg(format!("-DWORKSPACE_BYTES={bytes}"))
+        .arg(include)
+        .arg(crate_path("tests/outside/freestanding.c"))
+        .args(arguments));
+    run(&mut Command::new(&program));
+}
+
+#[test]
+fn a_failed_installation_leaves_nothing() {
+    let prefix = scratch("half");
+    let _ = fs::remove_dir_all(&prefix);
+    let output = Command::new(crate_path("install.sh"))
+        .arg(&prefix)
+        .arg("no-such-target")
+        .output()
+        .expect("the script runs");
+    assert!(!output.status.success());
+    assert!(!prefix.exists());
+}
