@@ -6,7 +6,7 @@ use std::fmt::{self, Display, Formatter};
 
 use lads_core::image::{Beyond, PolicyKind, ProgramKind, Split};
 use lads_core::op::Port;
-use lads_core::{Contract, Decision, Element, Policy, Program};
+use lads_core::{Contract, Decision, Element, GuardedController, Policy, Program};
 use serde_json::{Value, json};
 
 use crate::model::Model;
@@ -64,9 +64,11 @@ impl<'m> Report<'m> {
             "sizes": {
                 "image_bytes": self.policy.image_bytes(),
                 "weights_bytes": self.weights_bytes(),
+                "workspace_bytes": lads_ffi::workspace_bytes(&self.policy),
                 "arena_bytes": bytes(self.policy.arena_len()),
                 "state_bytes": bytes(self.policy.state_len()),
-                "workspace_bytes": self.workspace_bytes(),
+                "guard_bytes": bytes(GuardedController::memory_len(&self.policy)),
+                "stack_bytes": lads_ffi::LADS_STACK_BYTES,
             },
             "golden_steps": self.policy.golden().map(|golden| golden.len()),
         })
@@ -104,10 +106,6 @@ impl<'m> Report<'m> {
 
     fn weights_bytes(&self) -> usize {
         size_of_val(self.policy.weights())
-    }
-
-    fn workspace_bytes(&self) -> usize {
-        bytes(self.policy.arena_len()) + bytes(self.policy.state_len())
     }
 }
 
@@ -212,10 +210,16 @@ impl Report<'_> {
             self.weights_bytes()
         )?;
         let [arena, state] = [self.policy.arena_len(), self.policy.state_len()].map(bytes);
+        let guard = bytes(GuardedController::memory_len(&self.policy));
+        let workspace = lads_ffi::workspace_bytes(&self.policy);
         writeln!(
             f,
-            "  workspace  {:>9}: arena {arena}, state {state}",
-            self.workspace_bytes()
+            "  workspace  {workspace:>9}: arena {arena}, state {state}, guard {guard}, the rest controller and alignment"
+        )?;
+        writeln!(
+            f,
+            "  stack      {:>9}, measured with the static library on x86-64",
+            lads_ffi::LADS_STACK_BYTES
         )
     }
 }

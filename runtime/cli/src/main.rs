@@ -5,6 +5,7 @@
 #![forbid(unsafe_code)]
 
 mod act;
+mod emit;
 mod inspect;
 mod line;
 mod model;
@@ -41,13 +42,19 @@ enum Command {
         #[arg(long)]
         json: bool,
     },
-    /// Compiles a bundle to a program image
+    /// Compiles a bundle to a program image, and writes it as a file, as source, or both
     Compile {
-        /// Bundle (.onnx)
+        /// Bundle (.onnx); with --emit-c or --emit-rust also a compiled image (.lads)
         model: PathBuf,
         /// The image to write
-        #[arg(short, long)]
-        output: PathBuf,
+        #[arg(short, long, required_unless_present_any = ["emit_c", "emit_rust"])]
+        output: Option<PathBuf>,
+        /// A C source to write: the image as a constant, aligned byte array
+        #[arg(long, value_name = "FILE")]
+        emit_c: Option<PathBuf>,
+        /// A Rust source to write: the image as a constant, aligned byte array
+        #[arg(long, value_name = "FILE")]
+        emit_rust: Option<PathBuf>,
     },
     /// Replays the policy's golden episode on this machine and compares plans and actions
     SelfTest {
@@ -112,21 +119,35 @@ fn run(command: Command) -> Result<(), Refusal> {
                 print(&report.to_string())
             }
         }
-        Command::Compile { model, output } => {
+        Command::Compile {
+            model,
+            output,
+            emit_c,
+            emit_rust,
+        } => {
             let model = Model::open(&model)?;
-            if !model.is_bundle() {
+            if output.is_some() && !model.is_bundle() {
                 return Err(Refusal::new(
                     model.path.display(),
                     "it is a compiled image already",
                     "give the bundle (.onnx)",
                 ));
             }
-            write_file(&output, model.image())?;
-            print(&format!(
-                "{}: {} bytes\n",
-                output.display(),
-                model.image().len()
-            ))
+            model.policy()?;
+            let image = model.image();
+            // Everything that can be refused is, before the first file is written.
+            let c = emit_c.map(|path| emit::c(image, &path).map(|text| (path, text)));
+            let rust = emit_rust.map(|path| emit::rust(image, &path).map(|text| (path, text)));
+            let sources = [c.transpose()?, rust.transpose()?];
+            let sources = sources
+                .iter()
+                .flatten()
+                .map(|(path, text)| (path, text.as_bytes()));
+            for (path, bytes) in output.iter().map(|path| (path, image)).chain(sources) {
+                write_file(path, bytes)?;
+                print(&format!("{}: {} bytes\n", path.display(), bytes.len()))?;
+            }
+            Ok(())
         }
         Command::SelfTest { model } => {
             let line = self_test::self_test(&Model::open(&model)?)?;

@@ -250,10 +250,11 @@ fn inspect_tells_what_the_contract_and_the_image_hold() {
         }
         let sizes = &json["sizes"];
         assert_eq!(sizes["image_bytes"], policy.image_bytes());
-        assert_eq!(
-            sizes["workspace_bytes"],
-            4 * (policy.arena_len() + policy.state_len())
-        );
+        let [arena, state] = [policy.arena_len(), policy.state_len()].map(|len| 4 * len);
+        assert_eq!(sizes["arena_bytes"], arena);
+        assert_eq!(sizes["state_bytes"], state);
+        let workspace = sizes["workspace_bytes"].as_u64().unwrap() as usize;
+        assert!((arena + state..arena + state + 4096).contains(&workspace));
         assert_eq!(sizes["weights_bytes"], size_of_val(policy.weights()));
         assert_eq!(json["golden_steps"], golden.len());
     });

@@ -20,6 +20,11 @@
 #define LADS_WORKSPACE_ALIGN 64
 
 /**
+ * Stack that a call of the library takes at most, in bytes: measured on x86-64 with all functions of the archive.
+ */
+#define LADS_STACK_BYTES 4280
+
+/**
  * Words of a `lads_policy`.
  */
 #define LADS_POLICY_WORDS 96

@@ -7,6 +7,9 @@ use lads_core::{GuardedController, Policy};
 /// Alignment of a workspace, in bytes: a cache line, which is also the widest vector.
 pub const LADS_WORKSPACE_ALIGN: usize = 64;
 
+/// Stack that a call of the library takes at most, in bytes: measured on x86-64 with all functions of the archive.
+pub const LADS_STACK_BYTES: usize = 4280;
+
 /// Offsets in bytes.
 #[derive(Debug, Clone, Copy)]
 pub struct Layout {

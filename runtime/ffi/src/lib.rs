@@ -45,12 +45,12 @@ mod types;
 use core::ffi::{c_char, c_void};
 use core::ops::Range;
 
-use lads_core::{Decision, Instruction, Intervention, Tick};
+use lads_core::{Decision, Instruction, Intervention, Policy, Tick};
 
 use crate::handle::Handle;
 use crate::memory::{addresses, apart, check, get, give, read, zeroed};
 
-pub use layout::LADS_WORKSPACE_ALIGN;
+pub use layout::{LADS_STACK_BYTES, LADS_WORKSPACE_ALIGN};
 pub use status::Status;
 pub use types::*;
 
@@ -61,6 +61,11 @@ pub const LADS_ABI_VERSION: u32 = 1;
 #[unsafe(no_mangle)]
 pub extern "C" fn lads_abi_version() -> u32 {
     LADS_ABI_VERSION
+}
+
+/// What `lads_workspace_bytes` says about a policy, for tools written in Rust.
+pub fn workspace_bytes(policy: &Policy) -> usize {
+    handle::layout(policy).map_or(0, |layout| layout.total)
 }
 
 /// Turns a result into the number that C gets.
@@ -202,8 +207,7 @@ pub unsafe extern "C" fn lads_policy_find_instruction(
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_workspace_bytes(policy: *const LadsPolicy) -> usize {
     // SAFETY: the caller guarantees it.
-    let layout = unsafe { handle::policy(policy) }.and_then(|policy| handle::layout(policy));
-    layout.map_or(0, |layout| layout.total)
+    unsafe { handle::policy(policy) }.map_or(0, workspace_bytes)
 }
 
 /// Sets up a controller with its guard in `workspace`, aligned to `LADS_WORKSPACE_ALIGN`, which need not be initialised.

@@ -8,6 +8,7 @@ use std::process::{Command, Output};
 use std::sync::OnceLock;
 
 use lads_compiler::{Bundle, Image, compile};
+use lads_ffi::LADS_STACK_BYTES;
 
 /// What an archive may ask of its environment: the functions that compilers call on their own.
 const ENVIRONMENT: [&str; 2] = ["memcpy", "memset"];
@@ -256,6 +257,20 @@ fn no_c_library_is_needed() {
         .arg(crate_path("tests/outside/freestanding.c"))
         .args(arguments));
     run(&mut Command::new(&program));
+}
+
+#[test]
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+fn the_stack_is_what_the_header_says() {
+    let program = build("cc", "stack.c", "stack", &["-std=gnu99", "-O2", "-pthread"]);
+    let printed = run(Command::new(&program).arg(kitchen()));
+    let bytes: usize = printed.trim().parse().expect("it prints a number");
+    println!("stack: {bytes} bytes");
+    // Three per cent of growth are tolerated before somebody has to look.
+    assert!(
+        bytes * 100 <= LADS_STACK_BYTES * 103,
+        "{bytes} bytes of stack, LADS_STACK_BYTES is {LADS_STACK_BYTES}"
+    );
 }
 
 #[test]
