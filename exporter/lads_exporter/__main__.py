@@ -22,6 +22,13 @@ def _random(arguments):
     print(f"{arguments.output}: random weights, sha256 {bundle.save(model, arguments.output)}")
 
 
+def _growth(arguments):
+    from . import config, growth
+
+    for name in growth.export(config.load(arguments.config), Path(arguments.output), arguments.seed):
+        print(f"{arguments.output}/{name}", flush=True)
+
+
 def _device(name):
     import torch
 
@@ -104,6 +111,12 @@ def _parser():
     random.add_argument("-o", "--output", required=True)
     random.add_argument("--seed", type=int, default=0)
     random.set_defaults(run_command=_random)
+
+    growth = commands.add_parser("growth", help="random bundles in which one dimension grows, for the benchmarks")
+    growth.add_argument("--config", required=True, help="the sizes of everything else")
+    growth.add_argument("-o", "--output", required=True, help="the folder to write them to")
+    growth.add_argument("--seed", type=int, default=0)
+    growth.set_defaults(run_command=_growth)
 
     train = commands.add_parser("train", help="train a policy from a dataset")
     train.add_argument("--config", required=True, help="one TOML file per setting, in exporter/configs")

@@ -46,12 +46,13 @@ def observations(setting, steps, seed):
     return (centre + half * (wave + 0.01 * rng.uniform(-1, 1, wave.shape))).astype(np.float32)
 
 
-def export(setting, encoded, seed):
-    """A bundle with random weights and a golden episode over the whole context."""
+def export(setting, encoded, seed, steps=None):
+    """A bundle with random weights and a golden episode of so many control steps, or over the whole context."""
     torch.manual_seed(seed)
     lads = Lads(setting, encoded)
     randomize(lads, setting, seed)
-    steps, count = setting.config.high_level.context_steps, len(setting.instructions)
+    steps = steps or setting.config.high_level.context_steps
+    count = len(setting.instructions)
     candidates = ((tried % count, observations(setting, steps, seed + tried)) for tried in range(1, 200))
     provenance = {"dataset_sha256": "", "seed": seed, "steps": {}}
     return lads, bundle.assemble(lads, setting, encoded, provenance, candidates)

@@ -5,6 +5,7 @@
 #![forbid(unsafe_code)]
 
 mod act;
+mod bench;
 mod emit;
 mod inspect;
 mod line;
@@ -81,6 +82,8 @@ enum Command {
         #[arg(long, default_value_t = 0, requires = "sample")]
         seed: u64,
     },
+    /// Measures the control loop at its real rate: latency by kind of step, deadline misses, first call, growth with the context
+    Bench(bench::Request),
 }
 
 fn main() -> ExitCode {
@@ -110,6 +113,14 @@ fn main() -> ExitCode {
 
 fn run(command: Command) -> Result<(), Refusal> {
     match command {
+        Command::Bench(request) => {
+            let report = bench::bench(&request)?;
+            if request.json {
+                print(&format!("{:#}\n", report.json()))
+            } else {
+                print(&report.to_string())
+            }
+        }
         Command::Inspect { model, json } => {
             let model = Model::open(&model)?;
             let report = inspect::Report::of(&model)?;

@@ -21,7 +21,7 @@ use lads_kernels::{Isa, assign};
 
 use crate::contract::Decision;
 use crate::decision::{Decider, PlanIndex, margin};
-use crate::errors::{EncodeError, InstructionError, StepError};
+use crate::errors::{ActError, EncodeError, InstructionError, StepError};
 use crate::exec::{ExecError, Inputs};
 use crate::image::{Beyond, ProgramKind};
 use crate::op::Port;
@@ -229,6 +229,65 @@ impl<'a, 'm> Controller<'a, 'm> {
     /// The action of the last step, or what [`executed`](Self::executed) said.
     pub(crate) fn last_action(&self) -> &[f32] {
         self.workspace.now.action
+    }
+
+    /// The low level alone: the action for an observation and a plan, clipped to the contract's limits. Changes nothing in the
+    /// episode under way, and needs no instruction.
+    pub fn act(
+        &mut self,
+        observation: &[f32],
+        plan: PlanIndex,
+        action: &mut [f32],
+    ) -> Result<(), ActError> {
+        let contract = self.policy.contract();
+        for (got, needed) in [
+            (observation.len(), contract.observation_len()),
+            (action.len(), contract.action_len()),
+        ] {
+            if got != needed {
+                return Err(ActError::Length { got, needed });
+            }
+        }
+        let size = contract.codebook_len() as u32;
+        if plan.0 >= size {
+            return Err(ActError::Plan { got: plan.0, size });
+        }
+        if let Some(index) = observation.iter().position(|x| !x.is_finite()) {
+            return Err(ActError::NotFinite { index });
+        }
+        let Workspace { machine, next, .. } = &mut self.workspace;
+        let (policy, weights) = (&self.policy, self.policy.weights());
+        let lookup = policy.program(ProgramKind::Lookup);
+        let inputs = Inputs {
+            plan_index: plan.0,
+            ..Inputs::default()
+        };
+        machine
+            .run(lookup, weights, 0, &inputs)
+            .map_err(ActError::Program)?;
+        // The second bank holds nothing between two steps.
+        take_finite(machine.output(lookup, Port::Plan), next.plan)
+            .map_err(|_| ActError::NotFiniteResult)?;
+        let program = policy.program(ProgramKind::Act);
+        let inputs = Inputs {
+            observation,
+            plan: next.plan,
+            plan_index: plan.0,
+            ..Inputs::default()
+        };
+        machine
+            .run(program, weights, 0, &inputs)
+            .map_err(ActError::Program)?;
+        take_finite(machine.output(program, Port::Action), next.action)
+            .map_err(|_| ActError::NotFiniteResult)?;
+        for ((to, from), limits) in action
+            .iter_mut()
+            .zip(next.action.iter())
+            .zip(contract.actions())
+        {
+            *to = from.clamp(limits.min, limits.max);
+        }
+        Ok(())
     }
 
     /// The plan that one horizon of a demonstration follows: `observations` is `[H, O]`, `actions` is `[H, A]`. Changes nothing

@@ -147,6 +147,50 @@ impl fmt::Display for StepError {
 
 impl Error for StepError {}
 
+/// Why the low level alone gave no action.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ActError {
+    /// The observation or the action has another length than the contract's.
+    Length {
+        /// Elements given.
+        got: usize,
+        /// Elements in the contract.
+        needed: usize,
+    },
+    /// The codebook has no such plan.
+    Plan {
+        /// Index given.
+        got: u32,
+        /// Plans in the codebook.
+        size: u32,
+    },
+    /// An element of the observation is not a number or infinite.
+    NotFinite {
+        /// The first such element.
+        index: usize,
+    },
+    /// The policy computed something that is not finite.
+    NotFiniteResult,
+    /// The program failed.
+    Program(ExecError),
+}
+
+impl fmt::Display for ActError {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self {
+            Self::Length { got, needed } => {
+                write!(f, "{got} elements, the contract says {needed}")
+            }
+            Self::Plan { got, size } => write!(f, "plan {got} of a codebook of {size}"),
+            Self::NotFinite { index } => write!(f, "element {index} is not finite"),
+            Self::NotFiniteResult => f.write_str("the policy computed a value that is not finite"),
+            Self::Program(error) => write!(f, "the low level's program failed: {error}"),
+        }
+    }
+}
+
+impl Error for ActError {}
+
 /// Why a demonstration could not be encoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum EncodeError {

@@ -71,7 +71,7 @@ pub use check::Fault;
 pub use contract::{Contract, ContractError, Decision, Element, KnownInstruction, Network};
 pub use controller::{Controller, Instruction, StepReport};
 pub use decision::PlanIndex;
-pub use errors::{EncodeError, InstructionError, StepError};
+pub use errors::{ActError, EncodeError, InstructionError, StepError};
 pub use exec::ExecError;
 pub use golden::Golden;
 pub use guard::{

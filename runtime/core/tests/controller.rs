@@ -4,8 +4,8 @@ mod support;
 
 use lads_core::image::{Beyond, DecisionRule, ProgramKind};
 use lads_core::{
-    Controller, Decision, EncodeError, Instruction, InstructionError, Isa, PlanIndex, Policy,
-    StepError, Workspace,
+    ActError, Controller, Decision, EncodeError, Instruction, InstructionError, Isa, PlanIndex,
+    Policy, StepError, Workspace,
 };
 use support::assemble::{parts, with_golden};
 use support::{Image, Memory, Model, Random, Spec};
@@ -81,6 +81,59 @@ fn an_episode_equals_the_naive_model() {
     compare(&model, &words, 5, &mut controller);
     controller.reset();
     compare(&model, &words, 5, &mut controller);
+}
+
+#[test]
+fn the_low_level_alone_repeats_the_step_and_disturbs_nothing() {
+    let model = tiny();
+    let image = parts(&model).image();
+    let policy = image.policy();
+    let mut memory = Memory::for_policy(&policy);
+    let mut undisturbed = Memory::for_policy(&policy);
+    let mut controller = memory.controller(&policy);
+    let mut reference = undisturbed.controller(&policy);
+    let mut random = Random(9);
+    let mut action = vec![0.0; model.spec.action_len];
+    let mut alone = action.clone();
+    let other = PlanIndex(model.spec.codebook_len as u32 - 1);
+    for controller in [&mut controller, &mut reference] {
+        controller
+            .set_instruction(Instruction::Id(0))
+            .expect("the instruction is known");
+    }
+    for _ in 0..model.spec.steps {
+        let observation = random.vec(model.spec.observation_len, 1.0);
+        controller
+            .act(&observation, other, &mut alone)
+            .expect("the plan is in the codebook");
+        let report = controller.step(&observation, &mut action);
+        let mut wanted = action.clone();
+        assert_eq!(report, reference.step(&observation, &mut wanted));
+        assert_eq!(action, wanted);
+        let plan = report.expect("the observation is accepted").plan;
+        controller
+            .act(&observation, plan, &mut alone)
+            .expect("the plan is in the codebook");
+        assert_eq!(alone, action);
+    }
+    let observation = random.vec(model.spec.observation_len, 1.0);
+    let size = model.spec.codebook_len as u32;
+    assert_eq!(
+        controller.act(&observation, PlanIndex(size), &mut alone),
+        Err(ActError::Plan { got: size, size })
+    );
+    assert_eq!(
+        controller.act(&observation, PlanIndex(0), &mut []),
+        Err(ActError::Length {
+            got: 0,
+            needed: model.spec.action_len
+        })
+    );
+    let broken = vec![f32::NAN; model.spec.observation_len];
+    assert_eq!(
+        controller.act(&broken, PlanIndex(0), &mut alone),
+        Err(ActError::NotFinite { index: 0 })
+    );
 }
 
 #[test]

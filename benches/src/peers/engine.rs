@@ -1,0 +1,52 @@
+//! What a general runtime has to do here: load one ONNX model, and run it again and again on inputs that stay where they are.
+
+use crate::error::BenchError;
+
+use super::cut::Tensor;
+
+/// Named tensors.
+pub type Named<'t> = [(String, &'t Tensor)];
+
+/// A general runtime.
+pub trait Engine {
+    /// Its name in tables.
+    fn name(&self) -> &'static str;
+
+    /// Version and settings, for the report.
+    fn detail(&self) -> String;
+
+    /// Loads a model.
+    fn load(&self, model: &[u8]) -> Result<Box<dyn Session>, BenchError>;
+}
+
+/// A loaded model.
+pub trait Session {
+    /// Places the inputs and, where the runtime can, the outputs in memory that all following calls use.
+    fn bind(&mut self, inputs: &Named) -> Result<(), BenchError>;
+
+    /// Overwrites a bound input of floating-point numbers, by its place among the model's inputs.
+    fn write(&mut self, input: usize, values: &[f32]) -> Result<(), BenchError>;
+
+    /// Overwrites a bound input of one integer.
+    fn write_integer(&mut self, input: usize, value: i64) -> Result<(), BenchError>;
+
+    /// Runs on what is bound.
+    fn call(&mut self) -> Result<(), BenchError>;
+
+    /// Copies an output of the last call, by its place among the model's outputs.
+    fn read(&self, output: usize, to: &mut [f32]) -> Result<(), BenchError>;
+
+    /// All outputs of the last call, by name.
+    fn outputs(&self) -> Result<Vec<(String, Tensor)>, BenchError>;
+
+    /// Names of the inputs, in the model's order.
+    fn input_names(&self) -> Vec<String>;
+
+    /// Names of the outputs, in the model's order.
+    fn output_names(&self) -> Vec<String>;
+}
+
+/// An error of a runtime, in one line.
+pub fn failed(engine: &str, error: impl std::fmt::Display) -> BenchError {
+    BenchError::new(engine, error, "leave this peer out or fix its installation")
+}

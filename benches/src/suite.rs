@@ -1,0 +1,216 @@
+//! Brings all contenders to the start: opens what they need and compares what they compute, before anything is timed.
+
+use lads_compiler::Memory;
+use lads_core::{Controller, Policy};
+
+use crate::clock::now;
+use crate::contender::{Contender, Episode, compare};
+use crate::error::BenchError;
+use crate::lads::Lads;
+
+/// Control steps that are compared.
+const COMPARED: usize = 60;
+
+/// An image to measure.
+#[derive(Debug, Clone, Copy)]
+pub struct Candidate<'i> {
+    /// How its weights are stored, such as `f32`.
+    pub weights: &'i str,
+    /// The compiled program image, aligned to four bytes.
+    pub image: &'i [u8],
+    /// Largest difference of an action from the recorded one that is accepted.
+    pub tolerance: f32,
+}
+
+/// Which peers to run, and where they are.
+#[derive(Debug, Clone, Default)]
+pub struct Peers {
+    /// The shared library of ONNX Runtime.
+    pub onnxruntime: Option<std::path::PathBuf>,
+    /// Whether to run tract and rten.
+    pub crates: bool,
+    /// A Python that has PyTorch or OpenVINO, and the bundle's file.
+    pub python: Option<(std::path::PathBuf, std::path::PathBuf)>,
+}
+
+/// A contender at the start.
+#[derive(Debug, Clone, serde::Serialize)]
+pub struct Entrant {
+    /// Its name.
+    pub name: String,
+    /// Version and settings.
+    pub detail: String,
+    /// Largest difference of an action from the recorded episode.
+    pub largest_error: f32,
+    /// The first instruction and control step of this process, in nanoseconds.
+    pub first_ns: u64,
+    /// The same again, median, in nanoseconds.
+    pub again_ns: u64,
+}
+
+/// What was measured on.
+#[derive(Debug)]
+pub struct Field<'f> {
+    /// The episode.
+    pub episode: &'f Episode,
+    /// Words of its instruction.
+    pub words: usize,
+    /// Who takes part.
+    pub entrants: Vec<Entrant>,
+    /// Peers that were asked for and could not be run, with the reason.
+    pub absent: Vec<String>,
+}
+
+/// Opens all contenders, compares them, and lends them to `body`.
+pub fn with_contenders<R>(
+    candidates: &[Candidate<'_>],
+    bundle: &[u8],
+    peers: &Peers,
+    body: impl FnOnce(&Field<'_>, &mut [&mut dyn Contender]) -> Result<R, BenchError>,
+) -> Result<R, BenchError> {
+    let refused = |error: &dyn std::fmt::Display| {
+        BenchError::new("the policy", error, "compile it again from its bundle")
+    };
+    let policies = candidates
+        .iter()
+        .map(|candidate| Policy::new_checked(candidate.image));
+    let policies: Vec<_> = policies
+        .collect::<Result<_, _>>()
+        .map_err(|error| refused(&error))?;
+    let Some(first) = policies.first() else {
+        return Err(BenchError::new(
+            "the benchmark",
+            "there is no policy",
+            "name one with --model",
+        ));
+    };
+    let episode = Episode::of(first)?;
+    let known = first.contract().instruction(episode.instruction as usize);
+    let words = known.map_or(0, |known| known.words.len() / first.contract().word_dim());
+    let mut memories: Vec<_> = policies.iter().map(Memory::of).collect();
+    let controllers = memories
+        .iter_mut()
+        .zip(&policies)
+        .map(|(memory, policy)| memory.controller(policy));
+    let mut controllers: Vec<Controller<'_, '_>> = controllers
+        .collect::<Result<_, _>>()
+        .map_err(|error| refused(&error))?;
+    let mut ours: Vec<_> = controllers
+        .iter_mut()
+        .zip(candidates)
+        .map(|(controller, candidate)| Lads::new(candidate.weights, controller, &episode))
+        .collect();
+    let mut absent = vec![];
+    let mut others = open_peers(bundle, peers, &episode, &mut absent);
+
+    let tolerance = first.golden().map_or(0.0, |golden| golden.tolerance());
+    let tolerances = candidates.iter().map(|candidate| candidate.tolerance);
+    let tolerances = tolerances.chain(std::iter::repeat(tolerance));
+    let ours = ours
+        .iter_mut()
+        .map(|contender| contender as &mut dyn Contender);
+    let others = others
+        .iter_mut()
+        .map(|contender| contender.as_mut() as &mut dyn Contender);
+    let mut contenders: Vec<_> = ours.chain(others).collect();
+    let mut entrants = vec![];
+    for (contender, tolerance) in contenders.iter_mut().zip(tolerances) {
+        entrants.push(admit(*contender, &episode, tolerance)?);
+    }
+    let field = Field {
+        episode: &episode,
+        words,
+        entrants,
+        absent,
+    };
+    body(&field, &mut contenders)
+}
+
+/// Times the first calls, then compares a stretch of the episode.
+fn admit(
+    contender: &mut dyn Contender,
+    episode: &Episode,
+    tolerance: f32,
+) -> Result<Entrant, BenchError> {
+    let mut timed = || -> Result<u64, BenchError> {
+        let start = now();
+        contender.replay(1)?;
+        Ok(now() - start)
+    };
+    let first_ns = timed()?;
+    let mut again = (0..15).map(|_| timed()).collect::<Result<Vec<_>, _>>()?;
+    again.sort_unstable();
+    let compared = COMPARED.min(episode.recorded.len());
+    let computed = contender.replay(compared)?;
+    let wanted = episode.recorded.get(..compared).unwrap_or_default();
+    let largest_error = compare(contender.name(), &computed, wanted, tolerance)?;
+    Ok(Entrant {
+        name: contender.name().to_owned(),
+        detail: contender.detail(),
+        largest_error,
+        first_ns,
+        again_ns: again.get(again.len() / 2).copied().unwrap_or(0),
+    })
+}
+
+#[cfg(not(feature = "peers"))]
+fn open_peers<'e>(
+    _: &[u8],
+    peers: &Peers,
+    _: &'e Episode,
+    absent: &mut Vec<String>,
+) -> Vec<Box<dyn Contender + 'e>> {
+    if peers.onnxruntime.is_some() || peers.crates || peers.python.is_some() {
+        absent.push("all peers: built without the cargo feature `peers`".into());
+    }
+    vec![]
+}
+
+#[cfg(feature = "peers")]
+fn open_peers<'e>(
+    bundle: &[u8],
+    peers: &Peers,
+    episode: &'e Episode,
+    absent: &mut Vec<String>,
+) -> Vec<Box<dyn Contender + 'e>> {
+    use crate::peers::cut::Source;
+    use crate::peers::engine::Engine;
+    use crate::peers::general::General;
+    use crate::peers::worker::{NAMES, Worker};
+    use crate::peers::{onnxruntime::OnnxRuntime, rten::Rten, tract::Tract};
+
+    let mut open: Vec<Box<dyn Contender + 'e>> = vec![];
+    let source = match Source::new(bundle) {
+        Ok(source) => source,
+        Err(error) => {
+            absent.push(error.to_string());
+            return open;
+        }
+    };
+    let mut engines: Vec<Box<dyn Engine>> = vec![];
+    if let Some(library) = &peers.onnxruntime {
+        match OnnxRuntime::new(library) {
+            Ok(engine) => engines.push(Box::new(engine)),
+            Err(error) => absent.push(error.to_string()),
+        }
+    }
+    if peers.crates {
+        engines.push(Box::new(Tract));
+        engines.push(Box::new(Rten));
+    }
+    for engine in engines {
+        match General::new(engine.as_ref(), &source, episode) {
+            Ok(contender) => open.push(Box::new(contender)),
+            Err(error) => absent.push(error.to_string()),
+        }
+    }
+    if let Some((python, path)) = &peers.python {
+        for name in NAMES {
+            match Worker::new(name, python, path, episode) {
+                Ok(contender) => open.push(Box::new(contender)),
+                Err(error) => absent.push(error.to_string()),
+            }
+        }
+    }
+    open
+}

@@ -1,0 +1,30 @@
+//! All contenders in one run, block by block: A B C, then C B A, and so on, so that what changes slowly hits all alike.
+
+use crate::contender::{Block, Contender};
+use crate::error::BenchError;
+use crate::stats::Rounds;
+
+/// Measures `blocks` (all of one round) for every contender that offers them, `rounds` times. `progress` is told the rounds done.
+pub fn take_turns(
+    contenders: &mut [&mut dyn Contender],
+    blocks: &[Block],
+    rounds: usize,
+    progress: &mut dyn FnMut(usize),
+) -> Result<Vec<Rounds>, BenchError> {
+    let mut measured = vec![Rounds(vec![vec![]; rounds]); contenders.len()];
+    for round in 0..rounds {
+        for block in blocks {
+            let mut order: Vec<_> = (0..contenders.len()).collect();
+            if round % 2 == 1 {
+                order.reverse();
+            }
+            for turn in order {
+                if contenders[turn].offers(block.work) {
+                    contenders[turn].block(block, &mut measured[turn].0[round])?;
+                }
+            }
+        }
+        progress(round + 1);
+    }
+    Ok(measured)
+}
