@@ -69,11 +69,12 @@ pub trait Environment: Send {
     fn sub_tasks(&self) -> &'static [&'static str];
     /// Time between two control steps, in seconds.
     fn control_period_s(&self) -> f64;
-    /// Control steps of a full episode. The caller ends the episode; stepping on is allowed.
-    fn max_steps(&self) -> usize;
+    /// Control steps of a full episode of an instruction in `split`. The caller ends the episode; stepping on is allowed.
+    fn max_steps(&self, split: &str) -> usize;
 
-    /// Starts an episode and returns its first observation.
-    fn reset(&mut self, seed: EpisodeSeed) -> &[f64];
+    /// Starts an episode that is to complete the sub-tasks `commanded` (indices in [`Environment::sub_tasks`]) and returns its first
+    /// observation. Benchmarks prepare the objects that an instruction speaks of; with none commanded, the start is any.
+    fn reset(&mut self, seed: EpisodeSeed, commanded: &[usize]) -> &[f64];
     /// Applies `action` for one control period and returns the observation after it.
     fn step(&mut self, action: &[f64]) -> Result<&[f64], ActionError>;
 
@@ -85,6 +86,14 @@ pub trait Environment: Send {
     fn steps(&self) -> usize;
     /// Completions since the reset, in the order in which they happened.
     fn completions(&self) -> &[Completion];
+
+    /// Whether an instruction that commands these sub-tasks is carried out now: each was completed at some time, unless the environment
+    /// asks for more.
+    fn succeeded(&self, commanded: &[usize]) -> bool {
+        commanded
+            .iter()
+            .all(|&sub_task| self.completed_at(sub_task).is_some())
+    }
 
     /// Elements of an observation.
     fn observation_len(&self) -> usize {

@@ -26,6 +26,8 @@ pub struct Assignment {
     pub instruction: u32,
     /// The environment's indices of the sub-tasks that it commands.
     pub commanded: Vec<usize>,
+    /// Control steps of its episodes.
+    pub max_steps: usize,
 }
 
 /// What to run, and how.
@@ -190,6 +192,7 @@ impl Evaluation<'_> {
         Task {
             instruction: assignment.instruction,
             commanded: &assignment.commanded,
+            max_steps: assignment.max_steps,
             seed,
             decision,
         }

@@ -4,7 +4,7 @@
 //!
 //! - **N-rate**: the mean number of commanded sub-tasks completed within the episode;
 //! - **K-rate** `k`: the share of episodes in which at least `k` of them were completed, `k` = 1..4;
-//! - **full success**: the share of episodes in which all `C` were.
+//! - **full success**: the share of episodes that carried out the instruction: all `C` were completed, in some environments at one time.
 //!
 //! Invariants: a rate is in `0..=1` and inside its own interval; K-rates never grow with `k`. Nothing here can fail: over no
 //! episodes a rate is `None` and its interval is `[0, 1]`, which is what no evidence means.
@@ -86,11 +86,11 @@ pub struct Score {
     pub k_rate: [Option<f64>; K_RATES],
     /// Wilson 95 % intervals of `k_rate`.
     pub k_rate_interval: [Interval; K_RATES],
-    /// Share of episodes with every commanded sub-task completed.
+    /// Share of episodes that carried out the instruction.
     pub full_success: Option<f64>,
     /// Wilson 95 % interval of `full_success`.
     pub full_success_interval: Interval,
-    /// Episodes with every commanded sub-task completed.
+    /// Episodes that carried out the instruction.
     pub full_success_count: usize,
     /// Sub-tasks completed though the instruction did not command them, summed over the episodes.
     pub un_instructed: usize,
@@ -99,12 +99,12 @@ pub struct Score {
 /// What one episode achieved, as far as the rates are concerned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Outcome {
-    /// Number of sub-tasks that the instruction commands.
-    pub commanded: usize,
-    /// How many of these were completed within the episode.
+    /// How many of the commanded sub-tasks were completed within the episode.
     pub completed: usize,
     /// How many others were.
     pub un_instructed: usize,
+    /// Whether the instruction was carried out: that all were completed, unless the environment asks for more.
+    pub success: bool,
 }
 
 impl Score {
@@ -118,7 +118,7 @@ impl Score {
             sum += outcome.completed;
             sum_of_squares += outcome.completed * outcome.completed;
             un_instructed += outcome.un_instructed;
-            full += usize::from(outcome.completed == outcome.commanded);
+            full += usize::from(outcome.success);
             for (k, count) in at_least.iter_mut().enumerate() {
                 *count += usize::from(outcome.completed > k);
             }
@@ -230,9 +230,9 @@ mod tests {
 
     fn episode(completed: usize, un_instructed: usize) -> Outcome {
         Outcome {
-            commanded: 4,
             completed,
             un_instructed,
+            success: completed == 4,
         }
     }
 
@@ -261,19 +261,13 @@ mod tests {
     }
 
     #[test]
-    fn full_success_follows_the_number_commanded() {
-        let score = Score::of([
-            Outcome {
-                commanded: 2,
-                completed: 2,
-                un_instructed: 0,
-            },
-            Outcome {
-                commanded: 2,
-                completed: 1,
-                un_instructed: 0,
-            },
-        ]);
+    fn full_success_is_the_environments_verdict() {
+        let of_two = |completed, success| Outcome {
+            completed,
+            un_instructed: 0,
+            success,
+        };
+        let score = Score::of([of_two(2, true), of_two(1, false)]);
         assert_eq!(score.full_success, Some(0.5));
         assert_eq!(score.k_rate, [Some(1.0), Some(0.5), Some(0.0), Some(0.0)]);
     }

@@ -5,9 +5,8 @@
 
 use std::collections::BTreeMap;
 
-use lads_core::image::Split;
-use lads_core::{Decision, KnownInstruction};
-use serde::Serialize;
+use lads_core::{Contract, Decision, KnownInstruction};
+use serde::{Serialize, Serializer};
 
 use crate::environment::Environment;
 use crate::fit;
@@ -38,6 +37,8 @@ pub struct Run {
     pub episode: usize,
     /// Control steps executed.
     pub steps: usize,
+    /// Whether the instruction was carried out.
+    pub success: bool,
     /// Completed sub-tasks in the order of their completion.
     pub completions: Vec<Completion>,
     /// Latent plan indices in the order in which they were decided, one per horizon.
@@ -61,8 +62,8 @@ pub struct InstructionResult {
     pub id: String,
     /// Its text.
     pub text: String,
-    /// The split it belongs to: `seen` or `unseen` in training.
-    pub split: &'static str,
+    /// The split it belongs to, in the contract's name.
+    pub split: String,
     /// Its score; the field `episodes` is among these.
     #[serde(flatten)]
     pub score: Score,
@@ -107,11 +108,8 @@ impl InstructionResult {
         Self {
             id: instruction.id.to_owned(),
             text: instruction.text.to_owned(),
-            split: match instruction.split {
-                Split::Seen => "seen",
-                Split::Unseen => "unseen",
-            },
-            score: Score::of(runs.iter().map(|run| outcome(run, commanded.len()))),
+            split: instruction.split.to_owned(),
+            score: Score::of(runs.iter().map(outcome)),
             completions: commanded.iter().map(|&name| rate(name)).collect(),
             un_instructed_completions: others.collect(),
             runs,
@@ -132,17 +130,18 @@ fn run(number: usize, episode: &Episode, watched: &[&'static str], commanded: &[
     Run {
         episode: number,
         steps: episode.steps,
+        success: episode.success,
         completions: episode.completions.iter().filter_map(named).collect(),
         plans: episode.plans.clone(),
     }
 }
 
-fn outcome(run: &Run, commanded: usize) -> Outcome {
+fn outcome(run: &Run) -> Outcome {
     let completed = run.completions.iter().filter(|c| c.commanded).count();
     Outcome {
-        commanded,
         completed,
         un_instructed: run.completions.len() - completed,
+        success: run.success,
     }
 }
 
@@ -158,39 +157,54 @@ pub struct SplitResult {
     pub un_instructed_completions: Vec<SubTaskRate>,
 }
 
-/// The two splits.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Splits {
-    /// Instructions of the training data.
-    pub seen: SplitResult,
-    /// Instructions that were held out.
-    pub unseen: SplitResult,
-}
+/// The contract's splits in its order, by name; in JSON an object.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Splits(pub Vec<(String, SplitResult)>);
 
 impl Splits {
-    /// Sums up all episodes of each split; `watched` are the environment's sub-tasks.
-    pub fn of(instructions: &[InstructionResult], watched: &[&'static str]) -> Self {
-        let of_split = |split| {
-            instructions
-                .iter()
-                .filter(|result| result.split == split)
-                .collect::<Vec<_>>()
+    /// Sums up all episodes of each split in `names`; `watched` are the environment's sub-tasks.
+    pub fn of(
+        names: &[String],
+        instructions: &[InstructionResult],
+        watched: &[&'static str],
+    ) -> Self {
+        let of_split = |name: &String| {
+            let own = instructions.iter().filter(|result| result.split == *name);
+            let own: Vec<_> = own.collect();
+            (name.clone(), SplitResult::of(&own, watched))
         };
-        Self {
-            seen: SplitResult::of(&of_split("seen"), watched),
-            unseen: SplitResult::of(&of_split("unseen"), watched),
+        Self(names.iter().map(of_split).collect())
+    }
+
+    /// The result of a split.
+    pub fn get(&self, name: &str) -> Option<&SplitResult> {
+        let found = self.0.iter().find(|(known, _)| known == name);
+        found.map(|(_, result)| result)
+    }
+}
+
+impl Serialize for Splits {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_map(self.0.iter().map(|(name, result)| (name, result)))
+    }
+}
+
+/// The names of the contract's splits, in the order in which its instructions first name them.
+pub fn split_names(contract: &Contract<'_>) -> Vec<String> {
+    let mut names: Vec<String> = Vec::new();
+    for known in contract.instructions() {
+        if !names.iter().any(|name| name == known.split) {
+            names.push(known.split.to_owned());
         }
     }
+    names
 }
 
 impl SplitResult {
     fn of(instructions: &[&InstructionResult], watched: &[&'static str]) -> Self {
-        let outcomes = instructions.iter().flat_map(|result| {
-            result
-                .runs
-                .iter()
-                .map(|run| outcome(run, result.completions.len()))
-        });
+        let outcomes = instructions
+            .iter()
+            .flat_map(|result| result.runs.iter().map(outcome));
         let rate = |sub_task: &'static str, commanded: bool| {
             let commands = |result: &&InstructionResult| {
                 result.completions.iter().any(|c| c.sub_task == sub_task) == commanded
@@ -310,13 +324,15 @@ pub struct EnvironmentUsed {
     pub max_steps: usize,
 }
 
-impl From<&dyn Environment> for EnvironmentUsed {
-    fn from(environment: &dyn Environment) -> Self {
+impl EnvironmentUsed {
+    /// The environment, with the longest of the splits' episodes.
+    pub fn new(environment: &dyn Environment, splits: &[String]) -> Self {
+        let steps = splits.iter().map(|split| environment.max_steps(split));
         Self {
             id: environment.id(),
             version: environment.version(),
             control_period_s: environment.control_period_s(),
-            max_steps: environment.max_steps(),
+            max_steps: steps.max().unwrap_or(0),
         }
     }
 }
@@ -358,10 +374,11 @@ mod tests {
 
     const WATCHED: [&str; 5] = ["a", "b", "c", "d", "e"];
 
-    fn episode(done: &[(usize, usize)]) -> Episode {
+    fn episode(success: bool, done: &[(usize, usize)]) -> Episode {
         let completion = |&(sub_task, step)| crate::environment::Completion { sub_task, step };
         Episode {
             steps: 280,
+            success,
             completions: done.iter().map(completion).collect(),
             plans: vec![0; 14],
         }
@@ -376,14 +393,20 @@ mod tests {
             words: &[],
         };
         let first = [
-            episode(&[(0, 3), (1, 9), (4, 11), (2, 20), (3, 30)]),
-            episode(&[(1, 5)]),
+            episode(true, &[(0, 3), (1, 9), (4, 11), (2, 20), (3, 30)]),
+            episode(false, &[(1, 5)]),
         ];
-        let second = [episode(&[(0, 2), (3, 8)])];
+        let second = [episode(false, &[(0, 2), (3, 8)])];
         [
-            InstructionResult::new(&known("dcba", "d, c, b, a", Split::Seen), &WATCHED, &first),
-            InstructionResult::new(&known("eabc", "e,a,b,c", Split::Unseen), &WATCHED, &second),
+            InstructionResult::new(&known("dcba", "d, c, b, a", "seen"), &WATCHED, &first),
+            InstructionResult::new(&known("eabc", "e,a,b,c", "unseen"), &WATCHED, &second),
         ]
+    }
+
+    fn splits_of(instructions: &[InstructionResult]) -> [SplitResult; 2] {
+        let names = ["seen", "unseen"].map(str::to_owned);
+        let splits = Splits::of(&names, instructions, &WATCHED);
+        names.map(|name| splits.get(&name).unwrap().clone())
     }
 
     fn counts(rates: &[SubTaskRate]) -> Vec<(&str, usize)> {
@@ -434,37 +457,25 @@ mod tests {
     #[test]
     fn splits_by_hand() {
         let [first, second] = two_instructions();
-        let splits = Splits::of(std::slice::from_ref(&first), &WATCHED);
-        assert_eq!(
-            (splits.seen.score.episodes, splits.unseen.score.episodes),
-            (2, 0)
-        );
-        assert_eq!(
-            (splits.seen.score.n_rate, splits.unseen.score.n_rate),
-            (Some(2.5), None)
-        );
-        assert!(splits.unseen.completions.is_empty());
+        let [seen, unseen] = splits_of(std::slice::from_ref(&first));
+        assert_eq!((seen.score.episodes, unseen.score.episodes), (2, 0));
+        assert_eq!((seen.score.n_rate, unseen.score.n_rate), (Some(2.5), None));
+        assert!(unseen.completions.is_empty());
         let third = InstructionResult {
             id: "b".to_owned(),
             ..second.clone()
         };
-        let splits = Splits::of(&[first, second, third], &WATCHED);
+        let [seen, unseen] = splits_of(&[first, second, third]);
         assert_eq!(
-            (splits.seen.score.n_rate, splits.unseen.score.n_rate),
+            (seen.score.n_rate, unseen.score.n_rate),
             (Some(2.5), Some(1.0))
         );
         // Both unseen episodes command e, a, b, c and complete a and d; nobody commands d.
         assert_eq!(
-            counts(&splits.unseen.completions),
+            counts(&unseen.completions),
             [("a", 2), ("b", 0), ("c", 0), ("e", 0)]
         );
-        assert_eq!(counts(&splits.unseen.un_instructed_completions), [("d", 2)]);
-        assert!(
-            splits
-                .unseen
-                .completions
-                .iter()
-                .all(|of| of.rate.episodes == 2)
-        );
+        assert_eq!(counts(&unseen.un_instructed_completions), [("d", 2)]);
+        assert!(unseen.completions.iter().all(|of| of.rate.episodes == 2));
     }
 }

@@ -42,6 +42,8 @@ pub struct Task<'t> {
     pub instruction: u32,
     /// Indices, in the environment's list, of the sub-tasks that the instruction commands.
     pub commanded: &'t [usize],
+    /// Control steps after which the episode ends.
+    pub max_steps: usize,
     /// Random streams of the environment.
     pub seed: EpisodeSeed,
     /// How plans are chosen, with the seed of this episode where they are sampled.
@@ -53,6 +55,8 @@ pub struct Task<'t> {
 pub struct Episode {
     /// Control steps executed.
     pub steps: usize,
+    /// Whether the instruction was carried out, as the environment judges it.
+    pub success: bool,
     /// Completed sub-tasks, in order of time.
     pub completions: Vec<Completion>,
     /// Plan indices in the order in which they were decided.
@@ -125,28 +129,25 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         }
     }
 
-    /// Runs one episode to its end: all commanded sub-tasks completed, or the environment's number of steps.
+    /// Runs one episode to its end: the instruction is carried out, or the steps are used up.
     pub fn run(&mut self, task: &Task<'_>) -> Result<Episode, RolloutError> {
         let episode_cpu = cpu_time();
         self.instruct(task)?;
         let reset_cpu = cpu_time();
-        narrow(self.environment.reset(task.seed), &mut self.observation);
+        let start = self.environment.reset(task.seed, task.commanded);
+        narrow(start, &mut self.observation);
         self.timing.simulator_cpu += cpu_since(reset_cpu);
 
-        let mut plans = Vec::with_capacity(self.environment.max_steps());
-        for step in 0..self.environment.max_steps() {
-            if task
-                .commanded
-                .iter()
-                .all(|&sub_task| self.environment.completed_at(sub_task).is_some())
-            {
-                break;
-            }
+        let mut plans = Vec::with_capacity(task.max_steps);
+        let mut step = 0;
+        while step < task.max_steps && !self.environment.succeeded(task.commanded) {
             self.control_step(step, &mut plans)?;
+            step += 1;
         }
         self.timing.episodes_cpu += cpu_since(episode_cpu);
         Ok(Episode {
             steps: self.environment.steps(),
+            success: self.environment.succeeded(task.commanded),
             completions: self.environment.completions().to_vec(),
             plans,
         })

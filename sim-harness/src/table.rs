@@ -12,13 +12,8 @@ impl Display for Table<'_> {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let results = self.0;
         heading(results, f)?;
-        let splits = [
-            ("seen", &results.splits.seen),
-            ("unseen", &results.splits.unseen),
-        ];
-        let splits = splits
-            .into_iter()
-            .filter(|(_, result)| result.score.episodes > 0);
+        let splits = results.splits.0.iter();
+        let splits = splits.filter(|(_, result)| result.score.episodes > 0);
         for (split, _) in splits.clone() {
             rows(split, &results.instructions, f)?;
         }

@@ -21,7 +21,7 @@ fn episode(episode: u64) -> EpisodeSeed {
 /// The observations of an episode of random actions.
 fn run(kitchen: &mut Kitchen, seed: EpisodeSeed, steps: usize) -> Vec<Vec<f64>> {
     let mut actions = Stream::new(&[77]);
-    let mut observations = vec![kitchen.reset(seed).to_vec()];
+    let mut observations = vec![kitchen.reset(seed, &[]).to_vec()];
     for _ in 0..steps {
         let action: [f64; 9] = std::array::from_fn(|_| actions.uniform(-1.5, 1.5));
         observations.push(kitchen.step(&action).unwrap().to_vec());
@@ -61,7 +61,7 @@ fn noise_fills_its_amplitudes_and_no_more() {
         let mut kitchen = Kitchen::new(&SCENE, noise);
         let mut largest = [0.0_f64; 30];
         for number in 0..200 {
-            kitchen.reset(episode(number));
+            kitchen.reset(episode(number), &[]);
             for ((largest, seen), truth) in largest
                 .iter_mut()
                 .zip(kitchen.observation())
@@ -95,7 +95,7 @@ fn noise_fills_its_amplitudes_and_no_more() {
 #[test]
 fn a_refused_action_changes_nothing() {
     let mut kitchen = Kitchen::new(&SCENE, Noise::V0);
-    kitchen.reset(episode(0));
+    kitchen.reset(episode(0), &[]);
     let (observation, state) = (kitchen.observation().to_vec(), kitchen.state().to_vec());
     let mut action = [0.0; 9];
     action[4] = f64::NAN;
@@ -128,7 +128,7 @@ fn names_match_the_lengths() {
         (
             kitchen.action_len(),
             kitchen.sub_tasks().len(),
-            kitchen.max_steps()
+            kitchen.max_steps("seen")
         ),
         (9, 7, 280)
     );

@@ -29,6 +29,7 @@ fn assignments(policy: &Policy<'_>) -> Vec<Assignment> {
         .map(|(instruction, commanded)| Assignment {
             instruction,
             commanded,
+            max_steps: 40,
         })
         .collect()
 }
@@ -98,6 +99,7 @@ fn episodes_end_when_the_commanded_sub_tasks_are_done() {
     for (assignment, episodes) in assignments(&policy).iter().zip(&evaluated.episodes) {
         for Episode {
             steps,
+            success,
             completions,
             plans,
         } in episodes
@@ -112,8 +114,10 @@ fn episodes_end_when_the_commanded_sub_tasks_are_done() {
                     Some(steps),
                     "the last completion ends the episode"
                 );
+                assert!(success);
                 early += usize::from(*steps < 40);
             } else {
+                assert!(!success);
                 assert_eq!(*steps, 40, "nothing else does");
             }
             // The context holds 24 steps, a multiple of the horizon, and restarts there.

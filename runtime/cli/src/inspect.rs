@@ -4,7 +4,7 @@
 
 use std::fmt::{self, Display, Formatter};
 
-use lads_core::image::{Beyond, PolicyKind, ProgramKind, Split};
+use lads_core::image::{Beyond, PolicyKind, ProgramKind};
 use lads_core::op::Port;
 use lads_core::{Contract, Decision, Element, GuardedController, Policy, Program};
 use serde_json::{Value, json};
@@ -81,7 +81,7 @@ impl<'m> Report<'m> {
                 "id": known.id,
                 "text": known.text,
                 "sub_tasks": sub_tasks,
-                "split": split(known.split),
+                "split": known.split,
                 "words": known.words.len() / self.contract.word_dim(),
             })
         };
@@ -177,13 +177,7 @@ impl Report<'_> {
     fn instructions(&self, f: &mut Formatter<'_>) -> fmt::Result {
         writeln!(f, "\ninstructions ({})", self.contract.instruction_count())?;
         for known in self.contract.instructions() {
-            writeln!(
-                f,
-                "  {:<8} {:<6} {}",
-                known.id,
-                split(known.split),
-                known.text
-            )?;
+            writeln!(f, "  {:<8} {:<6} {}", known.id, known.split, known.text)?;
         }
         Ok(())
     }
@@ -358,13 +352,6 @@ fn beyond(beyond: Beyond) -> &'static str {
     match beyond {
         Beyond::Restart => "restart",
         Beyond::Refuse => "refuse",
-    }
-}
-
-fn split(split: Split) -> &'static str {
-    match split {
-        Split::Seen => "seen",
-        Split::Unseen => "unseen",
     }
 }
 

@@ -170,14 +170,18 @@ impl Bundle {
         Ok(model.encode_to_vec())
     }
 
-    /// Index of the instruction with this id, or with this text up to case and white space.
-    pub fn instruction_index(&self, text_or_id: &str) -> Option<usize> {
-        let wanted = plain(text_or_id);
+    /// Index of the instruction with this id; else of all with this text, up to case and white space. Empty for none.
+    pub fn instruction_indices(&self, text_or_id: &str) -> Vec<usize> {
         let known = &self.contract.instructions;
-        known
-            .iter()
-            .position(|known| known.id == text_or_id.trim())
-            .or_else(|| known.iter().position(|known| plain(&known.text) == wanted))
+        if let Some(index) = known.iter().position(|known| known.id == text_or_id.trim()) {
+            return vec![index];
+        }
+        let wanted = plain(text_or_id);
+        (0..)
+            .zip(known)
+            .filter(|(_, known)| plain(&known.text) == wanted)
+            .map(|(index, _)| index)
+            .collect()
     }
 
     /// The known instructions that are most like a text, the best first.

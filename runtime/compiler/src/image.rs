@@ -7,7 +7,7 @@ use lads_core::codec::{Field, Writer};
 use lads_core::image::{
     self, Beyond, CRC_WORD, ContractRecord, DecisionRule, ElementRecord, GoldenRecord,
     InstructionRecord, Layout, PORTS, PolicyKind, PortRecord, ProgramRecord, QuaternionOrder,
-    SECTIONS, Section, Split, Text,
+    SECTIONS, Section, Text,
 };
 use lads_core::op::{Place, Port, WeightSpan};
 
@@ -199,10 +199,7 @@ fn contract_words(bundle: &Bundle, parts: &Parts, strings: &mut Strings) -> Vec<
             id: strings.add(&known.id),
             text: strings.add(&known.text),
             sub_tasks: strings.add(&known.sub_tasks.join(",")),
-            split: match known.split {
-                contract::Split::Seen => Split::Seen,
-                contract::Split::Unseen => Split::Unseen,
-            },
+            split: strings.add(&known.split),
             words_len,
             words,
         };

@@ -62,12 +62,12 @@ fn opens_and_tells_what_it_holds() {
     assert_eq!(entries.len(), 7, "{entries:?}");
     assert!(entries.contains(&"trajectory_encoder/encode"));
     let first = &bundle.contract().instructions[0];
-    assert_eq!(bundle.instruction_index(&first.id), Some(0));
+    assert_eq!(bundle.instruction_indices(&first.id), [0]);
     assert_eq!(
-        bundle.instruction_index(&format!("  {} ", first.text.to_uppercase())),
-        Some(0)
+        bundle.instruction_indices(&format!("  {} ", first.text.to_uppercase())),
+        [0]
     );
-    assert_eq!(bundle.instruction_index("sing"), None);
+    assert!(bundle.instruction_indices("sing").is_empty());
     let mut typo = first.text.clone();
     typo.pop();
     assert_eq!(bundle.nearest_instructions(&typo)[0], first.text);

@@ -9,7 +9,7 @@ use core::fmt;
 use crate::codec::{Field, Reader};
 use crate::image::{
     Beyond, ContractRecord, DecisionRule, ElementRecord, InstructionRecord, PolicyKind,
-    QuaternionOrder, Split, Text,
+    QuaternionOrder, Text,
 };
 use crate::op::WeightSpan;
 
@@ -61,8 +61,8 @@ pub struct KnownInstruction<'a> {
     pub text: &'a str,
     /// Sub-tasks, separated by commas.
     pub sub_tasks: &'a str,
-    /// Seen in training or held out.
-    pub split: Split,
+    /// Name of the set that it belongs to in evaluations, such as `seen`.
+    pub split: &'a str,
     /// `[n, E]` word embeddings.
     pub words: &'a [f32],
 }
@@ -166,7 +166,7 @@ impl<'a> Contract<'a> {
         for words in self.instructions.chunks_exact(InstructionRecord::WORDS) {
             let known =
                 InstructionRecord::take(&mut Reader::new(words)).ok_or(ContractError::Record)?;
-            self.check_texts(&[known.id, known.text, known.sub_tasks])?;
+            self.check_texts(&[known.id, known.text, known.sub_tasks, known.split])?;
             let len = u64::from(known.words_len).saturating_mul(u64::from(fixed.word_dim));
             let fits = (1..=fixed.words_len).contains(&known.words_len)
                 && len == u64::from(known.words.len);
@@ -394,7 +394,7 @@ impl<'a> Contract<'a> {
                     id: contract.text(record.id),
                     text: contract.text(record.text),
                     sub_tasks: contract.text(record.sub_tasks),
-                    split: record.split,
+                    split: contract.text(record.split),
                     words: contract.span(record.words)?,
                 })
             })

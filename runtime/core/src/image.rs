@@ -31,7 +31,7 @@ use crate::op::{Place, Port, Span, WeightSpan};
 pub const MAGIC: u32 = u32::from_le_bytes(*b"LADS");
 
 /// Version of the format that this module describes.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
 /// Words of the header.
 pub const HEADER_WORDS: usize = 32;
@@ -143,16 +143,6 @@ word_enum! {
     }
 }
 
-word_enum! {
-    /// Which instructions a policy was trained on.
-    pub enum Split {
-        /// Seen in training.
-        Seen = 0,
-        /// Held out.
-        Unseen = 1,
-    }
-}
-
 record! {
     /// The contract's fixed part.
     pub struct ContractRecord {
@@ -234,8 +224,8 @@ record! {
         pub text: Text,
         /// Sub-tasks, separated by commas.
         pub sub_tasks: Text,
-        /// Seen in training or not.
-        pub split: Split,
+        /// Name of the set that it belongs to in evaluations, such as `seen`.
+        pub split: Text,
         /// Words, `1..=L`.
         pub words_len: u32,
         /// `[words_len, E]` word embeddings.

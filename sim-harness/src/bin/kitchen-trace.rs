@@ -34,7 +34,7 @@ fn run() -> Result<(), Box<dyn std::error::Error>> {
         if let Some(reset) = line.strip_prefix("reset ") {
             let (noise, seed) = parse_reset(reset)?;
             kitchen = Kitchen::new(&scene, noise);
-            kitchen.reset(seed);
+            kitchen.reset(seed, &[]);
         } else if let Some(sub_tasks) = line.strip_prefix("demonstrate ") {
             writeln!(
                 output,

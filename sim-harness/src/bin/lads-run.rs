@@ -20,7 +20,7 @@ use lads_compiler::{Bundle, Memory, compile};
 use lads_core::{Decision, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError};
-use lads_sim::results::{self, InstructionResult, Results};
+use lads_sim::results::{self, EnvironmentUsed, InstructionResult, Results};
 use lads_sim::table::Table;
 use lads_sim::{assets, command, fit, output, registry};
 
@@ -113,11 +113,12 @@ fn run(arguments: &Arguments) -> Result<(), End> {
         ))
     })?;
     let assignments: Vec<_> = (0..)
-        .zip(commanded)
-        .filter(|(instruction, _)| chosen.is_none_or(|chosen| chosen == *instruction))
-        .map(|(instruction, commanded)| Assignment {
+        .zip(contract.instructions().zip(commanded))
+        .filter(|(instruction, _)| chosen.as_ref().is_none_or(|all| all.contains(instruction)))
+        .map(|(instruction, (known, commanded))| Assignment {
             instruction,
             commanded,
+            max_steps: environment.max_steps(known.split),
         })
         .collect();
     let evaluation = Evaluation {
@@ -183,13 +184,14 @@ fn unwritable(path: &Path, error: &std::io::Error) -> End {
     ))
 }
 
-/// The number of the instruction that was asked for; `None` for all.
-fn choose(bundle: &Bundle, instruction: Option<&str>) -> Result<Option<u32>, End> {
+/// The numbers of the instructions with the id or the text that was asked for; `None` for all.
+fn choose(bundle: &Bundle, instruction: Option<&str>) -> Result<Option<Vec<u32>>, End> {
     let Some(wanted) = instruction else {
         return Ok(None);
     };
-    if let Some(index) = bundle.instruction_index(wanted) {
-        return Ok(Some(index as u32));
+    let found = bundle.instruction_indices(wanted);
+    if !found.is_empty() {
+        return Ok(Some(found.into_iter().map(|index| index as u32).collect()));
     }
     let nearest = bundle
         .nearest_instructions(wanted)
@@ -258,6 +260,7 @@ fn report(
     wall: Duration,
 ) -> Results {
     let (contract, watched) = (evaluation.policy.contract(), environment.sub_tasks());
+    let splits = results::split_names(&contract);
     let of_each = evaluation.assignments.iter().zip(&evaluated.episodes);
     let instructions: Vec<_> = of_each
         .filter_map(|(assignment, episodes)| {
@@ -269,14 +272,14 @@ fn report(
     Results {
         format: results::FORMAT,
         format_version: results::FORMAT_VERSION,
-        environment: environment.into(),
+        environment: EnvironmentUsed::new(environment, &splits),
         bundle_sha256: contract.bundle_sha256().to_owned(),
         seed: evaluation.seed,
         noise: noise.to_owned(),
         decision: evaluation.decision.into(),
         episodes_per_instruction: evaluation.episodes,
         versions: versions(),
-        splits: results::Splits::of(&instructions, watched),
+        splits: results::Splits::of(&splits, &instructions, watched),
         instructions,
         latency_us: results::LatencyByKind::of(&evaluated.timing),
         time: results::TimeUse::of(&evaluated.timing, wall, threads),

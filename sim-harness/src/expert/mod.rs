@@ -140,7 +140,7 @@ impl<'k> Performer<'k> {
         style: Style,
         max_steps: usize,
     ) -> Self {
-        kitchen.reset(seed);
+        kitchen.reset(seed, &[]);
         let arm = Arm::new(kitchen.physics());
         Self {
             kitchen,

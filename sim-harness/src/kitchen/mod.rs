@@ -94,11 +94,12 @@ impl Kitchen {
             steps: 0,
             completions: Vec::with_capacity(SUB_TASKS.len()),
         };
-        kitchen.reset(EpisodeSeed {
+        let first = EpisodeSeed {
             seed: 0,
             instruction: 0,
             episode: 0,
-        });
+        };
+        kitchen.reset(first, &[]);
         kitchen
     }
 
@@ -144,11 +145,11 @@ impl Environment for Kitchen {
         CONTROL_PERIOD_S
     }
 
-    fn max_steps(&self) -> usize {
+    fn max_steps(&self, _split: &str) -> usize {
         MAX_STEPS
     }
 
-    fn reset(&mut self, seed: EpisodeSeed) -> &[f64] {
+    fn reset(&mut self, seed: EpisodeSeed, _commanded: &[usize]) -> &[f64] {
         self.data.reset();
         self.data.qpos_mut().copy_from_slice(&INITIAL_POSITIONS);
         self.data.forward();

@@ -86,11 +86,11 @@ impl Environment for Bench {
     fn control_period_s(&self) -> f64 {
         self.says.control_period_s
     }
-    fn max_steps(&self) -> usize {
+    fn max_steps(&self, _split: &str) -> usize {
         40
     }
 
-    fn reset(&mut self, seed: EpisodeSeed) -> &[f64] {
+    fn reset(&mut self, seed: EpisodeSeed, _commanded: &[usize]) -> &[f64] {
         self.stream = Stream::new(&seed.entropy());
         self.state = [0.0; 5];
         self.steps = 0;

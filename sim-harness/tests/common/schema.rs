@@ -35,17 +35,17 @@ pub fn check(value: &Value, schema: &Value, root: &Value, path: &str) {
                 .iter()
                 .all(|key| value.get(key.as_str().unwrap()).is_some()),
             "additionalProperties" => {
-                assert_eq!(
-                    rule,
-                    &Value::Bool(false),
-                    "{path}: only false is understood"
-                );
-                let known = schema["properties"].as_object().unwrap();
-                value
-                    .as_object()
-                    .unwrap()
-                    .keys()
-                    .all(|key| known.contains_key(key))
+                let others = value.as_object().unwrap().iter();
+                let mut others = others.filter(|(key, _)| schema["properties"].get(key).is_none());
+                if rule.is_object() {
+                    others.for_each(|(key, inner)| {
+                        check(inner, rule, root, &format!("{path}.{key}"));
+                    });
+                    true
+                } else {
+                    assert_eq!(rule, &Value::Bool(false), "{path}: false or a schema");
+                    others.next().is_none()
+                }
             }
             "properties" => {
                 for (key, of_key) in rule.as_object().unwrap() {

@@ -2,7 +2,7 @@
 
 use lads_core::image::{
     Beyond, ContractRecord, DecisionRule, ElementRecord, GoldenRecord, InstructionRecord,
-    PolicyKind, PortRecord, ProgramKind, ProgramRecord, QuaternionOrder, Split, Text,
+    PolicyKind, PortRecord, ProgramKind, ProgramRecord, QuaternionOrder, Text,
 };
 use lads_core::op::{
     self, Activation, BinaryKind, IntSlot, Op, Place, Port, Span, StateSpan, WeightSpan,
@@ -465,7 +465,7 @@ fn contract(
             id: text(&format!("id{i}")),
             text: text(&format!("instruction {i}")),
             sub_tasks: text("kettle,microwave"),
-            split: if i == 0 { Split::Seen } else { Split::Unseen },
+            split: text(if i == 0 { "seen" } else { "unseen" }),
             words_len: (words.len() / spec.word_dim) as u32,
             words: writer::weights(&mut weights, words),
         });
