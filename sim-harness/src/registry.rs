@@ -60,7 +60,7 @@ pub enum LoadError {
     /// The kitchen's scene cannot be loaded.
     #[error(transparent)]
     Kitchen(#[from] kitchen::SceneError),
-    /// The LOReL table's scene cannot be loaded.
+    /// The `LOReL` table's scene cannot be loaded.
     #[error(transparent)]
     Lorel(#[from] lorel::SceneError),
 }

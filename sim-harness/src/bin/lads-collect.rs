@@ -1,5 +1,5 @@
 //! Collects demonstrations into one safetensors file, see [`lads_sim::dataset`] for its layout: scripted ones in the kitchen, labelled
-//! random trajectories on the LOReL table.
+//! random trajectories on the `LOReL` table.
 
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
@@ -15,7 +15,7 @@ use lads_sim::instructions::Instructions;
 use lads_sim::kitchen::{Noise, Scene};
 use lads_sim::{command, lorel, output};
 
-/// Collects demonstrations: of the kitchen's seen instructions by scripted experts, of the LOReL table by random actions with post-hoc labels.
+/// Collects demonstrations: of the kitchen's seen instructions by scripted experts, of the `LOReL` table by random actions with post-hoc labels.
 #[derive(Parser)]
 #[command(version)]
 struct Arguments {
@@ -49,7 +49,7 @@ struct Arguments {
 enum EnvironmentName {
     /// Franka Kitchen: 22 instructions of four sub-tasks.
     Kitchen,
-    /// The LOReL table: a drawer, a faucet and two mugs.
+    /// The `LOReL` table: a drawer, a faucet and two mugs.
     Lorel,
 }
 
@@ -136,7 +136,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     }
 }
 
-/// Random trajectories of the LOReL table.
+/// Random trajectories of the `LOReL` table.
 fn wander(
     settings: &lorel::collect::Settings,
     output: &Path,

@@ -1,4 +1,4 @@
-//! Post-hoc labels: what a trajectory did, in words, by the rules of the LOReL benchmark.
+//! Post-hoc labels: what a trajectory did, in words, by the rules of the `LOReL` benchmark.
 //!
 //! Each mug that moved gives one clause with its directions, the drawer and the faucet one each; directions within a clause and the
 //! clauses are shuffled and joined with "and". A trajectory that moved nothing has no label. Nothing here can fail.

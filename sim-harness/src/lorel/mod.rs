@@ -1,4 +1,4 @@
-//! LOReL's table in MuJoCo: a Sawyer arm, a drawer, a faucet and two mugs, with Meta-World's meshes in a scene of our own.
+//! `LOReL`'s table in MuJoCo: a Sawyer arm, a drawer, a faucet and two mugs, with Meta-World's meshes in a scene of our own.
 //!
 //! An action moves a mocap body that the hand is welded to, so the hand lags behind what was asked for: the displacements add up on the
 //! mocap body. Observations are the simulator's positions, without noise. An instruction is carried out when all its sub-tasks hold at one

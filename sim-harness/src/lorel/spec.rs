@@ -1,4 +1,4 @@
-//! The numbers of the LOReL table.
+//! The numbers of the `LOReL` table.
 //!
 //! An observation (15) is the simulator's positions as they are: arm joints 0-6 \[rad\], right and left finger \[m\], white and black mug
 //! x and y \[m\], faucet \[rad\], drawer \[m\] (0 closed, negative open). On the table, left is +x, right is -x, down is +y, up is -y.
