@@ -47,6 +47,7 @@ def contract(setting, encoded, provenance):
             "sha256": encoded.sha256,
             "dim": encoded.dim,
             "layer": config.language.layer,
+            "pooling": "mean" if config.language.pool else "none",
         },
         "network": {"layers": high.layers, "heads": high.heads, "head_dim": high.hidden // high.heads},
         "provenance": {"setting": config.name, "code_version": __version__, **provenance},

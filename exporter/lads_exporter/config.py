@@ -19,6 +19,7 @@ class UserError(Exception):
 class Language:
     encoder: str  # "all-MiniLM-L6-v2", the folder of a BERT-family model, or "random-<dim>" for tests
     layer: int  # which hidden layer gives the word embeddings; -1 is the last (the paper's)
+    pool: bool  # one word per instruction, the mean of the last layer; false is the paper's
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class LowLevel:
 class Encoder:
     hidden: int
     observed: int  # the encoder sees the first so many observation elements; 0 is all of them (the paper's)
+    relative: bool  # it sees how the observation changed since the segment's first step; false is the paper's
     horizon: int  # H, control steps per plan
     codebook_size: int  # M
     codebook_dim: int  # D
@@ -66,7 +68,12 @@ class Data:
     std_floor: float  # observations are z-scored with max(std, std_floor)
     validation_every: int  # every n-th episode is held out
     weights: dict  # instruction id -> sampling weight; others 1
+    action_mask: list  # 0 for elements of the action without effect, which are learned as 0; empty for none
+    hindsight: int  # train on so many relabelled parts of the trajectories (lads_exporter/hindsight.py); 0 is the paper's
+    hindsight_latest: int  # the last step that a part starts at
+    hindsight_most: int  # sub-tasks per label at most
     renoise: bool  # draw fresh observation noise on the clean states while the low level trains
+    word_noise: float  # Gaussian noise on the words while the high level trains, relative to their size
     word_dropout: float  # probability with which a word token is left out of the high level's prefix
     ending_rate: float  # share of the high level's trajectories that get an instruction with another ending; 0 is the paper's
     ending_variants: int  # other endings per beginning
@@ -158,7 +165,7 @@ class Setting:
 
     config: Config
     environment: dict
-    instructions: list  # of {id, text, sub_tasks, split}; seen first
+    instructions: list  # of {id, text, sub_tasks, split}, in the file's order
     tables: list  # what `from_tables` read, as plain data; stored in checkpoints
 
     @property
@@ -186,9 +193,13 @@ def from_tables(table, environment, instructions, where):
     for key in ("id", "version", "control_period_s", "quaternion_order", "observation", "action"):
         if key not in environment:
             raise UserError(f"{config.environment}: key {key!r} is missing")
-    rows = [{**row, "split": split} for split in ("seen", "unseen") for row in instructions.get(split, [])]
+    groups = ((split, group) for split, group in instructions.items() if isinstance(group, list))
+    rows = [{**row, "split": split} for split, group in groups for row in group]
     if not rows:
         raise UserError(f"{config.instructions}: no instruction in it")
+    mask = config.data.action_mask
+    if mask and (len(mask) != len(environment["action"]) or any(value not in (0, 1) for value in mask)):
+        raise UserError(f"{where}: data.action_mask must have a 0 or a 1 for each of {len(environment['action'])} elements")
     known = {row["id"] for row in rows}
     for name in config.data.weights:
         if name not in known:

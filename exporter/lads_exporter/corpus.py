@@ -35,6 +35,7 @@ class Segments:
 
 class Corpus:
     def __init__(self, dataset, setting, encoded, device):
+        """`encoded`: the instructions that the dataset's episodes point to."""
         config = setting.config
         self.horizon, self.device = config.encoder.horizon, device
         count = len(dataset)
@@ -52,8 +53,9 @@ class Corpus:
         self.lengths = torch.from_numpy(dataset.lengths())
         self.steps = int(self.lengths.max()) + self.horizon
         self.observations = self._padded(normed(dataset.observations), dataset)
-        self.actions = self._padded(torch.from_numpy(dataset.actions), dataset)
-        self.executed = self._padded(torch.from_numpy(dataset.executed), dataset)
+        mask = np.array(config.data.action_mask or [1] * setting.action_len, np.float32)
+        self.actions = self._padded(torch.from_numpy(dataset.actions * mask), dataset)
+        self.executed = self._padded(torch.from_numpy(dataset.executed * mask), dataset)
         self.states = self.noise = None
         if config.data.renoise:
             if dataset.states is None:
@@ -64,12 +66,12 @@ class Corpus:
         self.words = [torch.from_numpy(row.words).to(device) for row in encoded.instructions]
         self.sentences = torch.from_numpy(np.stack([row.sentence for row in encoded.instructions])).to(device)
         weights = [config.data.weights.get(row["id"], 1.0) for row in setting.instructions]
-        self.weights = torch.tensor(weights)[self.instruction]
+        self.own_texts = dataset.texts is not None
+        self.weights = torch.ones(count) if self.own_texts else torch.tensor(weights)[self.instruction]
 
     def _padded(self, rows, dataset):
         out = rows.new_zeros(len(dataset), self.steps, rows.shape[1])
-        for episode in range(len(dataset)):
-            out[episode, : self.lengths[episode]] = rows[dataset.rows(episode)]
+        out[torch.arange(self.steps) < self.lengths[:, None]] = rows
         return out.to(self.device)
 
     def shown(self, episodes, steps):
@@ -113,15 +115,18 @@ class Corpus:
         tensors = (table[at] for table in (self.observations, self.actions, self.executed))
         return Segments(*tensors, lengths, rows.to(self.device), steps[:, 0], places.to(self.device), self.shown(*at))
 
-    def every_window(self, episode):
-        """The windows that start at each step of an episode."""
-        starts = torch.arange(int(self.lengths[episode]))
-        return self._windows(torch.full_like(starts, episode), starts, torch.zeros_like(starts), starts)
+    def every_window(self, episodes):
+        """The windows that start at each step of the episodes, one episode after the other."""
+        lengths = self.lengths[episodes]
+        rows = torch.arange(len(episodes)).repeat_interleave(lengths)
+        starts = torch.cat([torch.arange(length) for length in lengths.tolist()])
+        return self._windows(episodes[rows], starts, rows, starts)
 
     @torch.no_grad()
     def codes(self, encode, episodes):
         """The code of the window that starts at each step of the episodes, [B, T], -1 beyond an episode's end."""
         out = torch.full((len(episodes), self.steps), -1, dtype=torch.long, device=self.device)
-        for row, episode in enumerate(episodes):
-            out[row, : self.lengths[episode]] = encode(self.every_window(episode))
+        for first, part in enumerate(torch.as_tensor(episodes).split(64)):
+            windows = self.every_window(part)
+            out[64 * first + windows.rows, windows.starts] = encode(windows)
         return out

@@ -31,6 +31,7 @@ class Dataset:
     instruction: np.ndarray  # [E], index into the setting's instructions
     sha256: str
     notes: dict = field(default_factory=dict)  # counts for the model card
+    texts: list | None = None  # the file's own instructions, where it has others than the setting; `instruction` points here
 
     def __len__(self):
         return len(self.instruction)
@@ -83,6 +84,8 @@ def _check(dataset, path, setting):
         raise UserError(
             f"{path}: an episode has {dataset.lengths().max()} steps, more than high_level.context_steps = {limit}"
         )
+    if dataset.texts is not None:
+        return
     for index in np.unique(dataset.instruction):
         if setting.instructions[index]["split"] != "seen":
             raise UserError(f"{path}: has demonstrations of the unseen instruction {setting.instructions[index]['id']!r}")
@@ -111,10 +114,11 @@ def _read_safetensors(path, setting):
     here = [row["id"] for row in known]
     if labels.size and not 0 <= labels.min() <= labels.max() < len(here):
         raise UserError(f"{path}: instruction has an index outside the metadata's list")
+    own = [row["text"] for row in known] if setting.environment.get("labels") == "post-hoc" else None
     for index in np.unique(labels):
-        if here[index] not in ids:
+        if own is None and here[index] not in ids:
             raise UserError(f"{path}: instruction {here[index]!r} is not in {setting.config.instructions}")
-    translate = np.array([ids.index(name) if name in ids else -1 for name in here])
+    translate = np.arange(len(here)) if own else np.array([ids.index(name) if name in ids else -1 for name in here])
     notes = {key: metadata[key] for key in ("seed", "noise", "attempts", "discarded", "versions") if key in metadata}
     return Dataset(
         floats["observations"],
@@ -125,6 +129,7 @@ def _read_safetensors(path, setting):
         translate[labels],
         _sha256(path),
         notes,
+        own,
     )
 
 

@@ -269,7 +269,11 @@ def trajectory_encode(graph, encoder, codes, normalizer, horizon):
     observation_len, hidden = len(normalizer.mean), encoder.lstm.hidden_size
     observations = entry.input("observations", [1, horizon, observation_len])
     actions = entry.input("actions", [1, horizon, encoder.embed_action.in_features])
-    centred = entry.centred(observations, normalizer, "observations_centred")
+    if encoder.relative:
+        first = entry.op("Slice", [observations, *(entry.integers(f"encoder.first.{k}", [v]) for k, v in (("from", 0), ("to", 1), ("axis", 1)))], "first")
+        centred = entry.op("Sub", [observations, first], "observations_relative")
+    else:
+        centred = entry.centred(observations, normalizer, "observations_centred")
     joined = entry.op("Concat", [centred, actions], "joined", axis=2)
     sequence = entry.op("Transpose", [joined], "sequence", perm=[1, 0, 2])
     weight, bias = encoder.input_weights()

@@ -2,7 +2,8 @@
 
 The word embeddings are one hidden layer's rows without the leading [CLS] and with the trailing [SEP].
 The mean-pooled last layer (all tokens) is the sentence embedding; it stands in for CLIP's in the
-semantic regularisation. "random-<dim>" is an encoder for tests: one fixed random vector per word.
+semantic regularisation, and where `pool` is set it is all that the policy hears, as one word: sentences that mean
+the same lie closer together than their words do. "random-<dim>" is an encoder for tests: one fixed random vector per word.
 """
 
 import hashlib
@@ -67,18 +68,22 @@ def _random_word(word, dim):
     return np.random.default_rng(zlib.crc32(word.encode())).standard_normal(dim).astype(np.float32)
 
 
-def _encode_random(dim, texts):
+def _embedded(words, sentence, pool):
+    return Embedded(sentence[None].copy() if pool else words, sentence)
+
+
+def _encode_random(dim, texts, pool):
     rows = []
     for text in texts:
         words = np.stack([_random_word(word, dim) for word in [*text.split(), "[SEP]"]])
-        rows.append(Embedded(words, words.mean(0)))
+        rows.append(_embedded(words, words.mean(0), pool))
     return Encoded(rows, f"random-{dim}", hashlib.sha256(f"random-{dim}".encode()).hexdigest())
 
 
 def encode(language, texts):
     """Encodes the texts one by one (no padding is involved)."""
     if language.encoder.startswith("random-"):
-        return _encode_random(int(language.encoder.removeprefix("random-")), texts)
+        return _encode_random(int(language.encoder.removeprefix("random-")), texts, language.pool)
     import torch
     from transformers import AutoModel, AutoTokenizer, logging
 
@@ -98,5 +103,6 @@ def encode(language, texts):
             hidden = model(input_ids=ids, attention_mask=torch.ones_like(ids), output_hidden_states=True).hidden_states
         if not -len(hidden) <= language.layer < len(hidden):
             raise UserError(f"language.layer = {language.layer}: the encoder has layers 0 to {len(hidden) - 1}")
-        rows.append(Embedded(hidden[language.layer][0, 1:].numpy().copy(), hidden[-1][0].mean(0).numpy().copy()))
+        sentence = hidden[-1][0].mean(0).numpy().copy()
+        rows.append(_embedded(hidden[language.layer][0, 1:].numpy().copy(), sentence, language.pool))
     return Encoded(rows, Path(language.encoder).name, sha256)

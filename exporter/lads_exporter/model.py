@@ -165,11 +165,13 @@ class TrajectoryEncoder(nn.Module):
     """q: an LSTM over the encoded (s, a) of a segment, then a 3-layer MLP to the latent (before quantisation).
 
     It may be shown the first `observed` elements of the observation only, for instance the robot's joints: then
-    a plan says how the robot moves, whatever was done before.
+    a plan says how the robot moves, whatever was done before. Or it may be shown the changes since the segment's first
+    step: then a plan says what happens, wherever that is.
     """
 
-    def __init__(self, hidden, observation_len, action_len, plan_len, observed):
+    def __init__(self, hidden, observation_len, action_len, plan_len, observed, relative):
         super().__init__()
+        self.relative = relative
         self.register_buffer("shown", (torch.arange(observation_len) < observed).float(), persistent=False)
         self.embed_observation = nn.Linear(observation_len, hidden)
         self.embed_action = nn.Linear(action_len, hidden)
@@ -188,6 +190,8 @@ class TrajectoryEncoder(nn.Module):
 
     def forward(self, observations, actions, lengths):
         """observations [N, H, O], actions [N, H, A], lengths [N] (valid steps, at least 1) -> latents [N, D]."""
+        if self.relative:
+            observations = observations - observations[:, :1]
         weight, bias = self.input_weights()
         hidden = self.lstm.hidden_size
         start = observations.new_zeros(1, len(observations), hidden)
@@ -251,7 +255,7 @@ class Lads(nn.Module):
         config, o, a = setting.config, setting.observation_len, setting.action_len
         encoder = config.encoder
         self.normalizer = Normalizer(o)
-        self.encoder = TrajectoryEncoder(encoder.hidden, o, a, encoder.codebook_dim, encoder.observed or o)
+        self.encoder = TrajectoryEncoder(encoder.hidden, o, a, encoder.codebook_dim, encoder.observed or o, encoder.relative)
         self.codebook = Codebook(encoder)
         self.low_level = LowLevelPolicy(config.low_level, o, encoder.codebook_dim, a)
         self.high_level = HighLevelPolicy(config.high_level, encoded.dim, o, a, encoder.codebook_size)

@@ -21,16 +21,18 @@ from collections import defaultdict
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from tqdm import tqdm
 
-from . import __version__, config as configuration
+from . import __version__, config as configuration, language
 from .bundle import write_atomically
 from .codebook import nearest, perplexity
 from .config import UserError
 from .corpus import Corpus
 from .endings import Endings
+from .hindsight import relabel
 from .model import Lads
 
 STAGES = {"joint": ("joint",), "staged": ("plans", "low_level", "high_level")}
@@ -97,6 +99,8 @@ class Losses:
         words = [self.corpus.words[i] for i in self.corpus.instruction[episodes]]
         if not self.lads.high_level.training:
             return words, codes
+        if self.corpus.own_texts:  # labels of what was done have no order, so no ending
+            return [self._some_words(row) for row in words], codes
         codes = codes.clone()
         for row, episode in enumerate(episodes.tolist()):
             other = self.endings.draw(int(self.corpus.instruction[episode]), int(self.corpus.lengths[episode]))
@@ -106,8 +110,10 @@ class Losses:
         return [self._some_words(row) for row in words], codes
 
     def _some_words(self, words):
-        """The words less a random few; the last token ([SEP]) always stays."""
-        rate = self.config.data.word_dropout
+        """The words, disturbed, less a random few; the last token ([SEP]) always stays."""
+        rate, noise = self.config.data.word_dropout, self.config.data.word_noise
+        if noise > 0:
+            words = words + noise * words.square().mean().sqrt() * torch.randn_like(words)
         if rate == 0:
             return words
         keep = torch.rand(len(words), device=words.device) >= rate
@@ -270,12 +276,16 @@ class Trainer:
         }
         torch.manual_seed(self.seed_of("", "weights", 0))
         self.lads = Lads(setting, encoded).to(device)
-        self.corpus = Corpus(dataset, setting, encoded, device)
+        data = self.config.data
+        if data.hindsight > 0:
+            dataset = relabel(dataset, setting, data.hindsight, data.hindsight_latest, data.hindsight_most, self.seed_of("", "hindsight", 0))
+        own = encoded if dataset.texts is None else language.encode(self.config.language, dataset.texts)
+        self.corpus = Corpus(dataset, setting, own, device)
         self.lads.normalizer.mean.copy_(self.corpus.mean)
         self.lads.normalizer.std.copy_(self.corpus.std)
         self.losses = Losses(self.lads, self.corpus, setting)
         self.notes = dataset.notes
-        self.golden = golden_candidates(dataset, self.corpus.validation.tolist())
+        self.golden = golden_candidates(dataset, self.corpus.validation.tolist(), setting)
         self.position = {"stage": 0, "step": 0}
         self.curves, self.seconds = [], {}
         self.stop = False
@@ -408,10 +418,15 @@ class Trainer:
         write_atomically(self.out / SUMMARY, (json.dumps(summary, indent=1) + "\n").encode())
 
 
-def golden_candidates(dataset, episodes, most=24):
+def golden_candidates(dataset, episodes, setting, most=24):
     """Held-out episodes one of which will be the bundle's golden episode: (instruction index, observations [T, O])."""
+    index = dataset.instruction
+    if dataset.texts is not None:  # those whose label is an instruction of the bundle
+        known = [row["text"] for row in setting.instructions]
+        index = np.array([known.index(text) if text in known else -1 for text in dataset.texts])[dataset.instruction]
+        episodes = [episode for episode in episodes if index[episode] >= 0]
     chosen = episodes[:: max(1, len(episodes) // most)][:most]
-    return [(int(dataset.instruction[e]), torch.from_numpy(dataset.observations[dataset.rows(e)].copy())) for e in chosen]
+    return [(int(index[e]), torch.from_numpy(dataset.observations[dataset.rows(e)].copy())) for e in chosen]
 
 
 def _short(validation):

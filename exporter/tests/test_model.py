@@ -81,7 +81,7 @@ def test_straight_through_and_commitment(setting):
 @torch.no_grad()
 def test_encoder_ignores_what_lies_beyond_a_short_segment():
     torch.manual_seed(0)
-    encoder = TrajectoryEncoder(16, 5, 3, 4, 5)
+    encoder = TrajectoryEncoder(16, 5, 3, 4, 5, False)
     observations, actions = torch.randn(2, 6, 5), torch.randn(2, 6, 3)
     lengths = torch.tensor([6, 4])
     full = encoder(observations, actions, lengths)
@@ -94,7 +94,7 @@ def test_encoder_ignores_what_lies_beyond_a_short_segment():
 @torch.no_grad()
 def test_encoder_folded_inputs_equal_the_unfolded_networks():
     torch.manual_seed(0)
-    encoder = TrajectoryEncoder(16, 5, 3, 4, 5)
+    encoder = TrajectoryEncoder(16, 5, 3, 4, 5, False)
     observations, actions = torch.randn(2, 6, 5), torch.randn(2, 6, 3)
     joined = torch.cat([encoder.embed_observation(observations), encoder.embed_action(actions)], -1)
     expected = encoder.mlp(encoder.lstm(joined)[0][:, -1])
@@ -176,7 +176,7 @@ def test_same_instruction_is_no_negative(setting):
 @torch.no_grad()
 def test_encoder_sees_what_it_is_shown_only():
     torch.manual_seed(0)
-    encoder = TrajectoryEncoder(16, 5, 3, 4, 2)
+    encoder = TrajectoryEncoder(16, 5, 3, 4, 2, False)
     observations, actions, lengths = torch.randn(6, 7, 5), torch.randn(6, 7, 3), torch.full((6,), 7)
     before = encoder(observations, actions, lengths)
     observations[:, :, 2:] = 9.0
