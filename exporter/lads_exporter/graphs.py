@@ -270,7 +270,7 @@ def trajectory_encode(graph, encoder, codes, normalizer, horizon):
     observations = entry.input("observations", [1, horizon, observation_len])
     actions = entry.input("actions", [1, horizon, encoder.embed_action.in_features])
     if encoder.relative:
-        first = entry.op("Slice", [observations, *(entry.integers(f"encoder.first.{k}", [v]) for k, v in (("from", 0), ("to", 1), ("axis", 1)))], "first")
+        first = entry.op("Gather", [observations, entry.integers("encoder.first", [0] * horizon)], "first", axis=1)
         centred = entry.op("Sub", [observations, first], "observations_relative")
     else:
         centred = entry.centred(observations, normalizer, "observations_centred")

@@ -14,7 +14,7 @@ use thiserror::Error;
 
 use crate::environment::{Environment, EpisodeSeed};
 use crate::random::Stream;
-use crate::rollout::{Driver, Episode, RolloutError, Task, Timing};
+use crate::rollout::{Actor, Driver, Episode, RolloutError, Task, Timing};
 
 /// Fourth number of the entropy of the stream that seeds plan sampling; the environment's noise has only the first three.
 const DECISION_STREAM: u64 = 1;
@@ -42,6 +42,8 @@ pub struct Evaluation<'e> {
     pub seed: u64,
     /// How plans are chosen; a sampling seed in it is replaced by one per episode.
     pub decision: Decision,
+    /// Who acts.
+    pub actor: Actor,
     /// Threads, at least one.
     pub threads: usize,
 }
@@ -195,6 +197,7 @@ impl Evaluation<'_> {
             max_steps: assignment.max_steps,
             seed,
             decision,
+            actor: self.actor,
         }
     }
 }

@@ -11,7 +11,7 @@ use serde::{Serialize, Serializer};
 use crate::environment::Environment;
 use crate::fit;
 use crate::metrics::{Latency, Outcome, Rate, Score};
-use crate::rollout::{Episode, Timing};
+use crate::rollout::{Actor, Episode, Timing};
 
 /// Value of the JSON's `format`.
 pub const FORMAT: &str = "lads-results";
@@ -290,10 +290,23 @@ impl TimeUse {
 /// How plans were chosen.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct DecisionUsed {
-    /// `argmax` or `sample`.
+    /// `argmax` or `sample`; `uniform` where actions were drawn at random and no plan was chosen.
     pub rule: &'static str,
     /// Temperature of the softmax that is sampled; `None` for argmax.
     pub temperature: Option<f32>,
+}
+
+impl DecisionUsed {
+    /// How the actions came about.
+    pub fn of(decision: Decision, actor: Actor) -> Self {
+        match actor {
+            Actor::Policy => decision.into(),
+            Actor::Uniform => Self {
+                rule: "uniform",
+                temperature: None,
+            },
+        }
+    }
 }
 
 impl From<Decision> for DecisionUsed {

@@ -10,6 +10,7 @@ use rustix::time::{ClockId, clock_gettime};
 use thiserror::Error;
 
 use crate::environment::{ActionError, Completion, Environment, EpisodeSeed};
+use crate::random::Stream;
 
 /// Why an episode could not be finished.
 #[derive(Debug, Error)]
@@ -35,6 +36,19 @@ pub enum RolloutError {
     },
 }
 
+/// Who acts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Actor {
+    /// The policy.
+    #[default]
+    Policy,
+    /// Nobody: actions are uniform in the contract's limits. The floor that policies are measured against.
+    Uniform,
+}
+
+/// Fourth number of the entropy of the stream that uniform actions are drawn from.
+const UNIFORM_STREAM: u64 = 3;
+
 /// Which episode to run.
 #[derive(Debug, Clone)]
 pub struct Task<'t> {
@@ -48,6 +62,8 @@ pub struct Task<'t> {
     pub seed: EpisodeSeed,
     /// How plans are chosen, with the seed of this episode where they are sampled.
     pub decision: Decision,
+    /// Who acts.
+    pub actor: Actor,
 }
 
 /// What happened in one episode.
@@ -110,6 +126,7 @@ pub struct Driver<'a, 'm, 'e> {
     observation: Vec<f32>,
     action: Vec<f32>,
     command: Vec<f64>,
+    limits: Vec<(f64, f64)>,
     /// What was measured so far.
     pub timing: Timing,
 }
@@ -117,6 +134,9 @@ pub struct Driver<'a, 'm, 'e> {
 impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
     /// Joins a controller and an environment that were checked to fit (see [`crate::fit`]).
     pub fn new(controller: Controller<'a, 'm>, environment: &'e mut dyn Environment) -> Self {
+        let actions = controller.policy().contract().actions();
+        let limits = actions.map(|element| (f64::from(element.min), f64::from(element.max)));
+        let limits = limits.collect();
         let (observation_len, action_len) =
             (environment.observation_len(), environment.action_len());
         Self {
@@ -125,6 +145,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             observation: vec![0.0; observation_len],
             action: vec![0.0; action_len],
             command: vec![0.0; action_len],
+            limits,
             timing: Timing::default(),
         }
     }
@@ -139,9 +160,13 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         self.timing.simulator_cpu += cpu_since(reset_cpu);
 
         let mut plans = Vec::with_capacity(task.max_steps);
+        let mut uniform = task.actor.stream(task.seed);
         let mut step = 0;
         while step < task.max_steps && !self.environment.succeeded(task.commanded) {
-            self.control_step(step, &mut plans)?;
+            match &mut uniform {
+                None => self.control_step(step, &mut plans)?,
+                Some(stream) => self.uniform_step(step, stream)?,
+            }
             step += 1;
         }
         self.timing.episodes_cpu += cpu_since(episode_cpu);
@@ -161,6 +186,17 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         self.timing.controller_cpu += cpu_since(start_cpu);
         self.timing.instruct_ns.push(nanoseconds(start.elapsed()));
         known.map_err(RolloutError::Instruction)
+    }
+
+    fn uniform_step(&mut self, step: usize, stream: &mut Stream) -> Result<(), RolloutError> {
+        for (command, &(low, high)) in self.command.iter_mut().zip(&self.limits) {
+            *command = stream.uniform(low, high);
+        }
+        let before_cpu = cpu_time();
+        let done = self.environment.step(&self.command);
+        done.map_err(|error| RolloutError::Action { step, error })?;
+        self.timing.simulator_cpu += cpu_since(before_cpu);
+        Ok(())
     }
 
     fn control_step(&mut self, step: usize, plans: &mut Vec<u32>) -> Result<(), RolloutError> {
@@ -188,6 +224,14 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         narrow(observation, &mut self.observation);
         self.timing.simulator_cpu += cpu_since(controlled_cpu);
         Ok(())
+    }
+}
+
+impl Actor {
+    fn stream(self, seed: EpisodeSeed) -> Option<Stream> {
+        let [run, instruction, episode] = seed.entropy();
+        let entropy = [run, instruction, episode, UNIFORM_STREAM];
+        (self == Self::Uniform).then(|| Stream::new(&entropy))
     }
 }
 

@@ -35,6 +35,7 @@ fn heading(results: &Results, f: &mut Formatter<'_>) -> fmt::Result {
     )?;
     match results.decision.temperature {
         Some(temperature) => write!(f, "plans sampled at temperature {temperature}")?,
+        None if results.decision.rule == "uniform" => write!(f, "uniform random actions")?,
         None => write!(f, "plans by {}", results.decision.rule)?,
     }
     writeln!(

@@ -2,6 +2,7 @@
 //! what `lads-collect` makes of it.
 
 use std::num::NonZeroUsize;
+use std::sync::OnceLock;
 
 use lads_sim::assets::vendor_dir;
 use lads_sim::environment::{Environment, EpisodeSeed};
@@ -21,8 +22,10 @@ struct Recorded {
     succeeded: Vec<String>,
 }
 
-fn scene() -> Scene {
-    Scene::load(&vendor_dir()).unwrap()
+/// Loaded once, so that its settled postures are made once.
+fn scene() -> &'static Scene {
+    static SCENE: OnceLock<Scene> = OnceLock::new();
+    SCENE.get_or_init(|| Scene::load(&vendor_dir()).unwrap())
 }
 
 fn seed([seed, instruction, episode]: [u64; 3]) -> EpisodeSeed {
@@ -50,7 +53,7 @@ fn distance(a: &[f64], b: &[f64]) -> f64 {
 fn trajectories_are_those_of_the_python_implementation() {
     let recorded: Vec<Recorded> =
         serde_json::from_str(include_str!("data/lorel-trajectories.json")).unwrap();
-    let mut lorel = Lorel::new(&scene());
+    let mut lorel = Lorel::new(scene());
     for one in &recorded {
         let commanded: Vec<usize> = one.commanded.iter().map(index).collect();
         // Equal to rounding on one machine, and on another, whose sines round differently: these episodes were chosen among those
@@ -79,8 +82,7 @@ fn trajectories_are_those_of_the_python_implementation() {
 
 #[test]
 fn a_seed_is_an_episode_whatever_came_before() {
-    let scene = scene();
-    let (mut one, mut other) = (Lorel::new(&scene), Lorel::new(&scene));
+    let (mut one, mut other) = (Lorel::new(scene()), Lorel::new(scene()));
     other.reset(seed([5, 1, 1]), &[0]);
     other.step(&[1.0, 1.0, -1.0, 2.0, 1.0]).unwrap();
     let action = [0.5, -0.5, -1.0, 3.0, -1.0];
@@ -99,13 +101,13 @@ fn a_seed_is_an_episode_whatever_came_before() {
 
 fn collected(threads: usize) -> Collected {
     let settings = Settings {
-        episodes: 210,
+        episodes: 120,
         seed: 4,
         threads: NonZeroUsize::new(threads).unwrap(),
     };
     let mut finished = 0;
-    let collected = collect(&scene(), &settings, |count| finished += count).unwrap();
-    assert_eq!(finished, 210);
+    let collected = collect(scene(), &settings, |count| finished += count).unwrap();
+    assert_eq!(finished, 120);
     collected
 }
 
@@ -114,7 +116,7 @@ fn a_collection_does_not_depend_on_the_threads() {
     let (one, three) = (collected(1), collected(3));
     assert_eq!(one, three);
     // 17.6 % of 50,000 move nothing; five standard deviations around it.
-    assert!((10..=65).contains(&one.nothing()), "{}", one.nothing());
+    assert!((4..=45).contains(&one.nothing()), "{}", one.nothing());
     for trajectory in &one.trajectories {
         assert!(!trajectory.label.sub_tasks.is_empty());
         let unused = trajectory.actions.map(|action| action[3].abs());

@@ -10,7 +10,7 @@ use lads_core::{Decision, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError};
 use lads_sim::fit;
-use lads_sim::rollout::Episode;
+use lads_sim::rollout::{Actor, Episode};
 
 /// The seed is replaced by one per episode.
 const SAMPLE: Decision = Decision::Sample {
@@ -42,6 +42,7 @@ fn evaluate(policy: &Policy<'_>, seed: u64, decision: Decision, threads: usize) 
         episodes: 5,
         seed,
         decision,
+        actor: Actor::Policy,
         threads,
     };
     evaluation
@@ -157,6 +158,7 @@ fn a_stop_ends_the_work_without_a_result() {
         episodes: 5,
         seed: 0,
         decision: Decision::Argmax,
+        actor: Actor::Policy,
         threads: 2,
     };
     let (stop, finished) = (AtomicBool::new(false), AtomicUsize::new(0));

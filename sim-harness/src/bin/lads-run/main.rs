@@ -20,7 +20,8 @@ use lads_compiler::{Bundle, Memory, compile};
 use lads_core::{Decision, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError};
-use lads_sim::results::{self, EnvironmentUsed, InstructionResult, Results};
+use lads_sim::results::{self, DecisionUsed, EnvironmentUsed, InstructionResult, Results};
+use lads_sim::rollout::Actor;
 use lads_sim::table::Table;
 use lads_sim::{assets, command, fit, output, registry};
 
@@ -52,6 +53,9 @@ struct Arguments {
     /// Sample plans from the policy's distribution instead of taking the likeliest
     #[arg(long)]
     sample: bool,
+    /// Draw uniform random actions instead of asking the policy: the floor that it is measured against
+    #[arg(long, conflicts_with = "sample")]
+    uniform: bool,
     /// Write the results to this file as JSON (its form: sim-harness/results.schema.json)
     #[arg(long)]
     json: Option<PathBuf>,
@@ -125,6 +129,11 @@ fn run(arguments: &Arguments) -> Result<(), End> {
         episodes: arguments.episodes,
         seed: arguments.seed,
         decision: decision(&policy, arguments.sample),
+        actor: if arguments.uniform {
+            Actor::Uniform
+        } else {
+            Actor::Policy
+        },
         threads,
     };
     let start = Instant::now();
@@ -268,7 +277,7 @@ fn report(
         bundle_sha256: contract.bundle_sha256().to_owned(),
         seed: evaluation.seed,
         noise: noise.to_owned(),
-        decision: evaluation.decision.into(),
+        decision: DecisionUsed::of(evaluation.decision, evaluation.actor),
         episodes_per_instruction: evaluation.episodes,
         versions: versions(),
         splits: results::Splits::of(&splits, &instructions, watched),
