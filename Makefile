@@ -6,6 +6,9 @@ VENV   := .venv
 PY     := $(VENV)/bin/python
 MODEL  ?= models/kitchen.onnx
 ARGS   ?=
+ENV    ?= kitchen
+COLLECT_kitchen := --episodes-per-instruction 50
+COLLECT_lorel   := --episodes 50000
 RUNTIME := -p lads-core -p lads-kernels -p lads-compiler -p lads-ffi -p lads-cli
 
 PREFIX  ?= /usr/local
@@ -47,21 +50,17 @@ test-exporter: setup $(VENV)/stamp
 	cargo build -p lads-cli -p lads-sim
 	$(PY) -m pytest exporter/tests tests/parity
 
-## collect: scripted demonstrations for the 22 seen instructions into data/kitchen.safetensors
+## collect: demonstrations into data/ENV.safetensors; ENV=kitchen (scripted, of the 22 seen instructions) or ENV=lorel (random, labelled)
 collect: setup
-	cargo run --release -p lads-sim --bin lads-collect -- --env kitchen --episodes-per-instruction 50 -o data/kitchen.safetensors
+	cargo run --release -p lads-sim --bin lads-collect -- --env $(ENV) $(COLLECT_$(ENV)) -o data/$(ENV).safetensors
 
-## train: the shipped policy from data/kitchen.safetensors into runs/kitchen; one thread, because sums depend on their number
+## train: the shipped policy from data/ENV.safetensors into runs/ENV; one thread, because sums depend on their number
 train: $(VENV)/stamp
-	$(PY) -m lads_exporter train --config exporter/configs/kitchen.toml --data data/kitchen.safetensors --out runs/kitchen --threads 1
+	$(PY) -m lads_exporter train --config exporter/configs/$(ENV).toml --data data/$(ENV).safetensors --out runs/$(ENV) --threads 1
 
-## export: runs/kitchen into models/kitchen.onnx
+## export: runs/ENV into models/ENV.onnx
 export: $(VENV)/stamp
-	$(PY) -m lads_exporter export --run runs/kitchen -o models/kitchen.onnx
-
-## install: liblads.a, lads.h, lads.hpp, and their CMake and pkg-config files, into PREFIX (/usr/local)
-install:
-	runtime/ffi/install.sh "$(PREFIX)"
+	$(PY) -m lads_exporter export --run runs/$(ENV) -o models/$(ENV).onnx
 
 ## bench: kernels, entries and the control step
 bench:

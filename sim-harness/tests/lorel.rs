@@ -1,4 +1,4 @@
-//! The LOReL table against trajectories of the Python implementation (exporter/lads_exporter/lorel_table.py), its own promises, and
+//! The `LOReL` table against trajectories of the Python implementation (`exporter/lads_exporter/lorel_table.py`), its own promises, and
 //! what `lads-collect` makes of it.
 
 use std::num::NonZeroUsize;
