@@ -2,8 +2,8 @@
 
 use std::collections::HashMap;
 
-use lads_core::Policy;
-use lads_core::op::{Port, WeightSpan};
+use lads_core::op::{Port, WeightFormat, WeightSpan};
+use lads_core::{Policy, SelfTest, SelfTestError};
 
 use crate::bundle::Bundle;
 use crate::entries::{
@@ -14,6 +14,7 @@ use crate::fuse::fuse;
 use crate::image::{self, Image, Parts};
 use crate::import::Model;
 use crate::lower::{Cache, Weights, lower};
+use crate::memory::Memory;
 use crate::plan::{Placed, plan};
 use crate::report::{CompileReport, ProgramReport};
 use crate::tensor::Tensor;
@@ -100,8 +101,25 @@ struct Made {
     report: ProgramReport,
 }
 
-/// Compiles a bundle.
+/// What a compilation may choose.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Options {
+    /// How the weights of dense layers are stored.
+    pub weights: WeightFormat,
+    /// How far an action may be from the recorded one, instead of what the bundle says; the image's self-test keeps to it too.
+    pub tolerance: Option<f32>,
+    /// Whether an image is made even if the gate refuses it; its self-test then fails.
+    pub force: bool,
+}
+
+/// Compiles a bundle with 32-bit weights.
 pub fn compile(bundle: &Bundle) -> Result<Image, CompileError> {
+    compile_with(bundle, Options::default())
+}
+
+/// Compiles a bundle. Weights of fewer bits have to pass a gate, unless forced: the image that was made replays the bundle's golden
+/// episode with the same plans, and with actions inside the episode's tolerance.
+pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileError> {
     let contract = bundle.contract();
     let signatures = entries::signatures(contract);
     let model = Model::new(&bundle.model, bundle.graph())?;
@@ -109,7 +127,7 @@ pub fn compile(bundle: &Bundle) -> Result<Image, CompileError> {
     let cache_len = cache.len().ok_or_else(|| CompileError::TooLarge {
         what: "the KV cache".into(),
     })?;
-    let mut weights = Weights::default();
+    let mut weights = Weights::new(options.weights);
     let mut made: Vec<Made> = vec![];
     // Whole matrices come before the parts of them that other programs need, and what runs in every control step comes first.
     let (before, rest) = RECIPES.split_at(1);
@@ -157,10 +175,28 @@ pub fn compile(bundle: &Bundle) -> Result<Image, CompileError> {
         words: &words,
         weights: &weights.data,
         cache_len,
+        tolerance: options.tolerance.unwrap_or(bundle.golden().tolerance),
     };
     let image = image::write(bundle, &parts, report)?;
-    Policy::new_checked(image.as_bytes()).map_err(CompileError::Image)?;
+    let policy = Policy::new_checked(image.as_bytes()).map_err(CompileError::Image)?;
+    if options.weights != WeightFormat::F32 && !options.force {
+        gate(&policy).map_err(|error| CompileError::Gate {
+            format: options.weights.name(),
+            error,
+            tolerance: parts.tolerance,
+        })?;
+    }
     Ok(image)
+}
+
+/// Replays the golden episode.
+fn gate(policy: &Policy) -> Result<SelfTest, SelfTestError> {
+    let mut memory = Memory::of(policy);
+    // Memory of a policy's own size is never too small.
+    let mut controller = memory
+        .controller(policy)
+        .map_err(|_| SelfTestError::NoGolden)?;
+    controller.self_test()
 }
 
 fn signature<'s>(signatures: &'s [Signature], entry: &str) -> Result<&'s Signature, CompileError> {

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::path::PathBuf;
 
-use lads_core::PolicyError;
+use lads_core::{PolicyError, SelfTestError};
 
 /// Text of one line: control characters, which names in a hostile file may hold, are escaped.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -129,6 +129,18 @@ pub enum CompileError {
         program: &'static str,
         /// What the verifier found.
         fault: crate::verify::PlanFault,
+    },
+    /// Weights of fewer bits change what the policy does.
+    #[error(
+        "with {format} weights the golden episode does not replay: {error} (tolerance {tolerance:e}); store more bits, or name the tolerance that the machine can live with"
+    )]
+    Gate {
+        /// The format of the weights.
+        format: &'static str,
+        /// What came out otherwise than recorded.
+        error: SelfTestError,
+        /// Largest absolute difference of an action that counts as equal.
+        tolerance: f32,
     },
     /// The policy is too large for an image, whose offsets have 32 bits.
     #[error(

@@ -97,6 +97,8 @@ pub(crate) struct Parts<'a> {
     pub words: &'a [(u32, WeightSpan)],
     pub weights: &'a [f32],
     pub cache_len: u32,
+    /// Of the golden episode's actions.
+    pub tolerance: f32,
 }
 
 /// Writes an image.
@@ -118,7 +120,7 @@ pub(crate) fn write(
         .map(|&word| u32::from_le_bytes(word))
         .collect();
     let (programs, ops) = program_words(parts);
-    let golden = golden_words(bundle.golden());
+    let golden = golden_words(bundle.golden(), parts.tolerance);
     let weights: Vec<u32> = parts.weights.iter().map(|x| x.to_bits()).collect();
     let sections: [(Section, Vec<u32>); SECTIONS] = [
         (Section::Contract, contract),
@@ -239,14 +241,14 @@ fn port_records(ports: &[(Port, Place)]) -> [PortRecord; PORTS] {
     records
 }
 
-fn golden_words(golden: &Golden) -> Vec<u32> {
+fn golden_words(golden: &Golden, tolerance: f32) -> Vec<u32> {
     let mut out = vec![];
     put(
         &mut out,
         &GoldenRecord {
             instruction: golden.instruction as u32,
             steps: golden.steps() as u32,
-            tolerance: golden.tolerance,
+            tolerance,
         },
     );
     out.extend(golden.observations.iter().map(|x| x.to_bits()));

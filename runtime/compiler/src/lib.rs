@@ -42,11 +42,12 @@ mod verify;
 mod tests;
 
 pub use bundle::Bundle;
-pub use compile::compile;
+pub use compile::{Options, compile, compile_with};
 pub use contract::Contract;
 pub use error::{BundleError, CompileError, Line};
 pub use golden::Golden;
 pub use image::Image;
+pub use lads_core::op::WeightFormat;
 pub use memory::Memory;
 pub use report::{CompileReport, ProgramReport};
 pub use verify::PlanFault;

@@ -13,6 +13,8 @@ mod weights;
 
 use std::collections::{HashMap, HashSet};
 
+use lads_kernels::keys_len;
+
 use lads_core::op::{self, IntSlot, Operand, Place, Port, Space, Span, StateSpan};
 
 use crate::contract::Contract;
@@ -37,7 +39,8 @@ pub(crate) struct Lowered {
     pub tokens: usize,
 }
 
-/// Where the KV cache lies in the state: for each layer keys, then values, `[capacity, heads * head_dim]` each.
+/// Where the KV cache lies in the state: for each layer keys, in whole blocks of sixteen tokens, then values,
+/// `[capacity, heads * head_dim]`.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Cache {
     capacity: usize,
@@ -65,18 +68,21 @@ impl Cache {
 
     /// Elements of all layers.
     pub fn len(&self) -> Option<u32> {
-        let layer = self.width().checked_mul(self.capacity)?.checked_mul(2)?;
+        let values = self.width().checked_mul(self.capacity)?;
+        let keys = keys_len(self.capacity, self.width());
+        let layer = values.checked_add(keys)?;
         u32::try_from(layer.checked_mul(self.layers)?).ok()
     }
 
     pub(crate) fn spans(&self, layer: usize) -> [StateSpan; 2] {
-        let len = (self.capacity * self.width()) as u32;
-        let offset = 2 * layer as u32 * len;
+        let values = (self.capacity * self.width()) as u32;
+        let keys = keys_len(self.capacity, self.width()) as u32;
+        let offset = layer as u32 * (keys + values);
         [
-            StateSpan { offset, len },
+            StateSpan { offset, len: keys },
             StateSpan {
-                offset: offset + len,
-                len,
+                offset: offset + keys,
+                len: values,
             },
         ]
     }

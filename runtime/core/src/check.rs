@@ -5,10 +5,10 @@
 use core::error::Error;
 use core::fmt;
 
-use lads_kernels::{PANEL, attention_scratch_len};
+use lads_kernels::{attention_scratch_len, keys_len};
 
 use crate::image::PortRecord;
-use crate::op::{self, Op, Operand, Place, Space, Span, StateSpan, WeightSpan};
+use crate::op::{self, Op, Operand, Place, Space, Span, StateSpan, WeightFormat, WeightSpan};
 use crate::program::Spaces;
 
 /// What is wrong with a program or one of its ops.
@@ -175,11 +175,16 @@ impl Checker {
         exactly(op.x.len, [op.m, op.k])?;
         exactly(op.y.len, [op.m, op.n])?;
         self.weights(op.w)?;
-        let panels = op.n.div_ceil(PANEL as u32);
-        exactly(op.w.len, [panels, op.k, PANEL as u32])?;
-        if let Some(bias) = op.bias {
-            self.weights(bias)?;
-            exactly(bias.len, [op.n])?;
+        // Blocks of sixteen outputs, four bytes to a word.
+        exactly(
+            op.w.len,
+            [op.n.div_ceil(16), op.k, 4, op.format.bytes() as u32],
+        )?;
+        let scaled = matches!(op.format, WeightFormat::Int8);
+        require(op.scales.is_some() == scaled, Fault::Shape)?;
+        for column in [op.scales, op.bias].into_iter().flatten() {
+            self.weights(column)?;
+            exactly(column.len, [op.n])?;
         }
         Ok(())
     }
@@ -210,9 +215,10 @@ impl Checker {
         self.cache(op.cache_v)?;
         let caches = [op.cache_k, op.cache_v].map(|span| [span.offset, span.len]);
         require(!overlap(caches[0], caches[1]), Fault::Overlap)?;
-        let capacity = op.cache_k.len.checked_div(width).ok_or(Fault::Shape)?;
-        exactly(op.cache_k.len, [capacity, width])?;
+        let capacity = op.cache_v.len.checked_div(width).ok_or(Fault::Shape)?;
         exactly(op.cache_v.len, [capacity, width])?;
+        let keys = keys_len(capacity as usize, width as usize);
+        require(op.cache_k.len as usize == keys, Fault::Shape)?;
         let needed = (self.spaces.past_max as u64).saturating_add(u64::from(op.tokens));
         require(u64::from(capacity) >= needed, Fault::Capacity)?;
         if op.queries == 0 {
@@ -224,7 +230,8 @@ impl Checker {
         self.arena(op.scratch)?;
         rows(op.q, op.queries, op.q_stride, width)?;
         exactly(op.y.len, [op.queries, width])?;
-        let scratch = attention_scratch_len(op.queries as usize, capacity as usize);
+        let scratch =
+            attention_scratch_len(op.queries as usize, op.heads as usize, capacity as usize);
         require(scratch as u64 == u64::from(op.scratch.len), Fault::Shape)?;
         apart(op.y, [op.q, op.k, op.v, op.scratch])?;
         apart(op.scratch, [op.q, op.k, op.v])

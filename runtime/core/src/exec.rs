@@ -14,7 +14,8 @@ use lads_kernels::Isa;
 use crate::check::arena_span;
 use crate::image::PortRecord;
 use crate::op::{
-    self, INT_SLOTS, IntSlot, Op, Operand, Place, Port, Space, Span, StateSpan, WeightSpan,
+    self, INT_SLOTS, IntSlot, Op, Operand, Place, Port, Space, Span, StateSpan, WeightFormat,
+    WeightSpan,
 };
 use crate::program::Program;
 
@@ -238,10 +239,21 @@ fn linear(op: &op::Linear, isa: Isa, weights: &[f32], arena: &mut [f32]) -> Opti
     let bias = op
         .bias
         .map_or(Some(&[][..]), |bias| read.get(bias.into()))?;
+    let w = read.get(op.w.into())?;
+    // Casts of whole words to smaller numbers: they fail on no span.
+    let w = match op.format {
+        WeightFormat::F32 => kernels::Panels::F32(w),
+        WeightFormat::F16 => kernels::Panels::F16(bytemuck::try_cast_slice(w).ok()?),
+        WeightFormat::Bf16 => kernels::Panels::Bf16(bytemuck::try_cast_slice(w).ok()?),
+        WeightFormat::Int8 => kernels::Panels::Int8 {
+            panels: bytemuck::try_cast_slice(w).ok()?,
+            scales: read.get(op.scales?.into())?,
+        },
+    };
     let layer = kernels::Linear {
         k: op.k as usize,
         n: op.n as usize,
-        w: read.get(op.w.into())?,
+        w,
         bias,
         activation: op.activation,
         accumulate: op.accumulate,
@@ -273,14 +285,14 @@ fn attention(
     let [cache_k, cache_v] = cache
         .get_disjoint_mut([state_range(op.cache_k), state_range(op.cache_v)])
         .ok()?;
-    kernels::append(
+    kernels::append_keys(
         arena.get(range(op.k))?,
         op.k_stride as usize,
         width,
         cache_k,
         past,
     );
-    kernels::append(
+    kernels::append_values(
         arena.get(range(op.v))?,
         op.v_stride as usize,
         width,

@@ -16,7 +16,8 @@
 //! Strings    UTF-8, zero-padded to a word; `Text` points into it
 //! Programs   seven ProgramRecords, in the order of `ProgramKind`
 //! Ops        `OP_WORDS` words per op, the programs' ops one after the other
-//! Weights    f32; starts on a 64-byte boundary. Packed panels, biases, tables, the words of the known instructions
+//! Weights    starts on a 64-byte boundary. Packed panels, in the format that their ops say; f32 biases, tables, words of the
+//!            known instructions
 //! Golden     empty, or: GoldenRecord, observations f32 [T, O], plan indices u32 [T], actions f32 [T, A]
 //! ```
 //!

@@ -16,7 +16,7 @@ mod place;
 
 use crate::codec::{Field, Reader, Writer, record, word_enum_for};
 
-pub use lads_kernels::{Activation, BinaryKind, ReduceKind, UnaryKind};
+pub use lads_kernels::{Activation, BinaryKind, ReduceKind, UnaryKind, WeightFormat};
 pub use place::{INT_SLOTS, IntSlot, Operand, Place, Port, Space, Span, StateSpan, WeightSpan};
 
 /// Words of an encoded op.
@@ -50,6 +50,8 @@ impl Field for Activation {
     }
 }
 
+word_enum_for!(WeightFormat { F32 = 0, F16 = 1, Bf16 = 2, Int8 = 3, });
+
 word_enum_for!(BinaryKind { Add = 0, Sub = 1, Mul = 2, Div = 3, Max = 4, Min = 5, Pow = 6, });
 
 word_enum_for!(UnaryKind {
@@ -75,8 +77,13 @@ record! {
     pub struct Linear {
         /// `[m, k]`, contiguous.
         pub x: Span,
-        /// `[k, n]` in panels of 16 outputs: `lads_kernels::packed_len(k, n)` elements, written by `lads_kernels::pack`.
+        /// How `w` is stored.
+        pub format: WeightFormat,
+        /// `[k, n]` in panels of 64 outputs: `lads_kernels::packed_len(k, n)` elements of `format`, ordered by
+        /// `lads_kernels::pack`.
         pub w: WeightSpan,
+        /// `[n]`, with `Int8` only: multiplies each output of `x·W`.
+        pub scales: Option<WeightSpan>,
         /// `[n]`
         pub bias: Option<WeightSpan>,
         /// `[m, n]`, contiguous.
@@ -137,7 +144,7 @@ record! {
         pub v_stride: u32,
         /// `[queries, heads * head_dim]`, contiguous.
         pub y: Span,
-        /// `[capacity, heads * head_dim]`
+        /// `[capacity / 16, heads * head_dim, 16]`, blocks of 16 tokens, the last one whole: `lads_kernels::keys_len`.
         pub cache_k: StateSpan,
         /// `[capacity, heads * head_dim]`; does not overlap `cache_k`.
         pub cache_v: StateSpan,
@@ -151,7 +158,7 @@ record! {
         pub queries: u32,
         /// Multiplies the scores.
         pub scale: f32,
-        /// `lads_kernels::attention_scratch_len(queries, capacity)` elements, overlaps nothing.
+        /// `lads_kernels::attention_scratch_len(queries, heads, capacity)` elements, overlaps nothing.
         pub scratch: Span,
     }
 }

@@ -44,27 +44,35 @@ fn op() -> impl Strategy<Value = Op> {
     let dims = any::<[u32; 4]>;
     let linear = (
         span(),
+        prop::sample::select(WeightFormat::ALL.to_vec()),
         weight_span(),
-        prop::option::of(weight_span()),
+        [
+            prop::option::of(weight_span()),
+            prop::option::of(weight_span()),
+        ],
         span(),
         any::<[u32; 3]>(),
         activation(),
         any::<bool>(),
     )
-        .prop_map(|(x, w, bias, y, [m, k, n], activation, accumulate)| {
-            Linear {
-                x,
-                w,
-                bias,
-                y,
-                m,
-                k,
-                n,
-                activation,
-                accumulate,
-            }
-            .into()
-        });
+        .prop_map(
+            |(x, format, w, [scales, bias], y, [m, k, n], activation, accumulate)| {
+                Linear {
+                    x,
+                    format,
+                    w,
+                    scales,
+                    bias,
+                    y,
+                    m,
+                    k,
+                    n,
+                    activation,
+                    accumulate,
+                }
+                .into()
+            },
+        );
     let layer_norm = (
         span(),
         span(),

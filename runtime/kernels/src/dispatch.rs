@@ -1,9 +1,9 @@
-//! One kernel body, compiled once per instruction set; the only unsafe code of the crate.
+//! One kernel body, compiled once per instruction set.
 //!
 //! ```text
-//! Isa::run(kernel):  AVX-512 → avx512(kernel)    the same inlined `Kernel::run`, with wider registers
+//! Isa::run(kernel):  AVX-512 → avx512(kernel)    the same inlined `Kernel::run`, with the vectors of `simd`
 //!                    AVX2    → avx2(kernel)
-//!                    else    → kernel.run()
+//!                    else    → kernel.run(Portable)
 //! ```
 //!
 //! Invariants:
@@ -18,6 +18,8 @@
 
 use core::fmt;
 
+use crate::simd::{Portable, Simd};
+
 /// Instructions that kernels may use, chosen once and then passed along; copying it costs nothing.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Isa(Level);
@@ -27,10 +29,10 @@ pub struct Isa(Level);
 enum Level {
     /// What the target of the build offers in any case.
     Portable,
-    /// AVX and AVX2.
+    /// AVX, AVX2 and F16C.
     #[cfg(target_arch = "x86_64")]
     Avx2,
-    /// AVX-512 F, BW, DQ and VL, and AVX2.
+    /// AVX-512 F, BW, DQ and VL, and the above.
     #[cfg(target_arch = "x86_64")]
     Avx512,
 }
@@ -79,13 +81,14 @@ impl Isa {
     #[inline(always)]
     pub(crate) fn run(self, kernel: impl Kernel) {
         match self.0 {
-            Level::Portable => kernel.run::<1>(),
+            Level::Portable => kernel.run(Portable),
             #[cfg(target_arch = "x86_64")]
-            // SAFETY: `Isa`'s constructors make this level only where `x86_64::widest` found AVX2 in CPU and operating system.
+            // SAFETY: `Isa`'s constructors make this level only where `x86_64::widest` found AVX2 and F16C in CPU
+            // and operating system.
             Level::Avx2 => unsafe { x86_64::avx2(kernel) },
             #[cfg(target_arch = "x86_64")]
-            // SAFETY: `Isa`'s constructors make this level only where `x86_64::widest` found AVX2 and all four parts of
-            // AVX-512 in CPU and operating system.
+            // SAFETY: `Isa`'s constructors make this level only where `x86_64::widest` found AVX2, F16C and all four
+            // parts of AVX-512 in CPU and operating system.
             Level::Avx512 => unsafe { x86_64::avx512(kernel) },
         }
     }
@@ -99,23 +102,12 @@ impl fmt::Debug for Isa {
 
 /// A kernel and its operands.
 pub(crate) trait Kernel {
-    /// Does the work. `#[inline(always)]` in every implementation, and in what it calls, so that each instruction set gets a
-    /// body of its own. `WIDE` is how many blocks of sixteen lanes the registers hold for each of two rows, beside the operands.
-    fn run<const WIDE: usize>(self);
-}
+    /// Whether AVX-512 runs it on half as wide vectors: where conversions take the time, which wide ones do not shorten.
+    const NARROW: bool = false;
 
-/// Asks for the cache line at an address, which need not be a valid one, and waits for nothing.
-#[inline(always)]
-pub(crate) fn prefetch<T>(line: *const T) {
-    #[cfg(target_arch = "x86_64")]
-    // SAFETY: a prefetch reads nothing that the program sees and never faults, whatever the address; it is part of SSE, which
-    // every x86-64 CPU has.
-    unsafe {
-        use core::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        _mm_prefetch::<_MM_HINT_T0>(line.cast());
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    let _ = line;
+    /// Does the work. `#[inline(always)]` in every implementation, and in what it calls, so that each instruction set gets a
+    /// body of its own.
+    fn run<S: Simd>(self, simd: S);
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -123,17 +115,28 @@ mod x86_64 {
     use core::arch::x86_64::{__cpuid, __cpuid_count, _xgetbv};
 
     use super::{Kernel, Level};
+    use crate::simd::x86_64::{Avx2, Avx512, Avx512Narrow};
 
-    /// Sixteen registers of half a block.
-    #[target_feature(enable = "avx2")]
-    pub fn avx2(kernel: impl Kernel) {
-        kernel.run::<2>();
+    /// # Safety
+    /// The CPU and the operating system offer AVX2 and F16C.
+    #[target_feature(enable = "avx2,f16c")]
+    pub unsafe fn avx2(kernel: impl Kernel) {
+        // SAFETY: the caller's promise is this constructor's.
+        kernel.run(unsafe { Avx2::new() });
     }
 
-    /// Thirty-two registers of one block.
-    #[target_feature(enable = "avx2,avx512f,avx512bw,avx512dq,avx512vl")]
-    pub fn avx512(kernel: impl Kernel) {
-        kernel.run::<4>();
+    /// # Safety
+    /// The CPU and the operating system offer AVX2, F16C and the four parts of AVX-512.
+    #[target_feature(enable = "avx2,f16c,avx512f,avx512bw,avx512dq,avx512vl")]
+    pub unsafe fn avx512<K: Kernel>(kernel: K) {
+        // SAFETY: the caller's promise is these constructors'.
+        unsafe {
+            if K::NARROW {
+                kernel.run(Avx512Narrow::new());
+            } else {
+                kernel.run(Avx512::new());
+            }
+        }
     }
 
     /// Bits of XCR0, the register states that the operating system saves: SSE and AVX.
@@ -147,8 +150,8 @@ mod x86_64 {
         if __cpuid(0).eax < 7 {
             return Level::Portable;
         }
-        // Leaf 1, ECX: 27 OSXSAVE, 28 AVX.
-        if !has(__cpuid(1).ecx, &[27, 28]) {
+        // Leaf 1, ECX: 27 OSXSAVE, 28 AVX, 29 F16C.
+        if !has(__cpuid(1).ecx, &[27, 28, 29]) {
             return Level::Portable;
         }
         // SAFETY: OSXSAVE, read from the CPU above, says that the operating system has enabled `xgetbv`.
@@ -182,7 +185,8 @@ mod tests {
     #[cfg(target_arch = "x86_64")]
     #[test]
     fn detection_agrees_with_the_standard_library() {
-        let avx2 = std::arch::is_x86_feature_detected!("avx2");
+        let avx2 = std::arch::is_x86_feature_detected!("avx2")
+            && std::arch::is_x86_feature_detected!("f16c");
         let avx512 = avx2
             && std::arch::is_x86_feature_detected!("avx512f")
             && std::arch::is_x86_feature_detected!("avx512bw")

@@ -2,6 +2,7 @@
 
 use crate::dispatch::{Isa, Kernel};
 use crate::math;
+use crate::simd::Simd;
 
 /// Copies element by element as far as both slices reach: `copy_from_slice` without its panic.
 #[inline(always)]
@@ -74,7 +75,7 @@ struct Elements<'a> {
 
 impl Kernel for Elements<'_> {
     #[inline(always)]
-    fn run<const WIDE: usize>(self) {
+    fn run<S: Simd>(self, _: S) {
         #[inline(always)]
         fn each(y: &mut [f32], f: impl Fn(f32) -> f32) {
             for y in y {

@@ -6,26 +6,6 @@ pub const LANES: usize = 16;
 /// One block of elements.
 pub type Block = [f32; LANES];
 
-/// `acc[l] += f(a[l], b[l])`
-#[inline(always)]
-#[expect(
-    clippy::indexing_slicing,
-    reason = "constant bounds; compilers vectorise this form best"
-)]
-pub fn add_products(acc: &mut Block, a: &Block, b: &Block) {
-    for i in 0..LANES {
-        acc[i] += a[i] * b[i];
-    }
-}
-
-/// `acc[l] += a * b[l]`
-#[inline(always)]
-pub fn add_scaled(acc: &mut Block, a: f32, b: &Block) {
-    for (acc, &b) in acc.iter_mut().zip(b) {
-        *acc += a * b;
-    }
-}
-
 /// The sum of the lanes: halves are added until one element is left.
 #[inline(always)]
 #[expect(

@@ -1,12 +1,13 @@
 //! Dense kernels for batch-1 policies: slices and shapes, nothing of ONNX or LADS.
 //!
 //! Invariants:
-//! - No allocation, no `std`, no panic, and no unsafe code but in `dispatch` and one loop of `linear`: a slice that is too short leaves the rest of the result as it was.
+//! - No allocation, no `std`, no panic, and no unsafe code but in `dispatch`, `simd` and the loops over weights and cache: a slice
+//!   that is too short leaves the rest of the result as it was.
 //!   Callers that want to be told check shapes beforehand; `lads-core` does so once per program.
 //! - The same bits on every target with IEEE 754 arithmetic: every sum has one fixed order (sixteen lanes, then a tree), no
 //!   multiply-add is fused, and `exp`, `tanh` and `sigmoid` are the polynomials of [`math`].
-//! - Plain Rust that compilers vectorise: inner loops run over arrays of sixteen elements. The kernels that a control step spends
-//!   its time in are compiled once per instruction set and take an [`Isa`], which says which of them to run.
+//! - Inner loops run over blocks of sixteen elements: plain Rust that compilers vectorise, or the vectors of `simd` where a control
+//!   step spends its time. Those kernels are compiled once per instruction set and take an [`Isa`], which says which of them to run.
 //!
 //! [`mod@reference`] holds the naive twin of every kernel; `tests/twins.rs` compares them on random shapes.
 #![no_std]
@@ -35,13 +36,16 @@ mod matmul;
 mod norm;
 mod reduce;
 pub mod reference;
+mod simd;
+pub mod stored;
 mod strided;
 
-pub use attention::{Attention, append, attention_scratch_len};
+pub use attention::{Attention, append_keys, append_values, attention_scratch_len, keys_len};
 pub use dispatch::Isa;
 pub use elementwise::{Unary, UnaryKind, assign};
 pub use linear::{Activation, Linear, PANEL, pack, packed_len};
 pub use matmul::MatMul;
 pub use norm::{LayerNorm, softmax};
 pub use reduce::{Axis, ReduceKind, arg_max, arg_min, reduce};
+pub use stored::{Panels, WeightFormat};
 pub use strided::{BinaryKind, Input, StridedCopy, binary};

@@ -4,6 +4,7 @@ use crate::dispatch::{Isa, Kernel};
 use crate::elementwise::assign;
 use crate::lanes::{max_of, sum_of};
 use crate::math;
+use crate::simd::Simd;
 
 /// Layer norm with the weights of one layer.
 #[derive(Debug, Clone, Copy)]
@@ -35,7 +36,7 @@ struct LayerNormRows<'a> {
 
 impl Kernel for LayerNormRows<'_> {
     #[inline(always)]
-    fn run<const WIDE: usize>(self) {
+    fn run<S: Simd>(self, _: S) {
         let LayerNorm { gamma, beta, eps } = self.norm;
         let cols = gamma.len().max(1);
         let rows = self.x.chunks_exact(cols);
@@ -66,7 +67,7 @@ struct SoftmaxRows<'a> {
 
 impl Kernel for SoftmaxRows<'_> {
     #[inline(always)]
-    fn run<const WIDE: usize>(self) {
+    fn run<S: Simd>(self, _: S) {
         let cols = self.cols.max(1);
         let rows = self.x.chunks_exact(cols);
         for (x, y) in rows.zip(self.y.chunks_exact_mut(cols)) {

@@ -85,7 +85,8 @@ pub fn attention(op: &Attention, q: &[f32], y: &mut [f32]) {
         for row in 0..op.visible + query {
             let score: f64 = (head..head + op.head_dim)
                 .map(|c| {
-                    f64::from(q[query * op.q_stride + c]) * f64::from(op.cache_k[row * width + c])
+                    f64::from(q[query * op.q_stride + c])
+                        * f64::from(op.cache_k[key(width, row, c)])
                 })
                 .sum();
             let p = libm::exp(score * f64::from(op.scale));
@@ -94,6 +95,11 @@ pub fn attention(op: &Attention, q: &[f32], y: &mut [f32]) {
         }
         *y = (sum / total) as f32;
     }
+}
+
+/// Where element `col` of key `row` lies.
+pub fn key(width: usize, row: usize, col: usize) -> usize {
+    (row / 16 * width + col) * 16 + row % 16
 }
 
 /// One element.

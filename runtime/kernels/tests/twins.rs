@@ -2,9 +2,9 @@
 
 use lads_kernels::reference as naive;
 use lads_kernels::{
-    Activation, Attention, Axis, BinaryKind, Input, Isa, LayerNorm, Linear, MatMul, ReduceKind,
-    StridedCopy, Unary, UnaryKind, append, arg_max, arg_min, attention_scratch_len, binary, pack,
-    packed_len, reduce, softmax,
+    Activation, Attention, Axis, BinaryKind, Input, Isa, LayerNorm, Linear, MatMul, Panels,
+    ReduceKind, StridedCopy, Unary, UnaryKind, WeightFormat, append_keys, append_values, arg_max,
+    arg_min, attention_scratch_len, binary, keys_len, pack, packed_len, reduce, softmax, stored,
 };
 use proptest::prelude::*;
 use proptest::sample::select;
@@ -83,6 +83,63 @@ fn on_all<const N: usize>(kernel: impl Fn(Isa) -> [Vec<f32>; N]) -> [Vec<f32>; N
     portable
 }
 
+/// A matrix as it is stored, and the numbers that it then means.
+struct Matrix {
+    format: WeightFormat,
+    singles: Vec<f32>,
+    halves: Vec<u16>,
+    integers: Vec<i8>,
+    scales: Vec<f32>,
+    meant: Vec<f32>,
+}
+
+impl Matrix {
+    fn new(w: &[f32], [k, n]: [usize; 2], format: WeightFormat) -> Self {
+        fn packed<T: Copy + Default>(w: &[T], [k, n]: [usize; 2]) -> Vec<T> {
+            let mut out = vec![T::default(); packed_len(k, n)];
+            pack(w, k, n, &mut out);
+            out
+        }
+        let column = |j: usize| w.iter().skip(j).step_by(n).copied();
+        let scales: Vec<f32> = (0..n).map(|j| stored::int8_scale(column(j))).collect();
+        let bits: Vec<u16> = match format {
+            WeightFormat::F16 => w.iter().map(|&w| stored::to_f16(w).unwrap()).collect(),
+            _ => w.iter().map(|&w| stored::to_bf16(w).unwrap()).collect(),
+        };
+        let integers: Vec<i8> = (w.iter().enumerate())
+            .map(|(i, &w)| stored::to_int8(w, scales[i % n]))
+            .collect();
+        let meant = match format {
+            WeightFormat::F32 => w.to_vec(),
+            WeightFormat::F16 => bits.iter().map(|&bits| stored::from_f16(bits)).collect(),
+            WeightFormat::Bf16 => bits.iter().map(|&bits| stored::from_bf16(bits)).collect(),
+            WeightFormat::Int8 => (integers.iter().enumerate())
+                .map(|(i, &q)| f32::from(q) * scales[i % n])
+                .collect(),
+        };
+        Self {
+            format,
+            singles: packed(w, [k, n]),
+            halves: packed(&bits, [k, n]),
+            integers: packed(&integers, [k, n]),
+            scales,
+            meant,
+        }
+    }
+
+    fn panels(&self) -> Panels<'_> {
+        match self.format {
+            WeightFormat::F32 => Panels::F32(&self.singles),
+            WeightFormat::F16 => Panels::F16(&self.halves),
+            WeightFormat::Bf16 => Panels::Bf16(&self.halves),
+            WeightFormat::Int8 => Panels::Int8 {
+                panels: &self.integers,
+                scales: &self.scales,
+            },
+        }
+    }
+}
+
 fn activation() -> impl Strategy<Value = Activation> {
     let all = [
         Activation::None,
@@ -98,23 +155,22 @@ proptest! {
     #[test]
     fn linear_equals_its_twin(
         (m, k, n) in (1_usize..6, 1_usize..70, 1_usize..180),
-        activation in activation(),
+        (format, activation) in (select(WeightFormat::ALL.to_vec()), activation()),
         (with_bias, accumulate) in any::<(bool, bool)>(),
         seed in any::<u64>(),
     ) {
         let (x, w) = (values(m * k, seed), values(k * n, seed ^ 1));
         let bias = if with_bias { values(n, seed ^ 2) } else { Vec::new() };
         let before = values(m * n, seed ^ 3);
-        let mut packed = vec![f32::NAN; packed_len(k, n)];
-        pack(&w, k, n, &mut packed);
-        let layer = Linear { k, n, w: &packed, bias: &bias, activation, accumulate };
+        let matrix = Matrix::new(&w, [k, n], format);
+        let layer = Linear { k, n, w: matrix.panels(), bias: &bias, activation, accumulate };
         let [y] = on_all(|isa| {
             let mut y = before.clone();
             layer.run(isa, &x, &mut y);
             [y]
         });
         let mut expected = vec![0.0; m * n];
-        naive::linear(&x, &w, &bias, activation, [k, n], &mut expected);
+        naive::linear(&x, &matrix.meant, &bias, activation, [k, n], &mut expected);
         if accumulate {
             expected.iter_mut().zip(&before).for_each(|(y, before)| *y += before);
         }
@@ -176,17 +232,28 @@ proptest! {
         let new = values(2 * tokens * stride, seed);
         let (new_k, new_v) = new.split_at(tokens * stride);
         // What lies beyond the tokens must not matter.
-        let mut caches = [seed ^ 1, seed ^ 2].map(|seed| values(capacity * width, seed));
-        for cache in &mut caches {
-            cache[(past + tokens) * width..].fill(f32::NAN);
+        let mut cache_v = values(capacity * width, seed ^ 2);
+        cache_v[(past + tokens) * width..].fill(f32::NAN);
+        let mut cache_k = vec![f32::NAN; keys_len(capacity, width)];
+        for (i, &k) in values(past * width, seed ^ 1).iter().enumerate() {
+            cache_k[naive::key(width, i / width, i % width)] = k;
         }
-        let [mut cache_k, mut cache_v] = caches;
-        append(new_k, stride, width, &mut cache_k, past);
-        append(new_v, stride, width, &mut cache_v, past);
+        let before = cache_k.clone();
+        append_keys(new_k, stride, width, &mut cache_k, past);
+        append_values(new_v, stride, width, &mut cache_v, past);
         for token in 0..tokens {
             let row = (past + token) * width..(past + token + 1) * width;
-            prop_assert_eq!(&cache_k[row.clone()], &new_k[token * stride..token * stride + width]);
             prop_assert_eq!(&cache_v[row], &new_v[token * stride..token * stride + width]);
+        }
+        for row in 0..capacity {
+            for col in 0..width {
+                let at = naive::key(width, row, col);
+                let expected = match row.checked_sub(past).filter(|&token| token < tokens) {
+                    Some(token) => new_k[token * stride + col],
+                    None => before[at],
+                };
+                prop_assert_eq!(cache_k[at].to_bits(), expected.to_bits());
+            }
         }
         let q: Vec<f32> = values((queries - 1) * stride + width, seed ^ 3).iter().map(|q| q * 4.0).collect();
         let attention = Attention {
@@ -199,7 +266,7 @@ proptest! {
             cache_v: &cache_v,
         };
         let [y] = on_all(|isa| {
-            let mut scratch = vec![f32::NAN; attention_scratch_len(queries, capacity)];
+            let mut scratch = vec![f32::NAN; attention_scratch_len(queries, heads, capacity)];
             let mut y = vec![f32::NAN; queries * width];
             attention.run(isa, &q, &mut y, &mut scratch);
             [y]
@@ -374,21 +441,18 @@ fn what_is_not_a_number_is_passed_over_by_the_best_element() {
 }
 
 #[test]
-fn weights_are_packed_in_panels_of_sixteen_outputs() {
-    // [k, n] = [2, 17]: two panels, the second with one output and zeros.
-    let w: Vec<f32> = (1..=34_u8).map(f32::from).collect();
-    let mut packed = vec![f32::NAN; packed_len(2, 17)];
-    pack(&w, 2, 17, &mut packed);
-    assert_eq!(packed.len(), 64);
-    assert_eq!(packed[..16], w[..16]);
-    assert_eq!(packed[16..32], w[17..33]);
-    assert_eq!((packed[32], packed[48]), (w[16], w[33]));
-    assert!(
-        packed[33..48]
-            .iter()
-            .chain(&packed[49..])
-            .all(|&w| w == 0.0)
-    );
+fn weights_are_packed_in_panels_of_sixty_four_outputs() {
+    // [k, n] = [2, 82]: a whole panel, and one of thirty-two of which eighteen are used.
+    let w: Vec<f32> = (1..=164_u8).map(f32::from).collect();
+    let mut packed = vec![f32::NAN; packed_len(2, 82)];
+    pack(&w, 2, 82, &mut packed);
+    assert_eq!(packed.len(), 2 * 96);
+    assert_eq!(packed[..64], w[..64]);
+    assert_eq!(packed[64..128], w[82..146]);
+    assert_eq!(packed[128..146], w[64..82]);
+    assert_eq!(packed[160..178], w[146..]);
+    let padding = packed[146..160].iter().chain(&packed[178..]);
+    assert!(padding.into_iter().all(|&w| w == 0.0));
 }
 
 /// Bits that must never change, on any target or at any optimisation level.
@@ -406,7 +470,7 @@ fn results_have_the_same_bits_everywhere() {
     let layer = Linear {
         k,
         n,
-        w: &packed,
+        w: Panels::F32(&packed),
         bias: &bias,
         activation: Activation::Tanh,
         accumulate: false,
@@ -416,14 +480,14 @@ fn results_have_the_same_bits_everywhere() {
         beta: &bias,
         eps: 1e-5,
     };
-    let cache = values(50 * 64, 4);
+    let (keys, cache) = (values(keys_len(50, 64), 6), values(50 * 64, 4));
     let attention = Attention {
         heads: 2,
         head_dim: 32,
         scale: 0.25,
         q_stride: 64,
         visible: 49,
-        cache_k: &cache,
+        cache_k: &keys,
         cache_v: &cache,
     };
     let results = on_all(|isa| {
@@ -432,7 +496,7 @@ fn results_have_the_same_bits_everywhere() {
         norm.run(isa, &y, &mut z);
         softmax(isa, &z, n, &mut p);
         let mut attended = vec![0.0; 128];
-        attention.run(isa, &values(128, 5), &mut attended, &mut [0.0; 50]);
+        attention.run(isa, &values(128, 5), &mut attended, &mut [0.0; 256]);
         [y, z, p, attended]
     });
     let digests = results.map(|x| digest(&x));
@@ -440,7 +504,7 @@ fn results_have_the_same_bits_everywhere() {
         0x05e1_b773_fda2_c929,
         0xddf6_4acd_014e_4f1e,
         0x370e_3ea7_0ba2_cda6,
-        0x52c6_1ccb_bf23_7a75,
+        0x3994_9bd4_e431_7df5,
     ];
     assert_eq!(digests, expected, "{digests:#x?}");
 }

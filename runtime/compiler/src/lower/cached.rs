@@ -38,7 +38,11 @@ impl Lowering<'_> {
         let (queries, tokens) = (shape[0], self.shape(x[1])?[0]);
         let [q, k, v] = [self.rows(x[0])?, self.rows(x[1])?, self.rows(x[2])?];
         let y = self.allocate(id, &shape);
-        let scratch = self.buffer(attention_scratch_len(queries, self.cache.capacity));
+        let scratch = self.buffer(attention_scratch_len(
+            queries,
+            self.cache.heads,
+            self.cache.capacity,
+        ));
         let op = Attention {
             y: self.span(&y, product(&shape)),
             queries: queries as u32,

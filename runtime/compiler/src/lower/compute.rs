@@ -371,7 +371,7 @@ impl Lowering<'_> {
             .constant(x[1])
             .cloned()
             .ok_or("reads weights that are not constant")?;
-        let w = self.weights.packed(&matrix)?;
+        let packed = self.weights.packed(&matrix)?;
         let bias = if bias { Some(self.plain(x[2])?) } else { None };
         let rows = self.contiguous(x[0])?;
         let y = match x.last() {
@@ -381,7 +381,9 @@ impl Lowering<'_> {
         let (k, n) = (matrix.shape[0] as u32, matrix.shape[1] as u32);
         let op = Linear {
             x: rows,
-            w,
+            format: packed.format,
+            w: packed.w,
+            scales: packed.scales,
             bias,
             y: self.span(&y, product(&shape)),
             m: rows.len / k,

@@ -7,8 +7,9 @@ use std::collections::HashMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 
-use lads_core::op::WeightSpan;
-use lads_kernels::{PANEL, pack, packed_len};
+use bytemuck::NoUninit;
+use lads_core::op::{WeightFormat, WeightSpan};
+use lads_kernels::{PANEL, pack, packed_len, stored};
 
 use crate::tensor::Tensor;
 
@@ -20,11 +21,24 @@ const ALIGN: usize = 16;
 enum Form {
     Plain,
     Packed,
+    Scales,
+}
+
+/// A packed matrix.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Packed {
+    pub format: WeightFormat,
+    pub w: WeightSpan,
+    /// Of `Int8` only.
+    pub scales: Option<WeightSpan>,
 }
 
 /// The weights of an image.
 #[derive(Debug, Default)]
 pub(crate) struct Weights {
+    /// How packed matrices are stored; everything else is `f32`.
+    format: WeightFormat,
+    /// In words: of what is stored with fewer bits, several to an element here.
     pub data: Vec<f32>,
     /// By content, as a hash: where blocks with that hash start.
     places: HashMap<u64, Vec<usize>>,
@@ -33,6 +47,13 @@ pub(crate) struct Weights {
 }
 
 impl Weights {
+    pub fn new(format: WeightFormat) -> Self {
+        Self {
+            format,
+            ..Self::default()
+        }
+    }
+
     /// Stores a tensor as it is.
     pub fn plain(&mut self, tensor: &Arc<Tensor>) -> Result<WeightSpan, String> {
         let data = tensor.as_f32().ok_or("reads integers as numbers")?;
@@ -40,16 +61,62 @@ impl Weights {
     }
 
     /// Stores a `[k, n]` matrix in the panels that `Linear` reads.
-    pub fn packed(&mut self, tensor: &Arc<Tensor>) -> Result<WeightSpan, String> {
+    pub fn packed(&mut self, tensor: &Arc<Tensor>) -> Result<Packed, String> {
         let data = tensor.as_f32().ok_or("reads integers as numbers")?;
         let &[k, n] = &tensor.shape[..] else {
             return Err("has weights that are no matrix".into());
         };
-        self.once(tensor, Form::Packed, |this| {
-            let mut panels = vec![0.0; packed_len(k, n)];
-            pack(data, k, n, &mut panels);
-            this.store_blocks(&panels, k * PANEL)
-        })
+        let format = self.format;
+        let mut scales = None;
+        let w = match format {
+            WeightFormat::F32 => {
+                self.once(tensor, Form::Packed, |this| this.store_panels(data, [k, n]))?
+            }
+            WeightFormat::F16 => {
+                let halves = converted(data, format, stored::to_f16)?;
+                self.once(tensor, Form::Packed, |this| {
+                    this.store_panels(&halves, [k, n])
+                })?
+            }
+            WeightFormat::Bf16 => {
+                let halves = converted(data, format, stored::to_bf16)?;
+                self.once(tensor, Form::Packed, |this| {
+                    this.store_panels(&halves, [k, n])
+                })?
+            }
+            WeightFormat::Int8 => {
+                let column = |j: usize| data.iter().skip(j).step_by(n).copied();
+                let columns: Vec<f32> = (0..n).map(|j| stored::int8_scale(column(j))).collect();
+                let mut at = (0..n).cycle();
+                let integers = converted(data, format, |w| {
+                    let scale = columns[at.next().unwrap_or(0)];
+                    w.is_finite().then(|| stored::to_int8(w, scale))
+                })?;
+                // The scales come first, next to the bias: both are read once per panel.
+                scales = Some(self.once(tensor, Form::Scales, |this| this.store(&columns))?);
+                self.once(tensor, Form::Packed, |this| {
+                    this.store_panels(&integers, [k, n])
+                })?
+            }
+        };
+        Ok(Packed { format, w, scales })
+    }
+
+    /// Panels as words; of a matrix of which another program needs some columns only, the columns' panels are found again.
+    fn store_panels<T: NoUninit + Default>(
+        &mut self,
+        data: &[T],
+        [k, n]: [usize; 2],
+    ) -> Result<WeightSpan, String> {
+        let mut panels = vec![T::default(); packed_len(k, n)];
+        pack(data, k, n, &mut panels);
+        let words: Vec<f32> = bytemuck::cast_slice(&panels)
+            .as_chunks::<4>()
+            .0
+            .iter()
+            .map(|&word| f32::from_bits(u32::from_le_bytes(word)))
+            .collect();
+        self.store_blocks(&words, k * PANEL * size_of::<T>() / 4)
     }
 
     fn once(
@@ -113,6 +180,22 @@ impl Weights {
             len: data.len() as u32,
         })
     }
+}
+
+/// Every weight in another format.
+fn converted<T>(
+    data: &[f32],
+    format: WeightFormat,
+    to: impl FnMut(f32) -> Option<T>,
+) -> Result<Vec<T>, String> {
+    let all: Option<Vec<T>> = data.iter().copied().map(to).collect();
+    all.ok_or_else(|| {
+        let largest = data.iter().fold(0.0_f32, |largest, w| largest.max(w.abs()));
+        format!(
+            "has weights up to {largest:e}, which {} cannot hold; compile with another format",
+            format.name()
+        )
+    })
 }
 
 /// The bits of elements, so that zeros of different sign differ.

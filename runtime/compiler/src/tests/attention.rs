@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 
 use lads_core::op::{Op, Port};
+use lads_kernels::reference;
 
 use super::machine::Machine;
 use super::models::{Small, int, ints};
@@ -197,11 +198,12 @@ fn agrees(spelling: &Spelling) -> Compiled {
             vec![f32::NAN; cache().len().expect("a size") as usize],
         );
         machine.set(&program.placed, Port::Observation, &x);
-        for (span, rows) in cache().spans(0).into_iter().zip([&keys, &values]) {
-            for (i, &value) in rows.iter().enumerate() {
-                let (head, row, col) = (i / (past * DIM), i / DIM % past, i % DIM);
-                machine.cache[span.offset as usize + row * WIDTH + head * DIM + col] = value;
-            }
+        let [key_span, value_span] = cache().spans(0).map(|span| span.offset as usize);
+        for (i, (&key, &value)) in keys.iter().zip(&values).enumerate() {
+            let (head, row, col) = (i / (past * DIM), i / DIM % past, i % DIM);
+            let col = head * DIM + col;
+            machine.cache[key_span + reference::key(WIDTH, row, col)] = key;
+            machine.cache[value_span + row * WIDTH + col] = value;
         }
         machine.run(&program.placed, past);
         let shape = [1, HEADS, past, DIM];

@@ -106,9 +106,11 @@ impl<'w> Machine<'w> {
                 let mut y = vec![];
                 for i in 0..m * n {
                     let (row, col) = (i / n, i % n);
-                    let panel = &w[col / PANEL * k * PANEL..];
+                    let first = col / PANEL * PANEL;
+                    let wide = (n - first).next_multiple_of(16).min(PANEL);
+                    let panel = &w[first * k..];
                     let products = (0..k).map(|l| {
-                        f64::from(x[row * k + l]) * f64::from(panel[l * PANEL + col % PANEL])
+                        f64::from(x[row * k + l]) * f64::from(panel[l * wide + col % PANEL])
                     });
                     let sum = products.sum::<f64>()
                         + op.bias
@@ -228,14 +230,13 @@ impl<'w> Machine<'w> {
 
     fn attention(&mut self, op: &lads_core::op::Attention, past: usize) {
         let width = (op.heads * op.head_dim) as usize;
-        for (rows, stride, cache) in [
-            (op.k, op.k_stride, op.cache_k),
-            (op.v, op.v_stride, op.cache_v),
-        ] {
-            for i in 0..op.tokens as usize {
-                let row = self.get(rows)[i * stride as usize..][..width].to_vec();
-                self.cache[cache.offset as usize + (past + i) * width..][..width]
-                    .copy_from_slice(&row);
+        for i in 0..op.tokens as usize {
+            for col in 0..width {
+                let key = self.get(op.k)[i * op.k_stride as usize + col];
+                let value = self.get(op.v)[i * op.v_stride as usize + col];
+                let row = past + i;
+                self.cache[op.cache_k.offset as usize + reference::key(width, row, col)] = key;
+                self.cache[op.cache_v.offset as usize + row * width + col] = value;
             }
         }
         if op.queries == 0 {

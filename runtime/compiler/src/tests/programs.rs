@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use lads_core::op::Port;
+use lads_kernels::reference;
 use tract_onnx::prelude::Tensor;
 
 use super::machine::Machine;
@@ -135,12 +136,19 @@ impl Case<'_> {
     fn rows(&self, name: &str, shape: &[usize]) -> impl Iterator<Item = usize> {
         let parts: Vec<&str> = name.split('.').collect();
         let layer: usize = parts[1].parse().expect("a layer");
-        let span = self.cache.spans(layer)[usize::from(parts[2] == "value")];
+        let values = parts[2] == "value";
+        let span = self.cache.spans(layer)[usize::from(values)];
         let (heads, len, dim) = (shape[1], shape[2], shape[3]);
         let width = heads * dim;
         (0..heads * len * dim).map(move |i| {
             let (head, row, col) = (i / (len * dim), i / dim % len, i % dim);
-            span.offset as usize + row * width + head * dim + col
+            let col = head * dim + col;
+            let at = if values {
+                row * width + col
+            } else {
+                reference::key(width, row, col)
+            };
+            span.offset as usize + at
         })
     }
 }

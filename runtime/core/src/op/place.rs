@@ -17,12 +17,12 @@ record! {
 }
 
 record! {
-    /// Elements `offset..offset + len` of the weights.
-    #[derive(Eq, Default)]
+    /// 4-byte words `offset..offset + len` of the weights: as many `f32` elements, or more of a smaller format.
+    #[derive(Eq, Hash, Default)]
     pub struct WeightSpan {
-        /// First element.
+        /// First word.
         pub offset: u32,
-        /// Number of elements.
+        /// Number of words.
         pub len: u32,
     }
 }

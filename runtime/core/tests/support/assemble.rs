@@ -116,7 +116,9 @@ impl Draft {
         let Packed { k, n, w, b } = dense;
         self.op(op::Linear {
             x,
+            format: op::WeightFormat::F32,
             w,
+            scales: None,
             bias: Some(b),
             y,
             m: x.len / k,
@@ -215,7 +217,11 @@ impl Transformer {
     fn attend(&self, draft: &mut Draft, layer: &PackedLayer, qkv: Span, queries: u32) -> Span {
         let (width, stride) = (self.width, 3 * self.width);
         let tokens = qkv.len / stride;
-        let scratch = attention_scratch_len(queries as usize, self.capacity as usize) as u32;
+        let scratch = attention_scratch_len(
+            queries as usize,
+            self.heads as usize,
+            self.capacity as usize,
+        ) as u32;
         let (y, scratch) = (draft.span(queries * width), draft.span(scratch));
         let part = |first: u32, rows: u32| Span {
             offset: qkv.offset + (tokens - rows) * stride + first * width,
@@ -254,10 +260,10 @@ pub fn parts(model: &Model) -> Parts {
     let mut pool = Pool(Vec::new());
     let capacity = (spec.words_len + 1 + 2 * (spec.steps - 1)) as u32;
     let mut cache_len = 0;
-    let mut cache = || {
+    let mut cache = |rows: u32| {
         let span = StateSpan {
             offset: cache_len,
-            len: capacity * d,
+            len: rows * d,
         };
         cache_len += span.len;
         span
@@ -269,8 +275,8 @@ pub fn parts(model: &Model) -> Parts {
         norm2: pool.norm(&layer.norm2),
         up: pool.dense(&layer.up),
         down: pool.dense(&layer.down),
-        cache_k: cache(),
-        cache_v: cache(),
+        cache_k: cache(capacity.next_multiple_of(16)),
+        cache_v: cache(capacity),
     });
     let layers = layers.collect();
     let transformer = Transformer {

@@ -1,0 +1,190 @@
+//! How weights are stored: 32-bit floats, or fewer bits that are decoded in registers while they are read. Sums are always 32-bit.
+//!
+//! | format | bits | error of a weight |
+//! |---|---|---|
+//! | `F32` | 32 | none |
+//! | `F16` | 16 | half a unit of 11 bits (relative 2^-11), or 2^-25 below 2^-14; magnitudes up to 65504 |
+//! | `Bf16` | 16 | half a unit of 8 bits (relative 2^-8) |
+//! | `Int8` | 8, and one `f32` scale per output | half of the scale: the output's largest weight / 254 |
+//!
+//! Conversions round to the nearest, ties to even, and are exact the other way, so every instruction set decodes the same bits.
+//! Encoding is offline work and can fail: [`to_f16`] has no number for what is too large.
+
+use crate::lanes::{Block, LANES};
+use crate::simd::Simd;
+
+/// How the weights of a dense layer are stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum WeightFormat {
+    /// IEEE 754 single precision.
+    #[default]
+    F32,
+    /// IEEE 754 half precision.
+    F16,
+    /// The upper half of single precision.
+    Bf16,
+    /// Integers from -127 to 127, times a scale per output.
+    Int8,
+}
+
+impl WeightFormat {
+    /// All of them, the most exact first.
+    pub const ALL: [Self; 4] = [Self::F32, Self::F16, Self::Bf16, Self::Int8];
+
+    /// Bytes of a weight.
+    pub const fn bytes(self) -> usize {
+        match self {
+            Self::F32 => 4,
+            Self::F16 | Self::Bf16 => 2,
+            Self::Int8 => 1,
+        }
+    }
+
+    /// Its name: `f32`, `f16`, `bf16` or `int8`.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::F32 => "f32",
+            Self::F16 => "f16",
+            Self::Bf16 => "bf16",
+            Self::Int8 => "int8",
+        }
+    }
+}
+
+/// The weights of a dense layer in panels, as [`pack`](crate::pack) orders them.
+#[derive(Debug, Clone, Copy)]
+pub enum Panels<'w> {
+    /// [`WeightFormat::F32`]
+    F32(&'w [f32]),
+    /// [`WeightFormat::F16`]
+    F16(&'w [u16]),
+    /// [`WeightFormat::Bf16`]
+    Bf16(&'w [u16]),
+    /// [`WeightFormat::Int8`]
+    Int8 {
+        /// The integers.
+        panels: &'w [i8],
+        /// `[n]`: multiplies each output's sum.
+        scales: &'w [f32],
+    },
+}
+
+/// A format at work: how sixteen stored weights become a vector.
+pub(crate) trait Stored {
+    /// One weight as it is stored.
+    type Bits;
+    /// Decodes.
+    fn load<S: Simd>(simd: S, from: &[Self::Bits; LANES]) -> S::V;
+}
+
+pub(crate) struct F32;
+pub(crate) struct F16;
+pub(crate) struct Bf16;
+pub(crate) struct Int8;
+
+impl Stored for F32 {
+    type Bits = f32;
+    #[inline(always)]
+    fn load<S: Simd>(simd: S, from: &Block) -> S::V {
+        simd.load(from)
+    }
+}
+
+impl Stored for F16 {
+    type Bits = u16;
+    #[inline(always)]
+    fn load<S: Simd>(simd: S, from: &[u16; LANES]) -> S::V {
+        simd.load_f16(from)
+    }
+}
+
+impl Stored for Bf16 {
+    type Bits = u16;
+    #[inline(always)]
+    fn load<S: Simd>(simd: S, from: &[u16; LANES]) -> S::V {
+        simd.load_bf16(from)
+    }
+}
+
+impl Stored for Int8 {
+    type Bits = i8;
+    #[inline(always)]
+    fn load<S: Simd>(simd: S, from: &[i8; LANES]) -> S::V {
+        simd.load_i8(from)
+    }
+}
+
+/// The number that half-precision bits mean; exact. Integer arithmetic, and one subtraction of normal numbers for those below
+/// the normal range, so that it does not depend on how the processor treats subnormal numbers.
+#[inline(always)]
+pub fn from_f16(bits: u16) -> f32 {
+    // What the exponents' biases, 127 and 15, differ by, and the exponent 2^-14 of the smallest normal number.
+    const REBIAS: u32 = (127 - 15) << 23;
+    const SMALLEST: u32 = (127 - 14) << 23;
+    let magnitude = u32::from(bits & 0x7fff) << 13;
+    let normal = magnitude + REBIAS;
+    let subnormal = (f32::from_bits(magnitude + SMALLEST) - f32::from_bits(SMALLEST)).to_bits();
+    // Infinity and what is not a number keep an exponent of ones.
+    let special = magnitude + 2 * REBIAS;
+    // Selections of computed numbers, so that compilers vectorise loops over this.
+    let found = if magnitude < 1 << 23 {
+        subnormal
+    } else {
+        normal
+    };
+    let found = if magnitude >= 31 << 23 {
+        special
+    } else {
+        found
+    };
+    f32::from_bits(found | u32::from(bits & 0x8000) << 16)
+}
+
+/// The nearest half-precision number, ties to even; `None` for what is not finite or rounds to more than 65504.
+pub fn to_f16(x: f32) -> Option<u16> {
+    let sign = (x.to_bits() >> 16) as u16 & 0x8000;
+    let magnitude = x.abs();
+    // The midpoint between the largest number and what would be the next one.
+    if magnitude.is_nan() || magnitude >= 65520.0 {
+        return None;
+    }
+    let bits = if magnitude < f32::from_bits((127 - 14) << 23) {
+        // Steps of 2^-24: adding 0.5, whose last place has that value, rounds there.
+        ((magnitude + 0.5).to_bits() - 0.5_f32.to_bits()) as u16
+    } else {
+        // Half a unit of what is dropped, less one where the kept part is even; the carry may go into the exponent.
+        let bits = magnitude.to_bits();
+        let rounded = bits + 0xfff + (bits >> 13 & 1);
+        ((rounded - ((127 - 15) << 23)) >> 13) as u16
+    };
+    Some(sign | bits)
+}
+
+/// The number that a brain float means; exact.
+#[inline(always)]
+pub fn from_bf16(bits: u16) -> f32 {
+    f32::from_bits(u32::from(bits) << 16)
+}
+
+/// The nearest brain float, ties to even; `None` for what is not finite or rounds to infinity.
+pub fn to_bf16(x: f32) -> Option<u16> {
+    let bits = x.to_bits();
+    let rounded = bits.checked_add(0x7fff + (bits >> 16 & 1))? >> 16;
+    (x.is_finite() && rounded & 0x7f80 != 0x7f80).then_some(rounded as u16)
+}
+
+/// The scale of one output's weights: its largest magnitude / 127; 1 where all are zero.
+pub fn int8_scale(weights: impl Iterator<Item = f32>) -> f32 {
+    let largest = weights.fold(0.0, |largest: f32, w| largest.max(w.abs()));
+    // A scale below the normal numbers would lose digits, and be flushed in a control step.
+    if largest / 127.0 < f32::MIN_POSITIVE {
+        1.0
+    } else {
+        largest / 127.0
+    }
+}
+
+/// The nearest multiple of the scale, ties to even; between -127 and 127.
+pub fn to_int8(x: f32, scale: f32) -> i8 {
+    libm::rintf(x / scale).clamp(-127.0, 127.0) as i8
+}
