@@ -18,6 +18,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+use lads_compiler::{Options, WeightFormat};
 
 use crate::model::Model;
 use crate::refusal::Refusal;
@@ -56,6 +57,17 @@ enum Command {
         /// A Rust source to write: the image as a constant, aligned byte array
         #[arg(long, value_name = "FILE")]
         emit_rust: Option<PathBuf>,
+        /// How the weights are stored; sums are 32-bit floats in any case. Fewer bits than 32 have to pass a gate: the golden
+        /// episode replays with the same plans, and with actions inside the tolerance
+        #[arg(long, value_name = "FORMAT", default_value = "f32", value_parser = weight_format)]
+        weights: WeightFormat,
+        /// Largest difference of an action that the gate, and later the image's self-test, accept, in the action's units; the
+        /// bundle's own is meant for 32-bit weights
+        #[arg(long, value_name = "DIFFERENCE", value_parser = tolerance)]
+        tolerance: Option<f32>,
+        /// Writes an image that the gate refuses, for experiments; its self-test fails
+        #[arg(long)]
+        force: bool,
     },
     /// Replays the policy's golden episode on this machine and compares plans and actions
     SelfTest {
@@ -135,9 +147,18 @@ fn run(command: Command) -> Result<(), Refusal> {
             output,
             emit_c,
             emit_rust,
+            weights,
+            tolerance,
+            force,
         } => {
-            let model = Model::open(&model)?;
-            if output.is_some() && !model.is_bundle() {
+            let options = Options {
+                weights,
+                tolerance,
+                force,
+            };
+            let model = Model::compile(&model, options)?;
+            let again = output.is_some() || options != Options::default();
+            if again && !model.is_bundle() {
                 return Err(Refusal::new(
                     model.path.display(),
                     "it is a compiled image already",
@@ -158,7 +179,11 @@ fn run(command: Command) -> Result<(), Refusal> {
                 write_file(path, bytes)?;
                 print(&format!("{}: {} bytes\n", path.display(), bytes.len()))?;
             }
-            Ok(())
+            if weights == WeightFormat::F32 || force {
+                return Ok(());
+            }
+            let line = self_test::self_test(&model)?;
+            print(&format!("{} weights: {line}\n", weights.name()))
         }
         Command::SelfTest { model } => {
             let line = self_test::self_test(&Model::open(&model)?)?;
@@ -185,6 +210,18 @@ fn run(command: Command) -> Result<(), Refusal> {
             )
         }
     }
+}
+
+fn weight_format(name: &str) -> Result<WeightFormat, String> {
+    let known = WeightFormat::ALL;
+    let found = known.into_iter().find(|format| format.name() == name);
+    found.ok_or_else(|| format!("known are {}", known.map(WeightFormat::name).join(", ")))
+}
+
+fn tolerance(text: &str) -> Result<f32, String> {
+    let number: Option<f32> = text.parse().ok();
+    let positive = number.filter(|number| number.is_finite() && *number > 0.0);
+    positive.ok_or_else(|| "it has to be a positive number".into())
 }
 
 /// Prints to stdout; a reader that has left is no failure.

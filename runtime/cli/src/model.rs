@@ -5,7 +5,7 @@
 
 use std::path::{Path, PathBuf};
 
-use lads_compiler::{Bundle, Image, compile};
+use lads_compiler::{Bundle, Image, Options, compile_with};
 use lads_core::{KnownInstruction, Policy};
 
 use crate::refusal::{Refusal, chain};
@@ -29,8 +29,13 @@ pub struct Model {
 }
 
 impl Model {
-    /// Reads and, where it is a bundle, compiles the policy at `path`.
+    /// Reads and, where it is a bundle, compiles the policy at `path`, with 32-bit weights.
     pub fn open(path: &Path) -> Result<Self, Refusal> {
+        Self::compile(path, Options::default())
+    }
+
+    /// The same with other weights; an image has those that it was compiled with.
+    pub fn compile(path: &Path, options: Options) -> Result<Self, Refusal> {
         let file = std::fs::read(path).map_err(|error| {
             Refusal::new(
                 path.display(),
@@ -45,7 +50,8 @@ impl Model {
                 Refusal::with_remedy_inside(path.display(), chain(error))
             };
             let bundle = Bundle::from_bytes(&file).map_err(|error| about(&error))?;
-            Bytes::Compiled(compile(&bundle).map_err(|error| about(&error))?)
+            let image = compile_with(&bundle, options);
+            Bytes::Compiled(image.map_err(|error| about(&error))?)
         };
         let model = Self {
             path: path.to_owned(),

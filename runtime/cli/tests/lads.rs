@@ -397,6 +397,33 @@ fn bad_files_are_refused_by_every_command() {
 }
 
 #[test]
+fn weights_of_fewer_bits_pass_a_gate() {
+    let folder = tempfile::tempdir().unwrap();
+    let (model, image) = (tiny(), folder.path().join("tiny.lads"));
+    let (model, image) = (model.to_str().unwrap(), image.to_str().unwrap());
+    let compile = |more: &[&'static str]| [&["compile", model, "-o", image], more].concat();
+    // The bundle's tolerance is that of 32-bit sums.
+    refused(
+        &compile(&["--weights", "bf16"]),
+        "",
+        &["tiny.onnx", "bf16", "step 0", "tolerance"],
+    );
+    assert!(!Path::new(image).exists());
+    let said = answer(&compile(&["--weights", "bf16", "--tolerance", "0.005"]), "");
+    assert!(said.contains("bf16 weights: self-test passed"), "{said}");
+    let tested = answer(&["self-test", image], "");
+    assert!(tested.contains("tolerance 5e-3"), "{tested}");
+    answer(&compile(&["--weights", "int8", "--force"]), "");
+    refused(&["self-test", image], "", &["self-test failed"]);
+    for (flag, value, known) in [
+        ("--weights", "f8", "f32, f16, bf16, int8"),
+        ("--tolerance", "0", "positive"),
+    ] {
+        refused(&compile(&[flag, value]), "", &[value, known]);
+    }
+}
+
+#[test]
 fn a_failed_compile_overwrites_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let output = folder.path().join("out.lads");

@@ -683,6 +683,7 @@ fn the_contract_says_what_was_written() {
     );
     assert_eq!(
         policy.state_len(),
-        contract.network().layers * 2 * 10 * 19 + 2 * (3 + 2 + 5)
+        // Values of nineteen tokens; keys in two blocks of sixteen.
+        contract.network().layers * 10 * (19 + 32) + 2 * (3 + 2 + 5)
     );
 }

@@ -5,7 +5,7 @@ use lads_core::image::{ContractRecord, Layout, PortRecord, ProgramRecord, Sectio
 use lads_core::op::{
     Activation, ArgMax, ArgMin, Attention, Binary, BinaryKind, Copy, GatherRow, IntSlot, LayerNorm,
     Linear, MatMul, OP_WORDS, Op, Operand, Reduce, ReduceKind, Softmax, Space, Span, StateSpan,
-    Unary, UnaryKind, WeightSpan,
+    Unary, UnaryKind, WeightFormat, WeightSpan,
 };
 use proptest::prelude::*;
 
