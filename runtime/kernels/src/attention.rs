@@ -52,7 +52,9 @@ pub fn append_values(x: &[f32], stride: usize, width: usize, cache: &mut [f32], 
 pub fn append_keys(x: &[f32], stride: usize, width: usize, cache: &mut [f32], first: usize) {
     for (i, x) in x.chunks(stride.max(1)).enumerate() {
         let (block, lane) = ((first + i) / LANES, (first + i) % LANES);
-        let block = cache.chunks_exact_mut(width.max(1) * LANES).nth(block);
+        let block = cache
+            .chunks_exact_mut(width.saturating_mul(LANES).max(1))
+            .nth(block);
         let (lines, _) = block.unwrap_or(&mut []).as_chunks_mut::<LANES>();
         for (line, &x) in lines.iter_mut().zip(x) {
             if let Some(to) = line.get_mut(lane) {

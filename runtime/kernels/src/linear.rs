@@ -114,45 +114,21 @@ impl Linear<'_> {
         }
     }
 
-    /// Scale, bias, activation and store of the outputs from `first` on.
+    /// Scale, bias, activation and store of sixteen outputs from `first` on.
     #[inline(always)]
-    fn finish<S: Simd, const P: usize>(
-        &self,
-        simd: S,
-        sums: [S::V; P],
-        first: usize,
-        y: &mut [f32],
-    ) {
-        for (p, sum) in sums.into_iter().enumerate() {
-            let first = first + p * LANES;
-            let mut block = [0.0; LANES];
-            simd.store(sum, &mut block);
-            if let Panels::Int8 { scales, .. } = self.w {
-                for (x, &scale) in block.iter_mut().zip(scales.get(first..).unwrap_or(&[])) {
-                    *x *= scale;
-                }
+    fn finish(&self, mut sums: Block, first: usize, y: &mut [f32]) {
+        if let Panels::Int8 { scales, .. } = self.w {
+            for (sum, &scale) in sums.iter_mut().zip(scales.get(first..).unwrap_or(&[])) {
+                *sum *= scale;
             }
-            if let Some(bias) = self.bias.get(first..).and_then(<[_]>::first_chunk) {
-                let bias: &Block = bias;
-                for (x, bias) in block.iter_mut().zip(bias) {
-                    *x += bias;
-                }
-            } else {
-                for (x, &bias) in block.iter_mut().zip(self.bias.get(first..).unwrap_or(&[])) {
-                    *x += bias;
-                }
-            }
-            self.activation.apply(&mut block);
-            let y = y.get_mut(first..).unwrap_or(&mut []);
-            if let Some(y) = y.first_chunk_mut::<LANES>() {
-                for (y, &x) in y.iter_mut().zip(&block) {
-                    *y = if self.accumulate { *y + x } else { x };
-                }
-            } else {
-                for (y, &x) in y.iter_mut().zip(&block) {
-                    *y = if self.accumulate { *y + x } else { x };
-                }
-            }
+        }
+        for (sum, &bias) in sums.iter_mut().zip(self.bias.get(first..).unwrap_or(&[])) {
+            *sum += bias;
+        }
+        self.activation.apply(&mut sums);
+        let y = y.get_mut(first..).unwrap_or(&mut []);
+        for (y, &sum) in y.iter_mut().zip(&sums) {
+            *y = if self.accumulate { *y + sum } else { sum };
         }
     }
 }
@@ -165,106 +141,64 @@ struct Rows<'a, W: Stored, const NARROW: bool> {
     y: &'a mut [f32],
 }
 
+/// The sums of one panel for two rows.
+type Sums = [[Block; PANEL_BLOCKS]; 2];
+
 impl<W: Stored, const NARROW: bool> Kernel for Rows<'_, W, NARROW> {
     const NARROW: bool = NARROW;
 
     #[inline(always)]
-    fn run<S: Simd>(mut self, simd: S) {
-        let (whole, rest) = (self.layer.n / PANEL, self.layer.n % PANEL);
-        for panel in 0..whole {
-            self.panel::<S, PANEL_BLOCKS>(simd, panel * PANEL);
-        }
-        let first = whole * PANEL;
-        match rest.div_ceil(LANES) {
-            0 => {}
-            1 => self.panel::<S, 1>(simd, first),
-            2 => self.panel::<S, 2>(simd, first),
-            3 => self.panel::<S, 3>(simd, first),
-            _ => self.panel::<S, PANEL_BLOCKS>(simd, first),
-        }
-    }
-}
-
-impl<W: Stored, const NARROW: bool> Rows<'_, W, NARROW> {
-    /// A panel of `B` blocks with all rows of `x`; the first output is `first`.
-    #[inline(always)]
-    fn panel<S: Simd, const B: usize>(&mut self, simd: S, first: usize) {
+    fn run<S: Simd>(self, simd: S) {
         let (k, n) = (self.layer.k, self.layer.n);
-        let start = first * k;
-        let w = self.w.get(start..start + B * LANES * k).unwrap_or(&[]);
-        let mut xs = self.x.chunks_exact((2 * k).max(1));
-        let mut ys = self.y.chunks_exact_mut((2 * n).max(1));
-        for (x, y) in xs.by_ref().zip(ys.by_ref()) {
-            let (Some((x0, x1)), Some((y0, y1))) =
-                (x.split_at_checked(k), y.split_at_mut_checked(n))
-            else {
-                return;
-            };
-            rows::<S, W, B, 2>(simd, self.layer, w, first, [x0, x1], [y0, y1]);
-        }
-        let (x, y) = (xs.remainder(), ys.into_remainder());
-        if x.len() == k && y.len() == n {
-            rows::<S, W, B, 1>(simd, self.layer, w, first, [x], [y]);
+        for first in (0..n).step_by(PANEL) {
+            let blocks = (n - first).div_ceil(LANES).min(PANEL_BLOCKS);
+            let start = first * k;
+            let w = self.w.get(start..start + blocks * LANES * k).unwrap_or(&[]);
+            let xs = self.x.chunks((2 * k).max(1));
+            let ys = self.y.chunks_mut((2 * n).max(1));
+            for (x, y) in xs.zip(ys) {
+                let mut sums = [[[0.0; LANES]; PANEL_BLOCKS]; 2];
+                match x.split_at_checked(k) {
+                    Some((x0, x1)) if x1.len() == k => {
+                        panel::<S, W, 2>(simd, w, blocks, [x0, x1], &mut sums);
+                    }
+                    Some((x, _)) => panel::<S, W, 1>(simd, w, blocks, [x], &mut sums),
+                    None => return,
+                }
+                // Written once for all widths and numbers of rows: activations are long.
+                for (y, sums) in y.chunks_exact_mut(n.max(1)).zip(sums) {
+                    for (block, sums) in sums.into_iter().take(blocks).enumerate() {
+                        self.layer.finish(sums, first + block * LANES, y);
+                    }
+                }
+            }
         }
     }
 }
 
 /// One panel and `R` rows, in as many parts as the registers ask for.
 #[inline(always)]
-fn rows<S: Simd, W: Stored, const B: usize, const R: usize>(
+fn panel<S: Simd, W: Stored, const R: usize>(
     simd: S,
-    layer: &Linear,
     w: &[W::Bits],
-    first: usize,
+    blocks: usize,
     x: [&[f32]; R],
-    y: [&mut [f32]; R],
+    sums: &mut Sums,
 ) {
-    if S::SUMS >= B * R {
-        part::<S, W, B, B, R>(simd, layer, w, [first, 0], x, y);
-    } else if S::SUMS >= 2 * R && B.is_multiple_of(2) {
-        let mut y = y;
-        for at in (0..B).step_by(2) {
-            part::<S, W, 2, B, R>(
-                simd,
-                layer,
-                w,
-                [first, at],
-                x,
-                y.each_mut().map(|y| &mut **y),
-            );
-        }
-    } else {
-        let mut y = y;
-        for at in 0..B {
-            part::<S, W, 1, B, R>(
-                simd,
-                layer,
-                w,
-                [first, at],
-                x,
-                y.each_mut().map(|y| &mut **y),
-            );
-        }
+    let mut at = 0;
+    while at < blocks {
+        let (place, left) = ([at, blocks], blocks - at);
+        at += if S::SUMS >= PANEL_BLOCKS * R && left >= PANEL_BLOCKS {
+            sweep::<S, W, PANEL_BLOCKS, R>(simd, w, place, x, sums)
+        } else if S::SUMS >= 2 * R && left >= 2 {
+            sweep::<S, W, 2, R>(simd, w, place, x, sums)
+        } else {
+            sweep::<S, W, 1, R>(simd, w, place, x, sums)
+        };
     }
 }
 
-/// `P` blocks, from block `at` on, of a panel of `B` blocks that begins at output `first`.
-#[inline(always)]
-fn part<S: Simd, W: Stored, const P: usize, const B: usize, const R: usize>(
-    simd: S,
-    layer: &Linear,
-    w: &[W::Bits],
-    [first, at]: [usize; 2],
-    x: [&[f32]; R],
-    y: [&mut [f32]; R],
-) {
-    let sums = sweep::<S, W, P, B, R>(simd, w, at, x);
-    for (sums, y) in sums.into_iter().zip(y) {
-        layer.finish(simd, sums, first + at * LANES, y);
-    }
-}
-
-/// The sums of `R` rows of `k` elements.
+/// The sums of `R` rows of `k` elements with `P` blocks, from block `at` on, of a panel of `blocks`; returns `P`.
 #[inline(always)]
 #[expect(
     clippy::indexing_slicing,
@@ -274,28 +208,34 @@ fn part<S: Simd, W: Stored, const P: usize, const B: usize, const R: usize>(
     unsafe_code,
     reason = "the sums stay in registers only without a branch in the loop, and compilers keep some of the bounds checks"
 )]
-fn sweep<S: Simd, W: Stored, const P: usize, const B: usize, const R: usize>(
+fn sweep<S: Simd, W: Stored, const P: usize, const R: usize>(
     simd: S,
     w: &[W::Bits],
-    at: usize,
+    [at, blocks]: [usize; 2],
     x: [&[f32]; R],
-) -> [[S::V; P]; R] {
-    let mut sums = [[simd.splat(0.0); P]; R];
+    out: &mut Sums,
+) -> usize {
     let (w, _) = w.as_chunks::<LANES>();
-    let (w, _) = w.as_chunks::<B>();
-    if x.iter().any(|x| x.len() != w.len()) || at + P > B {
-        return sums;
+    let w = w.chunks_exact(blocks.max(1));
+    if x.iter().any(|x| x.len() != w.len()) || at + P > blocks {
+        return P;
     }
-    for (l, row) in w.iter().enumerate() {
+    let mut sums = [[simd.splat(0.0); P]; R];
+    for (l, row) in w.enumerate() {
         // SAFETY: each `x[r]` is as long as `w`, as compared above, and `l` is an index of `w`.
         let x: [S::V; R] = x.map(|x| simd.splat(unsafe { *x.get_unchecked(l) }));
         for p in 0..P {
-            // SAFETY: `at + P <= B`, as compared above, and `p < P`.
+            // SAFETY: `row` has `blocks` elements, `at + P <= blocks`, as compared above, and `p < P`.
             let w = W::load(simd, unsafe { row.get_unchecked(at + p) });
             for (sums, &x) in sums.iter_mut().zip(&x) {
                 sums[p] = simd.add_product(sums[p], x, w);
             }
         }
     }
-    sums
+    for (out, sums) in out.iter_mut().zip(sums) {
+        for (out, sum) in out.iter_mut().skip(at).zip(sums) {
+            simd.store(sum, out);
+        }
+    }
+    P
 }
