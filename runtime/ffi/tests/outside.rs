@@ -260,6 +260,25 @@ fn no_c_library_is_needed() {
 }
 
 #[test]
+fn valgrind_finds_nothing() {
+    if !have("valgrind") {
+        return;
+    }
+    let program = build(
+        "cc",
+        "c/main.c",
+        "user_valgrind",
+        &["-std=c99", "-O1", "-g"],
+    );
+    let image = scratch("valgrind.lads");
+    let tiny = compiled("../compiler/tests/data/tiny.onnx");
+    fs::write(&image, tiny.as_bytes()).expect("it can be written");
+    run(Command::new("valgrind")
+        .args(["--quiet", "--error-exitcode=99"])
+        .args([&program, &image]));
+}
+
+#[test]
 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
 fn the_stack_is_what_the_header_says() {
     let program = build("cc", "stack.c", "stack", &["-std=gnu99", "-O2", "-pthread"]);
