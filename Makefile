@@ -62,6 +62,14 @@ train: $(VENV)/stamp
 export: $(VENV)/stamp
 	$(PY) -m lads_exporter export --run runs/$(ENV) -o models/$(ENV).onnx
 
+## reference: the policy of $(MODEL) in PyTorch and the official environment, 20 episodes of each instruction, for `lads-run --verify`
+reference: $(VENV)/stamp
+	$(PY) -m lads_exporter reference --model $(MODEL) -o $(MODEL:.onnx=.reference.json)
+
+## verify: is the compiled policy the reference's? Exit code 0 EQUIVALENT, 1 DIFFERENT, 3 INCONCLUSIVE
+verify: setup
+	cargo run --release -p lads-sim --bin lads-run -- --model $(MODEL) --verify $(ARGS)
+
 ## bench: kernels, entries and the control step
 bench:
 	cargo bench -p lads-benches

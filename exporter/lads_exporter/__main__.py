@@ -102,6 +102,14 @@ def _card_alone(arguments):
     _card(arguments, saved, hashlib.sha256(Path(arguments.output).read_bytes()).hexdigest())
 
 
+def _reference(arguments):
+    from . import reference
+
+    chosen = {key: getattr(arguments, key) for key in ("run", "episodes", "traced", "seed", "noise")}
+    reference.write(arguments.model, arguments.output, **chosen)
+    print(f"{arguments.output}: written; next: lads-run --model {arguments.model} --verify {arguments.output}")
+
+
 def _parser():
     parser = argparse.ArgumentParser(prog="python -m lads_exporter", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
@@ -136,6 +144,16 @@ def _parser():
         command.add_argument("--results", help="JSON of lads-run --json for this bundle")
         command.add_argument("--beside", action="append", default=[], metavar="LABEL=FILE", help="results of another run")
         command.set_defaults(run_command=function)
+
+    rollouts = commands.add_parser("reference", help="reference rollouts: PyTorch in the official environment, for lads-run --verify")
+    rollouts.add_argument("--model", required=True, help="the bundle whose policy is rolled out")
+    rollouts.add_argument("-o", "--output", required=True)
+    rollouts.add_argument("--run", help="take the weights from this run's checkpoint, not from the bundle's initializers")
+    rollouts.add_argument("--episodes", type=int, default=20, help="of each instruction (20)")
+    rollouts.add_argument("--traced", type=int, default=2, help="of these, so many with all actions and the first states (2)")
+    rollouts.add_argument("--seed", type=int, default=0)
+    rollouts.add_argument("--noise", default="v0", help="observation noise: v0, v1 or none")
+    rollouts.set_defaults(run_command=_reference)
     return parser
 
 

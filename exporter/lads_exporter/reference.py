@@ -1,0 +1,277 @@
+"""Reference rollouts: the PyTorch policy in the official environment, for `lads-run --verify` to compare with.
+
+What is independent of what is verified: the network runs as in training, in PyTorch, as a full-sequence forward over the
+whole history at every decision (no KV cache, no ONNX graph, no compiler, no Rust); the physics, the observations and the
+task checks are the official environment's; the words are encoded anew from the instructions' texts where the language
+encoder is installed. What is not: the weights come from the bundle's initializers unless `--run` names the checkpoint, and
+then the normaliser's scale and batch norm are those that the exporter folded; the observation noise is numpy's stream, so
+that the runtime can run the very same episodes.
+
+The policy sees observations as float32 and acts with float32, as the runtime does. An interrupted run continues from its
+progress file, which lies beside the output until that is complete.
+"""
+
+import base64
+import hashlib
+import json
+import os
+import platform
+import struct
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+from tqdm import tqdm
+
+from . import __version__, config, language, official, weights
+from .bundle import write_atomically
+
+FORMAT, FORMAT_VERSION = "lads-reference", 1
+TRACED_STATES = 50
+# What a policy is for; the rest of a contract says how it is built, which is what a verification compares.
+PURPOSE = ("environment", "control_period_s", "observation", "action", "quaternion_order", "instructions", "language")
+
+
+def purpose_sha256(contract):
+    """Hash of what the contract says the policy is for: equal for two policies that can be compared.
+
+    Canonical form: `{key value ...}` with sorted keys, `[value ...]`, texts as `"bytes:UTF-8`, numbers as the 16 hexadecimal
+    digits of their IEEE 754 double, `true`, `false` and `null`; no separators, so that nothing depends on how a number is
+    printed.
+    """
+    digest = hashlib.sha256()
+
+    def add(value):
+        if isinstance(value, dict):
+            digest.update(b"{")
+            for key in sorted(value):
+                add(key)
+                add(value[key])
+            digest.update(b"}")
+        elif isinstance(value, list):
+            digest.update(b"[")
+            for row in value:
+                add(row)
+            digest.update(b"]")
+        elif isinstance(value, str):
+            text = value.encode()
+            digest.update(b'"%d:' % len(text) + text)
+        elif value is None or isinstance(value, bool):
+            digest.update({None: b"null", True: b"true", False: b"false"}[value])
+        else:
+            digest.update(struct.pack(">d", value).hex().encode())
+
+    add({key: contract[key] for key in PURPOSE if key in contract})
+    return digest.hexdigest()
+
+
+class FullSequencePolicy:
+    """The policy as in training: at a decision the transformer reads the words and the whole history from its beginning."""
+
+    def __init__(self, acting, contract, words):
+        """words: one tensor [L, E] per instruction."""
+        self.acting, self.contract, self.words = acting, contract, words
+        limits = ((row["min"], row["max"]) for row in contract["action"])
+        self.low, self.high = (torch.tensor(column, dtype=torch.float32) for column in zip(*limits))
+
+    def start(self, instruction):
+        self.instruction = instruction
+        self.observations, self.actions = [], []
+        self.plans, self.margins = [], []
+
+    @torch.no_grad()
+    def act(self, observation):
+        """observation [O] float32 -> action [A] float32, clipped to the contract's limits."""
+        if len(self.observations) == self.contract["context"]["steps"]:
+            if self.contract["context"]["beyond"] != "restart":
+                raise config.UserError("an episode is longer than the policy's context, and its contract says to refuse")
+            self.observations, self.actions = [], []
+        acting = self.acting
+        self.observations.append(acting.normalizer(torch.from_numpy(observation)))
+        if (len(self.observations) - 1) % self.contract["horizon"] == 0:
+            logits = self._logits()
+            best = logits.topk(2).values
+            self.plans.append(int(logits.argmax()))
+            self.margins.append(float(best[0] - best[1]))
+        plan = acting.codes[self.plans[-1]]
+        action = acting.low_level(self.observations[-1][None], plan[None])[0]
+        action = torch.clamp(action, self.low, self.high)
+        self.actions.append(action)
+        return action.numpy()
+
+    def _logits(self):
+        nothing = torch.zeros(len(self.low))  # the forward pass drops the last action: it has not happened
+        observations, actions = torch.stack(self.observations)[None], torch.stack([*self.actions, nothing])[None]
+        return self.acting.high_level([self.words[self.instruction]], observations, actions)[0, -1]
+
+
+def episode(policy, environment, entropy, instruction, commanded, traced):
+    """One episode as a JSON object; it ends when all commanded sub-tasks are done or the environment's steps are up."""
+    policy.start(instruction)
+    observation = environment.reset(entropy)
+    states, observations, actions = [], [], []
+    while environment.steps < environment.MAX_STEPS and not environment.succeeded(commanded):
+        if traced and len(states) < TRACED_STATES:
+            states.append(environment.state())
+        seen = observation.astype(np.float32)
+        action = policy.act(seen)
+        observations.append(seen)
+        actions.append(action)
+        observation = environment.step(action.astype(np.float64))
+    order = sorted(environment.completions.items(), key=lambda row: (row[1], environment.SUB_TASKS.index(row[0])))
+    row = {
+        "episode": entropy[2],
+        "steps": environment.steps,
+        "success": environment.succeeded(commanded),
+        "completions": [{"sub_task": task, "step": step} for task, step in order],
+        "plans": policy.plans,
+        "margins": [round(margin, 6) for margin in policy.margins],
+        "final_state": environment.state().tolist(),
+    }
+    if traced:
+        text = lambda rows, kind: base64.b64encode(np.stack(rows).astype(kind).tobytes()).decode()
+        # What the policy saw and did at every step, so that a verifier can ask another policy the same questions; and the
+        # noise-free states that the environment's physics is compared by.
+        row["trace"] = {"observations": text(observations, "<f4"), "actions": text(actions, "<f4"), "states": text(states, "<f8")}
+    return row
+
+
+def _words(model, contract):
+    """One tensor [L, E] per instruction, where they come from, and the largest difference to the bundle's table."""
+    stored = {row.name: onnx.numpy_helper.to_array(row) for row in model.graph.initializer if "instruction." in row.name}
+    table, lengths = stored["weights/instruction.words"], stored["constants/instruction.lengths"]
+    rows = [torch.from_numpy(table[index, :length].copy()) for index, length in enumerate(lengths)]
+    facts = contract["language"]
+    try:
+        encoded = language.encode(config.Language(facts["encoder"], facts["layer"]), [row["text"] for row in contract["instructions"]])
+    except (config.UserError, ImportError):
+        return rows, "the bundle's table", None
+    if encoded.sha256 != facts["sha256"]:
+        return rows, "the bundle's table", None
+    anew = [torch.from_numpy(row.words) for row in encoded.instructions]
+    difference = max(float((a - b).abs().max()) for a, b in zip(anew, rows, strict=True))
+    return anew, "the language encoder", difference
+
+
+def _acting(model, contract, run):
+    if run is None:
+        return weights.from_bundle(model, contract), "the bundle's initializers"
+    from . import training
+    from .model import Lads
+
+    saved, setting = training.load_run(run)
+    if saved["identity"]["dataset_sha256"] != contract["provenance"]["dataset_sha256"]:
+        raise config.UserError(f"{run} was trained on other data than the bundle")
+    encoded = language.encode(setting.config.language, [row["text"] for row in setting.instructions])
+    lads = Lads(setting, encoded)
+    lads.load_state_dict(saved["lads"])
+    return weights.from_lads(lads), "the run's checkpoint"
+
+
+class Progress:
+    """Finished episodes, one JSON line each under a heading that says of what, in a file beside the output."""
+
+    def __init__(self, output, heading):
+        self.path = Path(f"{output}.progress")
+        self.done = {}
+        heading = json.dumps(heading, sort_keys=True)
+        lines = self.path.read_text().splitlines() if self.path.exists() else []
+        if lines and lines[0] == heading:
+            for line in lines[1:]:
+                try:
+                    instruction, row = json.loads(line)
+                except ValueError:
+                    break  # the line that was being written when the run ended
+                self.done[instruction, row["episode"]] = row
+        # Written anew, so that half a line at the end does not stay.
+        kept = [json.dumps([key[0], row]) for key, row in self.done.items()]
+        write_atomically(self.path, "".join(f"{line}\n" for line in [heading, *kept]).encode())
+        self.file = self.path.open("a")
+
+    def add(self, instruction, row):
+        self.done[instruction, row["episode"]] = row
+        self.file.write(json.dumps([instruction, row]) + "\n")
+        self.file.flush()
+
+    def finish(self):
+        self.file.close()
+        os.unlink(self.path)
+
+
+def _text(head, instructions):
+    """JSON with one line per episode."""
+    dump = lambda value: json.dumps(value, ensure_ascii=False)
+    lines = ["{"]
+    lines += [f" {dump(key)}: {dump(value)}," for key, value in head.items()]
+    lines.append(' "instructions": [')
+    for place, row in enumerate(instructions):
+        episodes = row.pop("episodes")
+        lines.append("  " + dump(row)[:-1] + ', "episodes": [')
+        lines.append(",\n".join("   " + dump(episode) for episode in episodes))
+        lines.append("  ]}" + ("," if place + 1 < len(instructions) else ""))
+    return "\n".join([*lines, " ]", "}", ""])
+
+
+def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0"):
+    """Rolls out all instructions of `bundle` and writes the reference to `output`."""
+    if episodes < 1 or not 1 <= traced <= episodes:
+        raise config.UserError(f"{episodes} episodes of which {traced} traced: give at least 1 of each, and no more traced than episodes")
+    data = Path(bundle).read_bytes()
+    try:
+        model = onnx.load_from_string(data)
+        contract = json.loads({row.key: row.value for row in model.metadata_props}["lads.contract"])
+    except Exception as error:
+        raise config.UserError(f"{bundle}: not a bundle with a contract ({type(error).__name__}); export one first") from error
+    if contract["decision"]["rule"] != "argmax":
+        raise config.UserError(f"{bundle}: plans are decided by {contract['decision']['rule']}; a reference needs argmax")
+    make = official.ENVIRONMENTS.get(contract["environment"]["id"])
+    if make is None:
+        raise config.UserError(f"{bundle}: no official environment for {contract['environment']['id']!r}")
+    torch.set_num_threads(1)  # sums depend on their number
+    environment = make(noise)
+    acting, weights_from = _acting(model, contract, run)
+    words, words_from, words_difference = _words(model, contract)
+    policy = FullSequencePolicy(acting, contract, words)
+    head = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "bundle_sha256": hashlib.sha256(data).hexdigest(),
+        "purpose_sha256": purpose_sha256(contract),
+        "environment": {"id": environment.ID, "version": environment.VERSION, "max_steps": environment.MAX_STEPS},
+        "seed": seed,
+        "noise": noise,
+        "decision": "argmax",
+        "horizon": contract["horizon"],
+        "episodes_per_instruction": episodes,
+        "traced_episodes": traced,
+        "weights_from": weights_from,
+        "words_from": words_from,
+        "words_difference": words_difference,
+        "versions": {
+            "lads-exporter": __version__,
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "torch": torch.__version__,
+            **environment.versions(),
+        },
+    }
+    progress = Progress(output, head)
+    known = contract["instructions"]
+    with tqdm(total=len(known) * episodes, initial=len(progress.done), unit="episode") as bar:
+        for number in range(episodes):
+            for index, instruction in enumerate(known):
+                if (index, number) in progress.done:
+                    continue
+                entropy = [seed, index, number]
+                progress.add(index, episode(policy, environment, entropy, index, instruction["sub_tasks"], number < traced))
+                bar.update()
+    environment.close()
+    rows = [
+        {key: row[key] for key in ("id", "text", "split", "sub_tasks")} | {"episodes": [progress.done[index, n] for n in range(episodes)]}
+        for index, row in enumerate(known)
+    ]
+    text = _text(head, rows)
+    write_atomically(output, text.encode())
+    progress.finish()
+    return rows

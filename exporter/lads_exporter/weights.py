@@ -1,0 +1,97 @@
+"""The PyTorch policy that acts: from a run's checkpoint, or back from a bundle's initializers.
+
+A bundle holds every weight of the networks that act, so the policy can be run in PyTorch from the repository alone. Two
+things are folded at export and stay folded here: the division by the observations' standard deviation (into the weights
+that read observations) and batch norm (into the linear layer before it). Loaded from a checkpoint they are not folded.
+Nothing else of the bundle is used: no node of its graphs but one attribute, the slope of LeakyReLU, is read.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from onnx import numpy_helper
+from torch import nn
+
+from .config import HighLevel, LowLevel, UserError
+from .model import HighLevelPolicy, LowLevelPolicy, Normalizer
+
+
+@dataclass(frozen=True)
+class Acting:
+    """What acts: normaliser, high level, codes [M, D], low level. All in eval mode."""
+
+    normalizer: nn.Module
+    high_level: nn.Module
+    codes: torch.Tensor
+    low_level: nn.Module
+
+
+def from_lads(lads):
+    """The acting part of trained networks."""
+    lads.eval()
+    return Acting(lads.normalizer, lads.high_level, lads.codebook.codes, lads.low_level)
+
+
+def _tensors(model):
+    named = ((row.name, row) for row in model.graph.initializer)
+    return {name.removeprefix("weights/"): torch.from_numpy(numpy_helper.to_array(row).copy()) for name, row in named}
+
+
+def _slope(model):
+    for node in model.graph.node:
+        if node.op_type == "LeakyRelu" and node.output[0].startswith("low_level/act/"):
+            return next(row.f for row in node.attribute if row.name == "alpha")
+    return 0.0  # two layers have no activation between them but the first's; a bundle always has one
+
+
+def _high_level(tensors, contract):
+    network, context = contract["network"], contract["context"]
+    hidden = network["heads"] * network["head_dim"]
+    setting = HighLevel(hidden, network["layers"], network["heads"], 0.0, context["steps"])
+    lengths = len(contract["observation"]), len(contract["action"])
+    policy = HighLevelPolicy(setting, contract["language"]["dim"], *lengths, contract["codebook"]["size"])
+    # As stored for `linear`, [k, n]; PyTorch wants [n, k]. Embeddings of observation and action and the head are stored [n, k].
+    state = {"embed_timestep.weight": tensors["high_level.embed_timestep"]}
+    for name in ("embed_observation", "embed_action", "head"):
+        state |= {f"{name}.{part}": tensors[f"high_level.{name}.{part}"] for part in ("weight", "bias")}
+    linears = ["embed_word"] + [f"block.{n}.{part}" for n in range(network["layers"]) for part in ("qkv", "out", "up", "down")]
+    norms = ["embed_norm", "norm"] + [f"block.{n}.{part}" for n in range(network["layers"]) for part in ("norm1", "norm2")]
+    for name in linears:
+        ours = name.replace("block.", "blocks.")
+        state |= {f"{ours}.weight": tensors[f"high_level.{name}.weight"].T, f"{ours}.bias": tensors[f"high_level.{name}.bias"]}
+    for name in norms:
+        ours = name.replace("block.", "blocks.")
+        state |= {f"{ours}.weight": tensors[f"high_level.{name}.scale"], f"{ours}.bias": tensors[f"high_level.{name}.bias"]}
+    policy.load_state_dict(state)
+    return policy.eval()
+
+
+def _low_level(tensors, contract, slope):
+    layers = sum(name.startswith("low_level.layer.") and name.endswith(".weight") for name in tensors)
+    hidden = len(tensors["low_level.layer.0.bias"])
+    observations, actions = len(contract["observation"]), len(contract["action"])
+    policy = LowLevelPolicy(LowLevel(hidden, layers, slope), observations, contract["codebook"]["dim"], actions)
+    last = layers - 1
+    state = dict(policy.state_dict())
+    for ours, number in (("first", 0), ("last", last)):
+        state |= {f"{ours}.{part}": tensors[f"low_level.layer.{number}.{part}"] for part in ("weight", "bias")}
+    for place, norm in enumerate(policy.norms):
+        # Folded already: the norm only adds the bias, because this variance and its epsilon make one.
+        state[f"norms.{place}.running_var"] = torch.full_like(norm.running_var, 1.0 - norm.eps)
+        state[f"middle.{place}.weight"] = tensors[f"low_level.layer.{place + 1}.weight"]
+        state[f"norms.{place}.bias"] = tensors[f"low_level.layer.{place + 1}.bias"]
+    policy.load_state_dict(state)
+    return policy.eval()
+
+
+def from_bundle(model, contract):
+    """The acting networks of an ONNX bundle, with the normaliser's scale and batch norm folded into their neighbours."""
+    tensors = _tensors(model)
+    try:
+        normalizer = Normalizer(len(contract["observation"]))
+        normalizer.mean.copy_(tensors["observation_mean"])
+        slope = _slope(model)
+        low_level = _low_level(tensors, contract, slope)
+        return Acting(normalizer.eval(), _high_level(tensors, contract), tensors["codebook"], low_level)
+    except (KeyError, RuntimeError) as error:
+        raise UserError(f"the bundle's weights are not those of a {contract.get('kind')} policy of this exporter: {error}") from error

@@ -1,0 +1,129 @@
+"""Reference rollouts: the PyTorch policy out of a bundle, its full-sequence forward, and what ends and continues a run."""
+
+import base64
+import json
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load
+
+from lads_exporter import config, reference, weights
+
+
+def contract_of(model):
+    return json.loads({row.key: row.value for row in model.metadata_props}["lads.contract"])
+
+
+def words(encoded):
+    return [torch.from_numpy(row.words) for row in encoded.instructions]
+
+
+def test_a_bundle_gives_the_networks_back(policy):
+    _, encoded, lads, model = policy
+    contract = contract_of(model)
+    trained, loaded = weights.from_lads(lads), weights.from_bundle(model, contract)
+    torch.manual_seed(0)
+    observations = trained.normalizer.mean + torch.randn(1, 7, len(contract["observation"]))
+    actions = torch.rand(1, 7, len(contract["action"])) - 0.5
+    word = words(encoded)[0]
+    with torch.no_grad():
+        logits = [acting.high_level([word], acting.normalizer(observations), actions) for acting in (trained, loaded)]
+        low = [acting.low_level(acting.normalizer(observations[0]), acting.codes[:1].expand(7, -1)) for acting in (trained, loaded)]
+    assert torch.equal(trained.codes, loaded.codes)
+    assert (logits[0] - logits[1]).abs().max() < 1e-5
+    assert (low[0] - low[1]).abs().max() < 1e-5
+
+
+def test_the_full_sequence_gives_the_golden_episode(policy):
+    _, encoded, _, model = policy
+    contract = contract_of(model)
+    golden = load(base64.b64decode({row.key: row.value for row in model.metadata_props}["lads.golden"]))
+    acting = reference.FullSequencePolicy(weights.from_bundle(model, contract), contract, words(encoded))
+    acting.start(int(golden["instruction"][0]))
+    actions = np.stack([acting.act(observation) for observation in golden["observations"]])
+    assert acting.plans == golden["plans"][:: contract["horizon"]].tolist()
+    assert np.abs(actions - golden["actions"]).max() < 1e-4
+
+
+def test_the_purpose_is_what_it_is_for(tiny):
+    contract = contract_of(tiny[3])
+    same = contract | {"horizon": contract["horizon"] + 1}
+    other = contract | {"control_period_s": 2 * contract["control_period_s"]}
+    assert reference.purpose_sha256(contract) == reference.purpose_sha256(same) != reference.purpose_sha256(other)
+
+
+class Bench:
+    """A few steps of noise in place of an environment."""
+
+    ID, VERSION, MAX_STEPS = "tiny-bench", "1", 9
+    SUB_TASKS = ["drawer", "lamp", "lever"]
+
+    def __init__(self, noise):
+        self.numbers = None
+
+    def versions(self):
+        return {"bench": "1"}
+
+    def reset(self, entropy):
+        self.numbers, self.steps, self.completions = np.random.default_rng(entropy), 0, {}
+        return self._observe()
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 5:
+            self.completions["lamp"] = 5
+        return self._observe()
+
+    def _observe(self):
+        self.last = self.numbers.uniform(-0.05, 0.05, 5)
+        return self.last
+
+    def succeeded(self, commanded):
+        return all(task in self.completions for task in commanded)
+
+    def state(self):
+        return self.last.copy()
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def bundle(tiny, tmp_path, monkeypatch):
+    monkeypatch.setitem(reference.official.ENVIRONMENTS, "tiny-bench", Bench)
+    path = tmp_path / "tiny.onnx"
+    path.write_bytes(tiny[3].SerializeToString())
+    return path
+
+
+def test_an_interrupted_run_continues(bundle, tmp_path, monkeypatch):
+    whole, resumed = tmp_path / "whole.json", tmp_path / "resumed.json"
+    reference.write(bundle, whole, episodes=2, traced=1)
+    step, left = Bench.step, [40]
+
+    def interrupted(self, action):
+        left[0] -= 1
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        return step(self, action)
+
+    monkeypatch.setattr(Bench, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        reference.write(bundle, resumed, episodes=2, traced=1)
+    assert not resumed.exists()
+    monkeypatch.setattr(Bench, "step", step)
+    reference.write(bundle, resumed, episodes=2, traced=1)
+    assert resumed.read_text() == whole.read_text()
+    assert [path.name for path in tmp_path.glob("*.progress")] == []
+    read = json.loads(whole.read_text())
+    rows = [row for instruction in read["instructions"] for row in instruction["episodes"]]
+    assert all(("trace" in row) == (row["episode"] < 1) and row["steps"] in (5, 9) for row in rows)
+    assert all(len(row["plans"]) == len(row["margins"]) for row in rows)
+
+
+def test_refusals(bundle, tmp_path):
+    with pytest.raises(config.UserError, match="traced"):
+        reference.write(bundle, tmp_path / "r.json", episodes=1, traced=2)
+    with pytest.raises(config.UserError, match="not a bundle"):
+        reference.write(__file__, tmp_path / "r.json")
