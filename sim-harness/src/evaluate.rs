@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 
 use lads_compiler::Memory;
-use lads_core::{Decision, Policy, WorkspaceTooSmall};
+use lads_core::{Decision, Isa, Policy, WorkspaceTooSmall};
 use thiserror::Error;
 
 use crate::environment::{Environment, EpisodeSeed};
@@ -44,6 +44,10 @@ pub struct Evaluation<'e> {
     pub decision: Decision,
     /// Who acts.
     pub actor: Actor,
+    /// The instructions that the kernels run on.
+    pub isa: Isa,
+    /// How many of each instruction's episodes, from the first, keep a trace.
+    pub traced: u32,
     /// Threads, at least one.
     pub threads: usize,
 }
@@ -153,7 +157,7 @@ impl Evaluation<'_> {
         let mut environment = open();
         let mut memory = Memory::of(&self.policy);
         let controller = memory
-            .controller(&self.policy)
+            .controller_with(&self.policy, self.isa)
             .map_err(EvaluationError::Workspace)?;
         let mut driver = Driver::new(controller, environment.as_mut());
         let mut episodes = Vec::new();
@@ -198,6 +202,7 @@ impl Evaluation<'_> {
             seed,
             decision,
             actor: self.actor,
+            traced: episode < self.traced,
         }
     }
 }

@@ -21,3 +21,4 @@ pub mod registry;
 pub mod results;
 pub mod rollout;
 pub mod table;
+pub mod verify;

@@ -9,9 +9,15 @@ use serde::Serialize;
 
 /// Writes `value` to `path` as JSON: to a temporary file in the same folder, then renamed.
 pub fn write_json(value: &impl Serialize, path: &Path) -> io::Result<()> {
+    let mut text = serde_json::to_vec_pretty(value)?;
+    text.push(b'\n');
+    write(&text, path)
+}
+
+/// Writes `bytes` to `path`: to a temporary file in the same folder, then renamed.
+pub fn write(bytes: &[u8], path: &Path) -> io::Result<()> {
     let mut file = temporary_beside(path)?;
-    serde_json::to_writer_pretty(&mut file, value)?;
-    file.write_all(b"\n")?;
+    file.write_all(bytes)?;
     file.as_file().sync_all()?;
     file.persist(path).map_err(|error| error.error)?;
     Ok(())

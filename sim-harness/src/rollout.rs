@@ -64,10 +64,21 @@ pub struct Task<'t> {
     pub decision: Decision,
     /// Who acts.
     pub actor: Actor,
+    /// Whether the episode is to have a trace.
+    pub traced: bool,
+}
+
+/// An episode step by step, for comparisons.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Trace {
+    /// What the policy saw, `[steps, O]`.
+    pub observations: Vec<f32>,
+    /// What it did, `[steps, A]`.
+    pub actions: Vec<f32>,
 }
 
 /// What happened in one episode.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Episode {
     /// Control steps executed.
     pub steps: usize,
@@ -77,6 +88,10 @@ pub struct Episode {
     pub completions: Vec<Completion>,
     /// Plan indices in the order in which they were decided.
     pub plans: Vec<u32>,
+    /// Noise-free state after the last step.
+    pub final_state: Vec<f64>,
+    /// What was seen and done, where the task asked for it.
+    pub trace: Option<Trace>,
 }
 
 /// How long everything took, over all episodes of one driver.
@@ -161,11 +176,18 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
 
         let mut plans = Vec::with_capacity(task.max_steps);
         let mut uniform = task.actor.stream(task.seed);
+        let mut trace = task.traced.then(Trace::default);
         let mut step = 0;
         while step < task.max_steps && !self.environment.succeeded(task.commanded) {
+            if let Some(trace) = &mut trace {
+                trace.observations.extend_from_slice(&self.observation);
+            }
             match &mut uniform {
                 None => self.control_step(step, &mut plans)?,
                 Some(stream) => self.uniform_step(step, stream)?,
+            }
+            if let Some(trace) = &mut trace {
+                trace.actions.extend_from_slice(&self.action);
             }
             step += 1;
         }
@@ -175,6 +197,8 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             success: self.environment.succeeded(task.commanded),
             completions: self.environment.completions().to_vec(),
             plans,
+            final_state: self.environment.state().to_vec(),
+            trace,
         })
     }
 

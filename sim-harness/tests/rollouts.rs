@@ -6,7 +6,7 @@ mod bench;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use bench::{Bench, Says, tiny_image};
-use lads_core::{Decision, Policy};
+use lads_core::{Decision, Isa, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError};
 use lads_sim::fit;
@@ -43,6 +43,8 @@ fn evaluate(policy: &Policy<'_>, seed: u64, decision: Decision, threads: usize) 
         seed,
         decision,
         actor: Actor::Policy,
+        isa: Isa::detect(),
+        traced: 1,
         threads,
     };
     evaluation
@@ -103,6 +105,7 @@ fn episodes_end_when_the_commanded_sub_tasks_are_done() {
             success,
             completions,
             plans,
+            ..
         } in episodes
         {
             let of_commanded = completions
@@ -159,6 +162,8 @@ fn a_stop_ends_the_work_without_a_result() {
         seed: 0,
         decision: Decision::Argmax,
         actor: Actor::Policy,
+        isa: Isa::portable(),
+        traced: 0,
         threads: 2,
     };
     let (stop, finished) = (AtomicBool::new(false), AtomicUsize::new(0));

@@ -1,6 +1,6 @@
 //! The memory of a controller on a host that may allocate.
 
-use lads_core::{Controller, Policy, Workspace, WorkspaceTooSmall};
+use lads_core::{Controller, Isa, Policy, Workspace, WorkspaceTooSmall};
 
 /// What one controller works in, allocated once.
 #[derive(Debug, Clone)]
@@ -25,7 +25,16 @@ impl Memory {
         &'m mut self,
         policy: &Policy<'p>,
     ) -> Result<Controller<'p, 'm>, WorkspaceTooSmall> {
+        self.controller_with(policy, Isa::detect())
+    }
+
+    /// The same on chosen instructions.
+    pub fn controller_with<'p, 'm>(
+        &'m mut self,
+        policy: &Policy<'p>,
+        isa: Isa,
+    ) -> Result<Controller<'p, 'm>, WorkspaceTooSmall> {
         let workspace = Workspace::new(policy, &mut self.arena, &mut self.state)?;
-        Ok(Controller::new(*policy, workspace))
+        Ok(Controller::with_isa(*policy, workspace, isa))
     }
 }

@@ -3,7 +3,10 @@
 //! Everything that can be wrong is looked at before the first episode: arguments, the place for the JSON, the bundle, its golden episode,
 //! the instruction, the assets, and whether contract and environment fit. Any of it ends with one line on stderr and exit code 2; an
 //! interrupt ends with exit code 130. Files are written only after the last episode, to a temporary file that is then renamed.
+//! `--verify` runs a reference's episodes instead, and its verdict is the exit code: 0 equivalent, 1 different, 3 inconclusive.
 #![forbid(unsafe_code)]
+
+mod verify;
 
 use std::collections::BTreeMap;
 use std::fmt::Display;
@@ -17,7 +20,7 @@ use std::time::{Duration, Instant};
 use clap::Parser;
 use indicatif::{ProgressBar, ProgressStyle};
 use lads_compiler::{Bundle, Memory, compile};
-use lads_core::{Decision, Policy};
+use lads_core::{Decision, Isa, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError};
 use lads_sim::results::{self, DecisionUsed, EnvironmentUsed, InstructionResult, Results};
@@ -38,9 +41,9 @@ struct Arguments {
     /// Run only this instruction, by its text or its id
     #[arg(long)]
     instruction: Option<String>,
-    /// Episodes of each instruction
-    #[arg(long, default_value_t = 2)]
-    episodes: u32,
+    /// Episodes of each instruction; left out, 2, and with --verify all that the reference has
+    #[arg(long)]
+    episodes: Option<u32>,
     /// Seed of all random streams; the same seed gives the same episodes on any number of threads
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -59,6 +62,29 @@ struct Arguments {
     /// Write the results to this file as JSON (its form: sim-harness/results.schema.json)
     #[arg(long)]
     json: Option<PathBuf>,
+    /// Instructions that the kernels run on; left out, the widest of this CPU. The results have the same bits on all
+    #[arg(long)]
+    isa: Option<IsaName>,
+    /// Run the episodes of a reference and say whether the policy is the reference's: exit code 0 EQUIVALENT, 1 DIFFERENT, 3 INCONCLUSIVE.
+    /// Left out, REFERENCE is the file beside the model that ends in .reference.json
+    #[arg(long, value_name = "REFERENCE", num_args = 0..=1, conflicts_with_all = ["seed", "noise", "sample", "uniform", "json"])]
+    #[expect(
+        clippy::option_option,
+        reason = "clap's form of an option whose value may be left out"
+    )]
+    verify: Option<Option<PathBuf>>,
+    /// Write the certificate of --verify to this file, as JSON (its form: sim-harness/certificate.schema.json) or, where it ends in .html, as
+    /// a page; may be given twice
+    #[arg(long, requires = "verify")]
+    certificate: Vec<PathBuf>,
+}
+
+/// Instruction sets by name.
+#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+enum IsaName {
+    Portable,
+    Avx2,
+    Avx512,
 }
 
 /// How a run ends early.
@@ -79,21 +105,23 @@ fn main() -> ExitCode {
         Err(code) => return code,
     };
     match run(&arguments) {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(code) => ExitCode::from(code),
         Err(End::Interrupted) => {
-            eprintln!("interrupted: no results written");
+            eprintln!("interrupted: nothing was written");
             ExitCode::from(INTERRUPTED)
         }
         Err(End::Refused(line)) => command::refuse(line),
     }
 }
 
-fn run(arguments: &Arguments) -> Result<(), End> {
+fn run(arguments: &Arguments) -> Result<u8, End> {
     let stop = stop_on_interrupt()?;
     let threads = check_numbers(arguments)?;
-    if let Some(path) = &arguments.json {
-        drop(output::temporary_beside(path).map_err(|error| unwritable(path, &error))?);
+    let isa = isa(arguments.isa)?;
+    for (option, path) in outputs(arguments) {
+        drop(output::temporary_beside(path).map_err(|error| unwritable(option, path, &error))?);
     }
+    let reference = verify::reference(arguments)?;
 
     let about = |wrong: &dyn Display| refused(format!("{}: {wrong}", arguments.model.display()));
     let bundle = Bundle::open(&arguments.model).map_err(refused)?;
@@ -106,6 +134,7 @@ fn run(arguments: &Arguments) -> Result<(), End> {
     let contract = policy.contract();
     let id = contract.environment_id();
     let noise = arguments.noise.as_deref();
+    let noise = noise.or(reference.as_ref().map(|reference| reference.noise.as_str()));
     let noise = noise.unwrap_or_else(|| registry::default_noise(id).unwrap_or("none"));
     let open = registry::load(id, noise, &assets::vendor_dir()).map_err(refused)?;
     let environment = open();
@@ -123,10 +152,10 @@ fn run(arguments: &Arguments) -> Result<(), End> {
             max_steps: environment.max_steps(known.split),
         })
         .collect();
-    let evaluation = Evaluation {
+    let mut evaluation = Evaluation {
         policy,
         assignments: &assignments,
-        episodes: arguments.episodes,
+        episodes: arguments.episodes.unwrap_or(2),
         seed: arguments.seed,
         decision: decision(&policy, arguments.sample),
         actor: if arguments.uniform {
@@ -134,17 +163,59 @@ fn run(arguments: &Arguments) -> Result<(), End> {
         } else {
             Actor::Policy
         },
+        isa,
+        traced: 0,
         threads,
     };
+    if let Some(reference) = reference {
+        reference
+            .check(&bundle, environment.as_ref())
+            .map_err(refused)?;
+        verify::prepare(&mut evaluation, &reference, arguments.episodes)?;
+        return verify::run(
+            &evaluation,
+            &reference,
+            &open,
+            &arguments.certificate,
+            &stop,
+        );
+    }
     let start = Instant::now();
     let evaluated = evaluate(&evaluation, &open, &stop)?;
     let wall = start.elapsed();
 
     let results = report(&evaluation, environment.as_ref(), noise, &evaluated, wall);
     if let Some(path) = &arguments.json {
-        output::write_json(&results, path).map_err(|error| unwritable(path, &error))?;
+        output::write_json(&results, path).map_err(|error| unwritable("--json", path, &error))?;
     }
-    print(&Table(&results))
+    print(&Table(&results))?;
+    Ok(0)
+}
+
+/// The files that will be written, with the options that name them.
+fn outputs(arguments: &Arguments) -> impl Iterator<Item = (&'static str, &PathBuf)> {
+    let json = arguments.json.iter().map(|path| ("--json", path));
+    json.chain(
+        arguments
+            .certificate
+            .iter()
+            .map(|path| ("--certificate", path)),
+    )
+}
+
+/// The instructions that were asked for, if this CPU has them.
+fn isa(name: Option<IsaName>) -> Result<Isa, End> {
+    let Some(name) = name else {
+        return Ok(Isa::detect());
+    };
+    let name = format!("{name:?}").to_lowercase();
+    Isa::all().find(|isa| isa.name() == name).ok_or_else(|| {
+        let offered: Vec<_> = Isa::all().map(Isa::name).collect();
+        refused(format!(
+            "--isa {name}: this CPU does not have it; it has {}",
+            offered.join(", ")
+        ))
+    })
 }
 
 /// A flag that an interrupt raises; a second interrupt ends the program at once.
@@ -166,7 +237,7 @@ fn stop_on_interrupt() -> Result<Arc<AtomicBool>, End> {
 
 /// Checks what needs no file; returns the number of threads.
 fn check_numbers(arguments: &Arguments) -> Result<usize, End> {
-    if arguments.episodes == 0 {
+    if arguments.episodes == Some(0) {
         return Err(refused("--episodes 0: nothing to run; give at least 1"));
     }
     match arguments.threads {
@@ -178,9 +249,9 @@ fn check_numbers(arguments: &Arguments) -> Result<usize, End> {
     }
 }
 
-fn unwritable(path: &Path, error: &std::io::Error) -> End {
+fn unwritable(option: &str, path: &Path, error: &std::io::Error) -> End {
     refused(format!(
-        "--json {}: cannot be written ({error}); name a file in an existing, writable folder",
+        "{option} {}: cannot be written ({error}); name a file in an existing, writable folder",
         path.display()
     ))
 }
@@ -236,21 +307,30 @@ fn evaluate(
     open: &registry::Opener,
     stop: &AtomicBool,
 ) -> Result<Evaluated, End> {
-    // Hidden by indicatif where stderr is no terminal.
+    let bar = progress(evaluation);
+    let evaluated = evaluation.run(open, stop, &|| bar.inc(1));
+    bar.finish_and_clear();
+    evaluated.map_err(unfinished)
+}
+
+/// A bar over all episodes; hidden by indicatif where stderr is no terminal.
+fn progress(evaluation: &Evaluation<'_>) -> ProgressBar {
     let bar = ProgressBar::new(evaluation.len() as u64);
     let style = ProgressStyle::with_template(
         "{bar:40} {pos}/{len} episodes, {elapsed} elapsed, {eta} left",
     );
     bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
     bar.enable_steady_tick(Duration::from_millis(200));
-    let evaluated = evaluation.run(open, stop, &|| bar.inc(1));
-    bar.finish_and_clear();
-    evaluated.map_err(|error| match error {
+    bar
+}
+
+fn unfinished(error: EvaluationError) -> End {
+    match error {
         EvaluationError::Interrupted => End::Interrupted,
         error => refused(format!(
             "{error}; run this instruction alone with the same seed to look into it"
         )),
-    })
+    }
 }
 
 fn report(
@@ -296,7 +376,7 @@ fn versions() -> BTreeMap<&'static str, String> {
 }
 
 /// Prints to stdout; a reader that has left is no failure.
-fn print(table: &Table<'_>) -> Result<(), End> {
+fn print(table: &dyn Display) -> Result<(), End> {
     let mut stdout = std::io::stdout().lock();
     match write!(stdout, "{table}").and_then(|()| stdout.flush()) {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(refused(format!(

@@ -1,0 +1,161 @@
+//! `lads-run --verify`: the reference, the certificate, and the verdict as exit code.
+
+use std::ffi::OsStr;
+use std::fmt;
+use std::path::PathBuf;
+use std::sync::atomic::AtomicBool;
+
+use askama::Template as _;
+use lads_core::Decision;
+use lads_sim::evaluate::Evaluation;
+use lads_sim::output;
+use lads_sim::registry::Opener;
+use lads_sim::verify::certificate::Certificate;
+use lads_sim::verify::page::Page;
+use lads_sim::verify::reference::Reference;
+
+use crate::{Arguments, End, print, progress, refused, unfinished, unwritable, versions};
+
+/// The reference that is asked for, read; `None` without `--verify`.
+pub fn reference(arguments: &Arguments) -> Result<Option<Reference>, End> {
+    let Some(named) = &arguments.verify else {
+        return Ok(None);
+    };
+    let path = named
+        .clone()
+        .unwrap_or_else(|| arguments.model.with_extension("reference.json"));
+    Reference::open(&path).map(Some).map_err(refused)
+}
+
+/// Makes `evaluation` the reference's: seed, decision rule, episodes and traces.
+pub fn prepare(
+    evaluation: &mut Evaluation<'_>,
+    reference: &Reference,
+    episodes: Option<u32>,
+) -> Result<(), End> {
+    let most = reference.episodes_per_instruction;
+    let episodes = episodes.unwrap_or(most);
+    if episodes > most {
+        return Err(refused(format!(
+            "--episodes {episodes}: the reference has {most} of each instruction; give at most that, or make a larger one: make reference"
+        )));
+    }
+    evaluation.episodes = episodes;
+    evaluation.seed = reference.seed;
+    evaluation.decision = Decision::Argmax;
+    evaluation.traced = reference.traced_episodes.min(episodes);
+    Ok(())
+}
+
+/// Runs the verification, writes and prints the certificate; gives the exit code.
+pub fn run(
+    evaluation: &Evaluation<'_>,
+    reference: &Reference,
+    open: &Opener,
+    certificates: &[PathBuf],
+    stop: &AtomicBool,
+) -> Result<u8, End> {
+    let bar = progress(evaluation);
+    let certificate = lads_sim::verify::run(evaluation, reference, open, versions(), stop, &|| {
+        bar.inc(1);
+    });
+    bar.finish_and_clear();
+    let certificate = certificate.map_err(unfinished)?;
+    for path in certificates {
+        let written = if path.extension() == Some(OsStr::new("html")) {
+            let page = Page::new(&certificate).render().map_err(refused)?;
+            output::write(page.as_bytes(), path)
+        } else {
+            output::write_json(&certificate, path)
+        };
+        written.map_err(|error| unwritable("--certificate", path, &error))?;
+    }
+    print(&Summary(&certificate))?;
+    Ok(certificate.verdict.exit_code())
+}
+
+/// The certificate on a terminal.
+struct Summary<'c>(&'c Certificate);
+
+impl fmt::Display for Summary<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Certificate {
+            policy,
+            environment,
+            rollouts,
+            ..
+        } = self.0;
+        writeln!(
+            f,
+            "policy alone       {} of {} replayed episodes differ; actions within {:.1e} (allowed {:.1e}) over {} steps",
+            policy.differing_episodes,
+            policy.episodes,
+            policy.largest_action_difference,
+            policy.action_tolerance,
+            policy.compared_steps
+        )?;
+        let bits = if environment.identical_bits {
+            ", the same bits"
+        } else {
+            ""
+        };
+        writeln!(
+            f,
+            "environment alone  states within {:.1e} (allowed {:.1e}) over {} states{bits}",
+            environment.largest_state_difference, environment.state_tolerance, environment.states
+        )?;
+        writeln!(
+            f,
+            "both together      {} pairs of episodes: completions identical in {:.1} %, plans in {:.1} %, steps in {:.1} %; actions within {:.1e} \
+             while trajectories agree ({} of {} traced steps)\n",
+            rollouts.episodes,
+            100.0 * rollouts.identical_completions,
+            100.0 * rollouts.identical_plans,
+            100.0 * rollouts.identical_steps,
+            rollouts.largest_action_difference,
+            rollouts.agreeing_steps[0],
+            rollouts.agreeing_steps[1]
+        )?;
+        writeln!(
+            f,
+            "{:<16} {:>7} {:>9}   {:>25}   {:>10} {:>11}",
+            "rate", "run", "reference", "paired difference (95 %)", "equivalent", "McNemar's p"
+        )?;
+        let n_rate = &rollouts.n_rate;
+        let rates = rollouts.rates.iter().map(|rate| {
+            let [run, reference] = rate.shares();
+            (
+                rate.name.as_str(),
+                run,
+                reference,
+                &rate.paired,
+                Some(rate.mcnemar_p),
+            )
+        });
+        for (name, run, reference, paired, p) in
+            rates.chain([("N-rate", n_rate.run, n_rate.reference, &n_rate.paired, None)])
+        {
+            let interval = format!(
+                "{:+.3} ({:+.3} to {:+.3})",
+                paired.estimate, paired.interval.0, paired.interval.1
+            );
+            let equivalent = if paired.equivalent { "yes" } else { "no" };
+            let p = p.map_or_else(String::new, |p| format!("{p:.3}"));
+            writeln!(
+                f,
+                "{name:<16} {run:>7.3} {reference:>9.3}   {interval:>25}   {equivalent:>10} {p:>11}"
+            )?;
+        }
+        writeln!(f, "\n{}", self.0.verdict.word())?;
+        for reason in &self.0.reasons {
+            writeln!(f, "- {reason}")?;
+        }
+        match self.0.more_episodes_per_instruction {
+            Some(more) => writeln!(
+                f,
+                "- about {more} more episodes of each instruction would decide, if it stays as it is"
+            ),
+            None => Ok(()),
+        }
+    }
+}

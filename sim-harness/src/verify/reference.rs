@@ -1,0 +1,301 @@
+//! Reference rollouts: what `lads_exporter reference` wrote, read and checked.
+//!
+//! Invariants of a [`Reference`] that was read: every instruction has the same number of episodes, numbered from 0, at least one of them
+//! traced; every trace holds as many observations, actions and states as its lengths say. What can fail: no such file, another format or
+//! version of it, numbers that contradict each other. Whether it is of *this* policy and environment is [`Reference::check`]'s to say,
+//! by name.
+
+use std::path::{Path, PathBuf};
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use lads_compiler::Bundle;
+use serde::Deserialize;
+use thiserror::Error;
+
+use super::purpose;
+use crate::environment::Environment;
+
+/// Value of the JSON's `format`.
+const FORMAT: &str = "lads-reference";
+/// Version of the JSON form that is read.
+const FORMAT_VERSION: u32 = 1;
+
+/// Why a reference is refused.
+#[derive(Debug, Error)]
+pub enum ReferenceError {
+    /// The file cannot be read.
+    #[error("{path}: cannot be read ({source}); name a reference, or make one: make reference", path = path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The file is no reference, or is damaged.
+    #[error("{path}: {problem}; make it again: make reference", path = path.display())]
+    Content {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        problem: String,
+    },
+    /// The reference is of something else.
+    #[error("{path}: the reference's {field} is {reference}, {whose} is {other}; use the reference that was made for this", path = path.display())]
+    Other {
+        /// The file.
+        path: PathBuf,
+        /// What differs.
+        field: &'static str,
+        /// What the reference says.
+        reference: String,
+        /// Whose value it is compared with.
+        whose: &'static str,
+        /// That value.
+        other: String,
+    },
+}
+
+/// What the exporter's reference rollouts found.
+#[derive(Debug, Deserialize)]
+pub struct Reference {
+    format: String,
+    format_version: u32,
+    /// SHA-256 of the bundle whose weights were rolled out.
+    pub bundle_sha256: String,
+    purpose_sha256: String,
+    environment: EnvironmentUsed,
+    /// Seed of the whole run.
+    pub seed: u64,
+    /// Noise level, as the environment names it.
+    pub noise: String,
+    /// Control steps between two decisions.
+    pub horizon: usize,
+    /// Episodes of each instruction.
+    pub episodes_per_instruction: u32,
+    /// How many of these have a trace.
+    pub traced_episodes: u32,
+    /// Where the weights came from.
+    pub weights_from: String,
+    /// Where the embeddings of the words came from.
+    pub words_from: String,
+    /// Versions of everything that took part.
+    pub versions: std::collections::BTreeMap<String, String>,
+    /// In the contract's order.
+    pub instructions: Vec<Instruction>,
+    #[serde(skip)]
+    path: PathBuf,
+}
+
+#[derive(Debug, Deserialize)]
+struct EnvironmentUsed {
+    id: String,
+    version: String,
+}
+
+/// All episodes of one instruction.
+#[derive(Debug, Deserialize)]
+pub struct Instruction {
+    /// Id in the contract.
+    pub id: String,
+    /// Its words.
+    pub text: String,
+    /// In order of their numbers.
+    pub episodes: Vec<Episode>,
+}
+
+/// One episode.
+#[derive(Debug, Deserialize)]
+pub struct Episode {
+    #[serde(rename = "episode")]
+    number: u64,
+    /// Control steps executed.
+    pub steps: usize,
+    /// Whether the instruction was carried out.
+    pub success: bool,
+    /// In order of time.
+    pub completions: Vec<Completion>,
+    /// Plan indices in the order in which they were decided.
+    pub plans: Vec<u32>,
+    /// Largest logit minus second largest, of each decision.
+    pub margins: Vec<f64>,
+    /// Noise-free state after the last step.
+    pub final_state: Vec<f64>,
+    /// What was seen and done, in the first episodes of each instruction.
+    pub trace: Option<Trace>,
+}
+
+/// A completed sub-task.
+#[derive(Debug, Deserialize)]
+pub struct Completion {
+    /// Its name.
+    pub sub_task: String,
+    /// Control step, from 1, after which it was done.
+    pub step: usize,
+}
+
+/// An episode step by step.
+#[derive(Debug, Deserialize)]
+#[serde(try_from = "Encoded")]
+pub struct Trace {
+    /// What the policy saw, `[steps, O]`.
+    pub observations: Vec<f32>,
+    /// What it did, `[steps, A]`.
+    pub actions: Vec<f32>,
+    /// Noise-free states before the first steps' actions, `[n, O]`.
+    pub states: Vec<f64>,
+}
+
+#[derive(Deserialize)]
+struct Encoded {
+    observations: String,
+    actions: String,
+    states: String,
+}
+
+impl TryFrom<Encoded> for Trace {
+    type Error = String;
+
+    fn try_from(encoded: Encoded) -> Result<Self, String> {
+        Ok(Self {
+            observations: numbers(&encoded.observations, f32::from_le_bytes)?,
+            actions: numbers(&encoded.actions, f32::from_le_bytes)?,
+            states: numbers(&encoded.states, f64::from_le_bytes)?,
+        })
+    }
+}
+
+/// Little-endian numbers in base64.
+fn numbers<T, const N: usize>(text: &str, read: fn([u8; N]) -> T) -> Result<Vec<T>, String> {
+    let bytes = STANDARD.decode(text).map_err(|error| error.to_string())?;
+    match bytes.as_chunks::<N>() {
+        (whole, []) => Ok(whole.iter().map(|&chunk| read(chunk)).collect()),
+        _ => Err(format!(
+            "a trace of {} bytes is no whole number of {N}-byte numbers",
+            bytes.len()
+        )),
+    }
+}
+
+impl Reference {
+    /// Reads and checks a file.
+    pub fn open(path: &Path) -> Result<Self, ReferenceError> {
+        let bytes = std::fs::read(path).map_err(|source| ReferenceError::File {
+            path: path.into(),
+            source,
+        })?;
+        let content = |problem: String| ReferenceError::Content {
+            path: path.into(),
+            problem,
+        };
+        let mut read: Self = serde_json::from_slice(&bytes)
+            .map_err(|error| content(format!("not a reference of lads ({error})")))?;
+        path.clone_into(&mut read.path);
+        if read.format != FORMAT || read.format_version != FORMAT_VERSION {
+            return Err(content(format!(
+                "its format is {} {}, this program reads {FORMAT} {FORMAT_VERSION}",
+                read.format, read.format_version
+            )));
+        }
+        read.consistent().map_err(content)?;
+        Ok(read)
+    }
+
+    fn consistent(&self) -> Result<(), String> {
+        if self.instructions.is_empty() || self.horizon == 0 || self.traced_episodes == 0 {
+            return Err("it has no instruction, no horizon or no traced episode".to_owned());
+        }
+        for instruction in &self.instructions {
+            let wrong = |what: &str| Err(format!("instruction '{}': {what}", instruction.id));
+            if instruction.episodes.len() != self.episodes_per_instruction as usize {
+                return wrong("its number of episodes is not the heading's");
+            }
+            for (number, episode) in (0..).zip(&instruction.episodes) {
+                let decisions = episode.steps.div_ceil(self.horizon);
+                let traced = number < u64::from(self.traced_episodes);
+                if episode.number != number || episode.trace.is_some() != traced {
+                    return wrong(
+                        "its episodes are not in order, or not traced as the heading says",
+                    );
+                }
+                if episode.plans.len() != decisions || episode.margins.len() != decisions {
+                    return wrong("its plans are not one per horizon");
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Refuses a reference of another environment, of other instructions, or of a policy for something else than this bundle's.
+    pub fn check(
+        &self,
+        bundle: &Bundle,
+        environment: &dyn Environment,
+    ) -> Result<(), ReferenceError> {
+        let same = |field, reference: &str, whose, other: &str| {
+            if reference == other {
+                return Ok(());
+            }
+            Err(ReferenceError::Other {
+                path: self.path.clone(),
+                field,
+                reference: format!("'{reference}'"),
+                whose,
+                other: format!("'{other}'"),
+            })
+        };
+        let used = &self.environment;
+        same("environment", &used.id, "the bundle's", environment.id())?;
+        let version = environment.version();
+        same(
+            "environment version",
+            &used.version,
+            "the simulator's",
+            version,
+        )?;
+        let known = &bundle.contract().instructions;
+        let texts = |list: Vec<&str>| list.join("; ");
+        let ours = texts(
+            self.instructions
+                .iter()
+                .map(|row| row.text.as_str())
+                .collect(),
+        );
+        let theirs = texts(known.iter().map(|row| row.text.as_str()).collect());
+        if ours != theirs {
+            let place = self.instructions.iter().zip(known);
+            let differ = place.into_iter().find(|(a, b)| a.text != b.text);
+            let (a, b) = differ.map_or(
+                (self.instructions.len().to_string(), known.len().to_string()),
+                |(a, b)| (a.text.clone(), b.text.clone()),
+            );
+            same("instruction list", &a, "the bundle's", &b)?;
+        }
+        let purpose = bundle
+            .metadata("lads.contract")
+            .and_then(purpose::sha256)
+            .unwrap_or_default();
+        same(
+            "contract hash",
+            &self.purpose_sha256,
+            "the bundle's",
+            &purpose,
+        )?;
+        let lens = (environment.observation_len(), environment.action_len());
+        for episode in self.instructions.iter().flat_map(|row| &row.episodes) {
+            let Some(trace) = &episode.trace else {
+                continue;
+            };
+            if trace.observations.len() != episode.steps * lens.0
+                || trace.actions.len() != episode.steps * lens.1
+                || !trace.states.len().is_multiple_of(lens.0)
+            {
+                return Err(ReferenceError::Content {
+                    path: self.path.clone(),
+                    problem: "the lengths of a trace are not those of the environment".to_owned(),
+                });
+            }
+        }
+        Ok(())
+    }
+}

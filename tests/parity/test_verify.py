@@ -1,0 +1,171 @@
+"""`lads-run --verify` calls a damaged policy DIFFERENT.
+
+Each damage is done to the shipped bundle's ONNX file, and the golden episode is recorded anew with the damaged graph, as an exporter with
+that fault would: the self-test passes, and only the comparison with the reference can see it.
+
+Run with `python -m pytest tests/parity` in the exporter's environment, after `cargo build -p lads-sim`. Skipped where either is missing.
+"""
+
+import base64
+import json
+import os
+import pathlib
+import subprocess
+
+import pytest
+
+np = pytest.importorskip("numpy")
+onnx = pytest.importorskip("onnx")
+replay = pytest.importorskip("lads_exporter.replay")
+from onnx import helper, numpy_helper  # noqa: E402
+from safetensors.numpy import load, save  # noqa: E402
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
+BUNDLE, REFERENCE = ROOT / "models/kitchen.onnx", ROOT / "models/kitchen.reference.json"
+EQUIVALENT, DIFFERENT, INCONCLUSIVE = 0, 1, 3
+JOINT = 3
+
+
+def lads_run():
+    builds = [p for p in (TARGET / profile / "lads-run" for profile in ("release", "debug")) if p.is_file()]
+    if not builds:
+        pytest.skip("lads-run is not built: run `cargo build -p lads-sim`")
+    return max(builds, key=lambda path: path.stat().st_mtime)
+
+
+def verify(bundle, folder):
+    """-> exit code, certificate."""
+    file = folder / "certificate.json"
+    command = [lads_run(), "--model", bundle, "--verify", REFERENCE, "--certificate", file, "--instruction", "kbls", "--episodes", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode in (EQUIVALENT, DIFFERENT, INCONCLUSIVE), done.stderr
+    return done.returncode, json.loads(file.read_text())
+
+
+def properties(model):
+    return {entry.key: entry.value for entry in model.metadata_props}
+
+
+def edit(model, name, change):
+    """Replaces an initializer by what `change` makes of it."""
+    tensor = next(row for row in model.graph.initializer if row.name.removeprefix("weights/") == name)
+    changed = change(numpy_helper.to_array(tensor).copy())
+    tensor.CopyFrom(numpy_helper.from_array(np.ascontiguousarray(changed), tensor.name))
+
+
+# The two layers that read an observation, [outputs, inputs]; the normaliser's scale is folded into their columns.
+READERS = ("high_level.embed_observation.weight", "low_level.layer.0.weight")
+
+
+def scale_off(model):
+    """The normaliser takes one joint's standard deviation for 2 % smaller than it is."""
+
+    def change(weight):
+        weight[:, JOINT] *= 1.02
+        return weight
+
+    for name in READERS:
+        edit(model, name, change)
+
+
+def joints_swapped(model):
+    """Two joints arrive in each other's place."""
+
+    def change(rows):
+        order = list(range(rows.shape[-1]))
+        order[JOINT], order[JOINT + 1] = order[JOINT + 1], order[JOINT]
+        return rows[..., order]
+
+    for name in (*READERS, "observation_mean"):
+        edit(model, name, change)
+
+
+def horizon_off(model):
+    """Plans are decided every H + 1 steps."""
+    contract = json.loads(properties(model)["lads.contract"])
+    contract["horizon"] += 1
+    for entry in ("observations", "actions"):
+        # The trajectory encoder's windows have the length that the contract says.
+        name = f"trajectory_encoder/encode/{entry}"
+        value = next(row for row in model.graph.input if row.name == name)
+        assert value.type.tensor_type.shape.dim[1].dim_value == contract["horizon"] - 1
+    set_property(model, "lads.contract", json.dumps(contract))
+    drop_entry(model, "trajectory_encoder/")
+
+
+def drop_entry(model, prefix):
+    graph = model.graph
+    for rows in (graph.node, graph.input, graph.output, graph.value_info):
+        kept = [row for row in rows if not (row.output[0] if hasattr(row, "output") else row.name).startswith(prefix)]
+        del rows[:]
+        rows.extend(kept)
+    used = {name for node in graph.node for name in node.input}
+    kept = [row for row in graph.initializer if row.name in used]
+    del graph.initializer[:]
+    graph.initializer.extend(kept)
+
+
+def second_best(model):
+    """The likeliest plan is never taken: its logit is pushed below the others."""
+    graph = model.graph
+    graph.initializer.extend(
+        [
+            numpy_helper.from_array(np.array(1e-6, np.float32), "damage/epsilon"),
+            numpy_helper.from_array(np.array(1e9, np.float32), "damage/far"),
+            numpy_helper.from_array(np.array([-1], np.int64), "damage/axes"),
+        ]
+    )
+    for entry in ("high_level/start", "high_level/step"):
+        output, local = f"{entry}/logits", lambda name: f"{entry}/damage/{name}"
+        producer = next(node for node in graph.node if output in node.output)
+        producer.output[list(producer.output).index(output)] = local("logits")
+        steps = [
+            ("ReduceMax", [local("logits"), "damage/axes"], local("best")),
+            ("Sub", [local("logits"), local("best")], local("behind")),
+            ("Add", [local("behind"), "damage/epsilon"], local("ahead")),
+            ("Relu", [local("ahead")], local("is_best")),
+            ("Mul", [local("is_best"), "damage/far"], local("push")),
+            ("Sub", [local("logits"), local("push")], output),
+        ]
+        graph.node.extend(helper.make_node(kind, inputs, [out], name=out) for kind, inputs, out in steps)
+
+
+def set_property(model, key, value):
+    next(row for row in model.metadata_props if row.key == key).value = value
+
+
+def record_golden(model):
+    """The golden episode as an exporter with this fault would have recorded it."""
+    contract = json.loads(properties(model)["lads.contract"])
+    golden = load(base64.b64decode(properties(model)["lads.golden"]))
+    bundle = replay.Bundle(model, [entry for entry in replay.ENTRIES if any(row.name.startswith(entry + "/") for row in model.graph.input)])
+    index = int(golden["instruction"][0])
+    plans, actions, _ = bundle.open_loop(contract, index, golden["observations"])
+    golden |= {"plans": plans.astype(np.int64), "actions": actions.astype(np.float32)}
+    set_property(model, "lads.golden", base64.b64encode(save(golden, metadata={"tolerance": "0.0001"})).decode())
+
+
+@pytest.mark.parametrize("damage", [scale_off, joints_swapped, horizon_off, second_best], ids=lambda damage: damage.__name__)
+def test_a_damaged_policy_is_different(damage, tmp_path):
+    model = onnx.load(BUNDLE)
+    damage(model)
+    record_golden(model)
+    path = tmp_path / "damaged.onnx"
+    path.write_bytes(model.SerializeToString())
+    code, certificate = verify(path, tmp_path)
+    assert code == DIFFERENT and certificate["verdict"] == "DIFFERENT"
+    assert certificate["policy"]["differing_episodes"] == 1
+    assert certificate["environment"]["first_difference"] is None
+    assert "the policy answers otherwise" in certificate["reasons"][0]
+    assert not certificate["reference"]["same_bundle"]
+
+
+def test_the_shipped_policy_is_not(tmp_path):
+    code, certificate = verify(BUNDLE, tmp_path)
+    # One episode cannot show equivalence of rates, but there is no difference.
+    assert code == INCONCLUSIVE and certificate["more_episodes_per_instruction"] > 0
+    assert certificate["policy"]["differing_episodes"] == 0
+    assert certificate["policy"]["largest_action_difference"] < 1e-4
+    assert certificate["rollouts"]["identical_completions"] == 1.0
+    assert certificate["reference"]["same_bundle"]
