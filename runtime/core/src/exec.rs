@@ -87,7 +87,7 @@ pub(crate) struct Machine<'m> {
 }
 
 impl Machine<'_> {
-    /// Sets the inputs and runs the ops, with `past` tokens in the cache.
+    /// Sets the inputs and runs the ops, with `past` tokens in the cache and subnormal numbers taken as zero.
     pub fn run(
         &mut self,
         program: &Program,
@@ -95,6 +95,7 @@ impl Machine<'_> {
         past: usize,
         inputs: &Inputs,
     ) -> Result<(), ExecError> {
+        let _flushed = kernels::Flushed::new();
         for PortRecord { port, place } in program.inputs() {
             match place {
                 Place::Span(span) => {

@@ -1,7 +1,7 @@
 //! Dense kernels for batch-1 policies: slices and shapes, nothing of ONNX or LADS.
 //!
 //! Invariants:
-//! - No allocation, no `std`, no panic, and no unsafe code but in `dispatch`, `simd` and the loops over weights and cache: a slice
+//! - No allocation, no `std`, no panic, and no unsafe code but in `dispatch`, `simd`, `subnormal` and the loops over weights and cache: a slice
 //!   that is too short leaves the rest of the result as it was.
 //!   Callers that want to be told check shapes beforehand; `lads-core` does so once per program.
 //! - The same bits on every target with IEEE 754 arithmetic: every sum has one fixed order (sixteen lanes, then a tree), no
@@ -39,6 +39,7 @@ pub mod reference;
 mod simd;
 pub mod stored;
 mod strided;
+mod subnormal;
 
 pub use attention::{Attention, append_keys, append_values, attention_scratch_len, keys_len};
 pub use dispatch::Isa;
@@ -49,3 +50,4 @@ pub use norm::{LayerNorm, softmax};
 pub use reduce::{Axis, ReduceKind, arg_max, arg_min, reduce};
 pub use stored::{Panels, WeightFormat};
 pub use strided::{BinaryKind, Input, StridedCopy, binary};
+pub use subnormal::Flushed;
