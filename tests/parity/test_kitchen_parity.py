@@ -1,6 +1,6 @@
 """The harness's kitchen against the official FrankaKitchen-v1 of gymnasium-robotics.
 
-Run with `python -m pytest tests/parity`. Needs numpy, mujoco 3.17.0, gymnasium and gymnasium-robotics 1.4.2, and the harness's
+Run with `python -m pytest tests/parity`. Needs lads_exporter, numpy, mujoco 3.17.0, gymnasium and gymnasium-robotics 1.4.2, and the harness's
 `kitchen-trace` (`cargo build -p lads-sim`); skipped where they are missing. KITCHEN_TRACE names another binary.
 """
 
@@ -19,14 +19,13 @@ gymnasium_robotics = pytest.importorskip("gymnasium_robotics")
 from gymnasium_robotics.envs.franka_kitchen import kitchen_env  # noqa: E402
 from gymnasium_robotics.utils import mujoco_utils  # noqa: E402
 
+pytest.importorskip("lads_exporter.official")
+from lads_exporter.official import AMPLITUDES, SUB_TASKS, Noise, joint_qpos, joint_qvel, positions  # noqa: E402
+
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
 TOLERANCE = 1e-9
 STEPS = 1000
-SUB_TASKS = ["microwave", "kettle", "bottom burner", "top burner", "light switch", "slide cabinet", "hinge cabinet"]
-
-# pos_noise_amp of franka_config.xml for the 30 positions.
-AMPLITUDES = np.array([0.1] * 9 + [0.005] * 2 + [0.0005] * 6 + [0.005] * 3 + [0.1] * 3 + [0.005] * 3 + [0.1] * 3 + [0.005])
 
 
 def trace_binary():
@@ -63,43 +62,6 @@ class Harness:
         return self.ask(json.dumps([float(x) for x in action]))
 
 
-class OfficialNoise:
-    """Stands in for the official environment's generator: hands out our stream's 30 numbers per observation.
-
-    The official environment draws four times per observation: robot positions, robot velocities, object positions, object velocities.
-    Ours draws the 30 positions at once; velocities are no part of our observation and get no noise. `object_scale` turns the amplitudes
-    that FrankaKitchen-v1 gives the objects into ours.
-    """
-
-    def __init__(self, entropy, object_scale):
-        self.stream = np.random.default_rng(entropy)
-        self.object_scale = object_scale
-        self.draws = 0
-
-    def uniform(self, low, high, size):
-        turn, self.draws = self.draws % 4, self.draws + 1
-        if turn == 0:
-            self.numbers = self.stream.uniform(low, high, 30)
-        return [self.numbers[:9], np.zeros(9), self.numbers[9:] * self.object_scale, np.zeros(20)][turn]
-
-
-# MuJoCo's joint types are no longer members of a tuple of its enumeration since 3.12, which is all that stops FrankaKitchen-v1 on 3.17.
-def scalar_joint(model, name):
-    joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
-    assert joint != -1 and int(model.jnt_type[joint]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-    return joint
-
-
-def joint_qpos(model, data, name):
-    address = model.jnt_qposadr[scalar_joint(model, name)]
-    return data.qpos[address : address + 1].copy()
-
-
-def joint_qvel(model, data, name):
-    address = model.jnt_dofadr[scalar_joint(model, name)]
-    return data.qvel[address : address + 1].copy()
-
-
 @pytest.fixture
 def official(monkeypatch):
     """FrankaKitchen-v1, made by `official(robot_noise_ratio, object_noise_ratio)`."""
@@ -120,11 +82,6 @@ def official(monkeypatch):
     yield make
     for environment in made:
         environment.close()
-
-
-def positions(observation):
-    """The 30 positions of the official 59 numbers."""
-    return np.concatenate([observation["observation"][:9], observation["observation"][18:39]])
 
 
 def random_actions(seed, steps):
@@ -169,7 +126,7 @@ def test_the_closed_loop_with_our_noise_in_both(official, noise, robot, objects)
     object_scale = AMPLITUDES[9:] / robot_env.robot_pos_noise_amp[8:] if noise == "v0" else np.ones(21)
     with Harness() as harness:
         environment.reset(seed=0)
-        robot_env._np_random = OfficialNoise(entropy, object_scale)
+        robot_env._np_random = Noise(entropy, object_scale)
         observation = environment._get_obs(robot_env.reset_model())
         answer = harness.reset(noise, entropy)
         worst, _ = same_run(environment, harness, observation, answer, random_actions(7, 500))

@@ -1,0 +1,166 @@
+//! `lads-run --verify`: the certificate of the shipped policy, its form, its exit codes, and every reference that is refused.
+
+#[path = "common/schema.rs"]
+mod schema;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+/// A file of the project, by its path from the root.
+fn project_file(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
+}
+
+fn verify(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_lads-run"))
+        .arg("--model")
+        .arg(project_file("models/kitchen.onnx"))
+        .arg("--verify")
+        .args(arguments)
+        .output()
+        .unwrap()
+}
+
+fn certificate(arguments: &[&str], folder: &Path) -> (Option<i32>, Value) {
+    let file = folder.join("certificate.json");
+    let output = verify(&[arguments, &["--certificate", file.to_str().unwrap()]].concat());
+    let text = fs::read_to_string(&file)
+        .unwrap_or_else(|_| panic!("{}", String::from_utf8_lossy(&output.stderr)));
+    (output.status.code(), serde_json::from_str(&text).unwrap())
+}
+
+#[test]
+fn one_episode_agrees_on_every_instruction_set_and_is_too_few() {
+    let folder = tempfile::tempdir().unwrap();
+    let schema = fs::read_to_string(project_file("sim-harness/certificate.schema.json")).unwrap();
+    let schema: Value = serde_json::from_str(&schema).unwrap();
+    let few = ["--episodes", "1", "--instruction", "kbls"];
+    let mut certificates = Vec::new();
+    for isa in lads_core::Isa::all() {
+        let arguments = [&few[..], &["--isa", isa.name()]].concat();
+        let (code, mut found) = certificate(&arguments, folder.path());
+        schema::check(&found, &schema, &schema, "certificate");
+        assert_eq!((code, &found["verdict"]), (Some(3), &"INCONCLUSIVE".into()));
+        assert!(found["more_episodes_per_instruction"].as_u64() > Some(0));
+        assert_eq!(found["policy"]["differing_episodes"], 0);
+        assert!(found["policy"]["largest_action_difference"].as_f64() < Some(1e-4));
+        assert!(found["environment"]["largest_state_difference"].as_f64() <= Some(1e-6));
+        assert_eq!(found["rollouts"]["identical_completions"], 1.0);
+        assert!(found["rollouts"]["largest_action_difference"].as_f64() < Some(1e-4));
+        assert_eq!(found["setting"]["isa"], isa.name());
+        found["setting"]["isa"].take();
+        certificates.push(found);
+    }
+    // The bits of the policy do not depend on the instruction set.
+    assert!(certificates.windows(2).all(|pair| pair[0] == pair[1]));
+}
+
+#[test]
+fn the_page_is_one_file_that_names_the_verdict() {
+    let folder = tempfile::tempdir().unwrap();
+    let page = folder.path().join("certificate.html");
+    let arguments = [
+        "--episodes",
+        "1",
+        "--instruction",
+        "mksh",
+        "--certificate",
+        page.to_str().unwrap(),
+    ];
+    let output = verify(&arguments);
+    assert_eq!(output.status.code(), Some(3));
+    let page = fs::read_to_string(page).unwrap();
+    assert!(page.contains("INCONCLUSIVE") && page.contains("slide cabinet"));
+    for fetched in ["http://", "https://", "src=", "href=", "@import", "url("] {
+        assert!(!page.contains(fetched), "{fetched}");
+    }
+    let printed = String::from_utf8(output.stdout).unwrap();
+    assert!(
+        printed.contains("INCONCLUSIVE") && printed.contains("McNemar"),
+        "{printed}"
+    );
+}
+
+fn refused(arguments: &[&str], parts: &[&str]) {
+    let output = verify(arguments);
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{errors}");
+    assert!(
+        output.stdout.is_empty() && errors.lines().count() == 1,
+        "{errors}"
+    );
+    for part in parts {
+        assert!(errors.contains(part), "'{part}' is not in: {errors}");
+    }
+}
+
+/// The reference with one text of it replaced.
+fn altered(folder: &Path, from: &str, to: &str) -> String {
+    let text = fs::read_to_string(project_file("models/kitchen.reference.json")).unwrap();
+    assert!(text.contains(from), "{from}");
+    let path = folder.join("altered.json");
+    fs::write(&path, text.replacen(from, to, 1)).unwrap();
+    path.to_str().unwrap().to_owned()
+}
+
+#[test]
+fn references_of_something_else_are_refused_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let certificate = folder.join("c.json");
+    let check = |from: &str, to: &str, parts: &[&str]| {
+        let path = altered(folder, from, to);
+        refused(
+            &[&path, "--certificate", certificate.to_str().unwrap()],
+            parts,
+        );
+        assert!(!certificate.exists());
+    };
+    let environment = r#""environment": {"id": "franka-kitchen", "version": "1""#;
+    check(
+        environment,
+        r#""environment": {"id": "franka-kitchen", "version": "2""#,
+        &["environment version", "'2'", "'1'"],
+    );
+    check(
+        environment,
+        r#""environment": {"id": "other", "version": "1""#,
+        &["environment", "'other'"],
+    );
+    check(
+        "turn on light switch",
+        "turn off light switch",
+        &["instruction list", "turn off"],
+    );
+    check(
+        r#""purpose_sha256": ""#,
+        r#""purpose_sha256": "0"#,
+        &["contract hash"],
+    );
+    check(
+        r#""format_version": 1"#,
+        r#""format_version": 9"#,
+        &["lads-reference 9", "make reference"],
+    );
+    check(
+        r#""plans": [19"#,
+        r#""plans": [19, 19"#,
+        &["not one per horizon"],
+    );
+    refused(
+        &["no-such-file.json"],
+        &["no-such-file.json", "make reference"],
+    );
+    refused(
+        &[project_file("README.md").to_str().unwrap()],
+        &["not a reference"],
+    );
+    refused(&["--episodes", "21"], &["--episodes 21", "20"]);
+    refused(
+        &["--episodes", "1", "--certificate", "no/such/folder/c.json"],
+        &["--certificate", "no/such/folder"],
+    );
+}
