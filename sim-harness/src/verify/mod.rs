@@ -3,7 +3,7 @@
 //! Three comparisons, each of which can fail where the others cannot see: the policy alone ([`policy`]: open loop on the reference's
 //! observations), the environment alone ([`physics`]: open loop on the reference's actions), and both together ([`pairs`]: the reference's
 //! episodes in closed loop). [`certificate`] has the rules of the verdict. What can fail: a reference that cannot be read or is of something
-//! else ([`reference`]), an episode that cannot be finished.
+//! else ([`mod@reference`]), an episode that cannot be finished.
 
 pub mod certificate;
 pub mod page;
