@@ -4,6 +4,7 @@ mod attention;
 mod layers;
 mod machine;
 mod models;
+mod nodes;
 mod operators;
 mod oracle;
 mod plans;

@@ -76,6 +76,40 @@ impl<'i> Inputs<'i> {
     }
 }
 
+impl Program<'_> {
+    /// Runs a program on its own, without a policy around it and without KV cache: for those who test compilers and kernels.
+    /// `arena` has at least [`arena_len`](Self::arena_len) elements; the outputs lie where [`outputs`](Self::outputs) says, those
+    /// that are integers in the slots that are returned. Of the inputs, [`Port::Observation`], [`Port::Action`], [`Port::Plan`]
+    /// and [`Port::Words`] can be set.
+    pub fn run(
+        &self,
+        isa: Isa,
+        weights: &[f32],
+        arena: &mut [f32],
+        inputs: &[(Port, &[f32])],
+    ) -> Result<[u32; INT_SLOTS], ExecError> {
+        let of = |port: Port| {
+            let found = inputs.iter().find(|(known, _)| *known == port);
+            found.map_or(&[][..], |(_, values)| values)
+        };
+        let inputs = Inputs {
+            observation: of(Port::Observation),
+            action: of(Port::Action),
+            words: of(Port::Words),
+            plan: of(Port::Plan),
+            ..Inputs::default()
+        };
+        let mut machine = Machine {
+            arena,
+            cache: &mut [],
+            ints: [0; INT_SLOTS],
+            isa,
+        };
+        machine.run(self, weights, 0, &inputs)?;
+        Ok(machine.ints)
+    }
+}
+
 /// The memory that programs run in.
 #[derive(Debug)]
 pub(crate) struct Machine<'m> {

@@ -1,0 +1,248 @@
+//! ONNX's own node conformance tests, through compilation and the core's executor, on every instruction set.
+//!
+//! The cases are made by `tests/parity/test_onnx_nodes.py` from the `onnx` package, one model per file in the folder that
+//! [`FOLDER`] names: its inputs are called `a` to `e`, its outputs `y`, `z` or `j`, and what goes in and has to come out is among
+//! the initializers, as `given/a` and `expected/y`. Without the variable the test has nothing to do.
+
+use std::collections::{BTreeMap, HashMap};
+
+use lads_core::Isa;
+use lads_core::codec::{Field, Writer};
+use lads_core::image::{PORTS as MOST, PortRecord, ProgramRecord};
+use lads_core::op::{Place, Port};
+use lads_core::program::{Program, Spaces};
+use prost::Message;
+
+use super::models::ENTRY;
+use super::operators::cache;
+use super::{Compiled, compiled};
+use crate::entries::{Signature, Value};
+use crate::error::CompileError;
+use crate::graph::{Dim, Type};
+use crate::onnx::ModelProto;
+use crate::tensor::{Data, Tensor};
+
+const FOLDER: &str = "LADS_ONNX_NODES";
+
+const PORTS: [(&str, Port); 7] = [
+    ("a", Port::Observation),
+    ("b", Port::Action),
+    ("c", Port::Plan),
+    ("d", Port::Words),
+    ("y", Port::Logits),
+    ("z", Port::Latent),
+    ("j", Port::PlanIndex),
+];
+
+/// One conformance test.
+struct Case {
+    model: ModelProto,
+    given: HashMap<String, Tensor>,
+    expected: HashMap<String, Tensor>,
+}
+
+impl Case {
+    fn read(bytes: &[u8]) -> Self {
+        let mut model = ModelProto::decode(bytes).expect("a model");
+        let graph = model.graph.as_mut().expect("a graph");
+        let mut take = |prefix: &str| -> HashMap<String, Tensor> {
+            let found = graph.initializer.iter().filter_map(|tensor| {
+                let name = tensor.name.strip_prefix(prefix)?;
+                let value = Tensor::from_proto(tensor).expect("a tensor");
+                Some((name.to_string(), (*value).clone()))
+            });
+            let found = found.collect();
+            graph
+                .initializer
+                .retain(|tensor| !tensor.name.starts_with(prefix));
+            found
+        };
+        let (given, expected) = (take("given/"), take("expected/"));
+        Self {
+            model,
+            given,
+            expected,
+        }
+    }
+
+    /// The inputs from the `runtime`-th on become constants: what an exporter would have made of a scale or of axes.
+    fn compile(&self, runtime: usize) -> Result<Compiled, CompileError> {
+        let mut model = self.model.clone();
+        let graph = model.graph.as_mut().expect("a graph");
+        let mut inputs: Vec<&String> = self.given.keys().collect();
+        inputs.sort();
+        let constants = inputs.split_off(runtime.min(inputs.len()));
+        for name in constants {
+            let mut tensor = crate::onnx::TensorProto {
+                name: format!("{ENTRY}/{name}"),
+                dims: self.given[name]
+                    .shape
+                    .iter()
+                    .map(|&dim| dim as i64)
+                    .collect(),
+                ..Default::default()
+            };
+            let Data::F32(data) = &self.given[name].data else {
+                panic!("inputs are floats");
+            };
+            tensor.data_type = crate::onnx::data_type::FLOAT;
+            tensor.float_data.clone_from(data);
+            graph.initializer.push(tensor);
+        }
+        let value = |name: &String, tensor: &Tensor| Value {
+            name: name.clone(),
+            ty: if matches!(tensor.data, Data::F32(_)) {
+                Type::F32
+            } else {
+                Type::I64
+            },
+            shape: tensor.shape.iter().map(|&dim| Dim::of(dim)).collect(),
+            fields: "test",
+        };
+        let mut outputs: Vec<&String> = self.expected.keys().collect();
+        outputs.sort();
+        let signature = Signature {
+            entry: ENTRY,
+            inputs: inputs
+                .iter()
+                .map(|&name| value(name, &self.given[name]))
+                .collect(),
+            outputs: outputs
+                .iter()
+                .map(|&name| value(name, &self.expected[name]))
+                .collect(),
+        };
+        let names: Vec<&str> = outputs.iter().map(|name| name.as_str()).collect();
+        compiled(&model, &signature, &names, &PORTS, cache())
+    }
+
+    /// Runs the program in the core and compares; the tolerance is that of ONNX's own runner.
+    fn check(&self, name: &str, program: &Compiled) {
+        let placed = &program.placed;
+        let ports = |ports: &[(Port, Place)]| {
+            let mut records = [PortRecord::default(); MOST];
+            for (record, &(port, place)) in records.iter_mut().zip(ports) {
+                *record = PortRecord { port, place };
+            }
+            records
+        };
+        let record = ProgramRecord {
+            first_op: 0,
+            ops_len: placed.ops.len() as u32,
+            arena_len: placed.arena_len,
+            tokens: 0,
+            inputs_len: placed.inputs.len() as u32,
+            inputs: ports(&placed.inputs),
+            outputs_len: placed.outputs.len() as u32,
+            outputs: ports(&placed.outputs),
+        };
+        let mut words = vec![0; ProgramRecord::WORDS];
+        record.put(&mut Writer::new(&mut words));
+        let ops: Vec<_> = placed.ops.iter().map(lads_core::op::Op::encode).collect();
+        let spaces = Spaces {
+            weights_len: program.weights.len(),
+            cache_len: 0,
+            past_max: 0,
+        };
+        let opened = Program::new_checked(&words, &ops, spaces);
+        let opened = opened.unwrap_or_else(|error| panic!("{name}: {error}"));
+        let given: Vec<(Port, &[f32])> = (PORTS.iter())
+            .filter_map(|&(known, port)| Some((port, self.given.get(known)?.as_f32()?)))
+            .collect();
+        for isa in Isa::all() {
+            let mut arena = vec![f32::NAN; opened.arena_len()];
+            let ints = opened.run(isa, &program.weights, &mut arena, &given);
+            let ints = ints.unwrap_or_else(|error| panic!("{name}: {error}"));
+            for (output, expected) in &self.expected {
+                let port = PORTS
+                    .iter()
+                    .find(|(known, _)| known == output)
+                    .expect("a port")
+                    .1;
+                let got: Vec<f32> = match opened.output(port).expect("an output") {
+                    Place::Span(span) => {
+                        arena[span.offset as usize..][..span.len as usize].to_vec()
+                    }
+                    Place::Int(slot) => vec![ints[usize::from(slot.0)] as f32],
+                };
+                let expected: Vec<f32> = match &expected.data {
+                    Data::F32(data) => data.clone(),
+                    Data::I64(data) => data.iter().map(|&x| x as f32).collect(),
+                };
+                assert_eq!(got.len(), expected.len(), "{name}");
+                for (got, expected) in got.into_iter().zip(expected) {
+                    let same = got == expected || got.is_nan() && expected.is_nan();
+                    let near = (got - expected).abs() <= 1e-7 + 1e-3 * expected.abs();
+                    assert!(
+                        same || near,
+                        "{name} on {isa:?}: {got} instead of {expected}"
+                    );
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn onnx_node_cases() {
+    let Some(folder) = std::env::var_os(FOLDER) else {
+        println!("skipped: {FOLDER} names no folder of cases");
+        return;
+    };
+    let mut paths: Vec<_> = std::fs::read_dir(&folder)
+        .expect("the folder can be read")
+        .map(|entry| entry.expect("it can be read").path())
+        .collect();
+    paths.sort();
+    let (mut passed, mut refused) = (BTreeMap::<String, usize>::new(), 0);
+    for path in &paths {
+        let name = path.file_stem().expect("a name").to_string_lossy();
+        let case = Case::read(&std::fs::read(path).expect("it can be read"));
+        let nodes = &case.model.graph.as_ref().expect("a graph").node;
+        let operators: Vec<String> = nodes.iter().map(|node| node.op_type.clone()).collect();
+        // As many inputs as possible are given when the program runs.
+        let attempts = (0..=case.given.len())
+            .rev()
+            .map(|runtime| case.compile(runtime));
+        let mut last = None;
+        let program = attempts
+            .into_iter()
+            .find_map(|attempt| attempt.map_err(|error| last = Some(error)).ok());
+        match (program, last) {
+            (Some(program), _) => {
+                case.check(&name, &program);
+                for operator in operators {
+                    *passed.entry(operator).or_default() += 1;
+                }
+            }
+            (None, Some(CompileError::Operator { operator, .. })) => {
+                assert!(
+                    operators.contains(&operator.to_string()),
+                    "{name}: {operator} is named"
+                );
+                refused += 1;
+            }
+            (None, Some(CompileError::Entry { .. })) => refused += 1,
+            (None, error) => panic!("{name}: {error:?}"),
+        }
+    }
+    let total: usize = paths.len() - refused;
+    println!(
+        "{total} cases agree, {refused} are refused with a named error; agreeing by operator: {passed:?}"
+    );
+    // Operators that the crate says it compiles: each has a case that agrees.
+    let documented = include_str!("../lib.rs")
+        .split("```text")
+        .nth(2)
+        .expect("the list");
+    let documented = documented
+        .split("```")
+        .next()
+        .expect("the list")
+        .replace("//!", "");
+    let without: Vec<&str> = (documented.split_whitespace())
+        .filter(|operator| !passed.contains_key(*operator))
+        .collect();
+    // The package's cases of these search several rows, or convert other types.
+    assert_eq!(without, ["ArgMax", "ArgMin", "Cast"]);
+}

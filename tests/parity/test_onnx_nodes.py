@@ -1,0 +1,86 @@
+"""ONNX's own node conformance tests through the compiler and the core's executor.
+
+The cases come from the `onnx` package. Each is written as one model with its data among the initializers; `runtime/compiler`'s test
+`onnx_node_cases` compiles and runs them all. Skipped where the package is missing.
+"""
+
+import os
+import pathlib
+import re
+import subprocess
+import warnings
+
+import pytest
+
+np = pytest.importorskip("numpy")
+onnx = pytest.importorskip("onnx")
+from onnx import numpy_helper  # noqa: E402
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+# The newest operator set that the compiler reads.
+OPSET = 21
+
+
+def write(case, folder):
+    """Writes a case; False for element types, or numbers of values, that a policy has none of."""
+    inputs, outputs = (list(values) for values in case.data_sets[0])
+    if len(case.model.graph.node) == 1 and case.model.graph.node[0].op_type == "LayerNormalization":
+        # Mean and deviation are optional outputs for training.
+        outputs = outputs[:1]
+    values = inputs + outputs
+    if not all(isinstance(value, np.ndarray) and value.dtype in (np.float32, np.int64) for value in values):
+        return False
+    model = onnx.ModelProto()
+    model.CopyFrom(case.model)
+    graph = model.graph
+    if len(graph.node) == 1 and len(outputs) < len(graph.output):
+        del graph.output[len(outputs) :], graph.node[0].output[len(outputs) :]
+    if len(graph.input) != len(inputs) or len(graph.output) != len(outputs) or any(value.size == 0 for value in values):
+        return False
+    names, free = {}, {"in": list("abcde"), "out": list("yz"), "index": ["j"]}
+    for info, value in zip(list(graph.input), inputs, strict=True):
+        if value.dtype == np.int64:
+            # Axes, shapes and indices are constants in every exported policy.
+            names[info.name] = f"test/graph/{info.name}"
+            graph.initializer.append(numpy_helper.from_array(value, names[info.name]))
+            graph.input.remove(info)
+        elif not free["in"]:
+            return False
+        else:
+            short = free["in"].pop(0)
+            names[info.name] = f"test/graph/{short}"
+            graph.initializer.append(numpy_helper.from_array(value, f"given/{short}"))
+    for info, value in zip(graph.output, outputs, strict=True):
+        kind = free["index" if value.dtype == np.int64 else "out"]
+        if not kind or info.name in names:
+            return False
+        short = kind.pop(0)
+        names[info.name] = f"test/graph/{short}"
+        graph.initializer.append(numpy_helper.from_array(value, f"expected/{short}"))
+    for node in graph.node:
+        node.input[:] = [names.get(name, name) for name in node.input]
+        node.output[:] = [names.get(name, name) for name in node.output]
+    for info in [*graph.input, *graph.output]:
+        info.name = names[info.name]
+    for opset in model.opset_import:
+        if opset.domain in ("", "ai.onnx"):
+            opset.version = min(opset.version, OPSET)
+    (folder / f"{case.name}.onnx").write_bytes(model.SerializeToString())
+    return True
+
+
+def test_node_cases(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from onnx.backend.test.case.node import collect_testcases
+
+        cases = collect_testcases(None)
+    written = sum(write(case, tmp_path) for case in cases)
+    assert written > 300
+    command = ["cargo", "test", "-p", "lads-compiler", "--lib", "onnx_node_cases", "--", "--nocapture"]
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | {"LADS_ONNX_NODES": str(tmp_path)}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    agreed, refused = map(int, re.search(r"(\d+) cases agree, (\d+) are refused", done.stdout).groups())
+    print(re.search(r".* cases agree.*", done.stdout).group())
+    assert agreed + refused == written
+    assert agreed > 200
