@@ -1,6 +1,9 @@
 //! What suites that need more than one crate share; the suites are in `tests/`.
 #![forbid(unsafe_code)]
 
+pub mod hostile;
+mod wire;
+
 use std::path::{Path, PathBuf};
 
 use lads_compiler::{Bundle, Image, compile};

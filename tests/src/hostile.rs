@@ -1,0 +1,206 @@
+//! Files as an attacker would write them: an edit script turns the small bundle, or the image made of it, into one that is almost
+//! sound, and everything that takes it has to refuse it or work.
+//!
+//! A script is a row of edits of eight bytes: what to do, where, and with which value. Any bytes are a script, so fuzzers (`tests/fuzz`)
+//! and the seeded mutator of `tests/tests/hostile.rs` drive the same two functions. Both panic when an invariant is broken.
+
+use std::sync::OnceLock;
+
+use lads_compiler::{Bundle, compile};
+use lads_core::image::{CRC_WORD, crc32};
+use lads_core::{Controller, GuardConfig, GuardedController, Instruction, Policy, Tick, Workspace};
+
+use crate::wire;
+
+/// Bytes of one edit.
+const EDIT_BYTES: usize = 8;
+
+/// Edits of a script that are carried out.
+const MOST_EDITS: usize = 32;
+
+/// The most elements that a caller of these tests lends; a policy that wants more is not run.
+const MOST_ELEMENTS: usize = 1 << 20;
+
+/// Numbers that break things.
+const VALUES: [u64; 16] = [
+    0,
+    1,
+    2,
+    3,
+    63,
+    64,
+    255,
+    1 << 15,
+    1 << 16,
+    (1 << 31) - 1,
+    1 << 31,
+    u32::MAX as u64,
+    0x7f80_0000,
+    0x7fc0_0000,
+    1 << 40,
+    u64::MAX,
+];
+
+/// One edit.
+#[derive(Debug, Clone, Copy)]
+pub struct Edit {
+    /// What to do; each function has its own meaning.
+    pub kind: u8,
+    /// Where.
+    pub place: usize,
+    /// With which value.
+    pub value: u64,
+}
+
+fn script(bytes: &[u8]) -> impl Iterator<Item = Edit> {
+    let (edits, _) = bytes.as_chunks::<EDIT_BYTES>();
+    edits
+        .iter()
+        .take(MOST_EDITS)
+        .map(|&[kind, p0, p1, p2, chosen, v0, v1, v2]| Edit {
+            kind,
+            place: u32::from_le_bytes([p0, p1, p2, 0]) as usize,
+            value: match VALUES.get(usize::from(chosen)) {
+                Some(&value) => value,
+                None => u64::from(u32::from_le_bytes([v0, v1, v2, 0])),
+            },
+        })
+}
+
+/// The small bundle.
+const TINY: &[u8] = include_bytes!("../../runtime/compiler/tests/data/tiny.onnx");
+
+fn tiny_image() -> &'static [u32] {
+    static IMAGE: OnceLock<Vec<u32>> = OnceLock::new();
+    IMAGE.get_or_init(|| {
+        let bundle = Bundle::from_bytes(TINY).expect("the bundle is sound");
+        let image = compile(&bundle).expect("it compiles");
+        let (words, _) = image.as_bytes().as_chunks::<4>();
+        words.iter().map(|&word| u32::from_le_bytes(word)).collect()
+    })
+}
+
+/// Edits an image, gives it the right checksum, opens it, and drives it.
+///
+/// # Panics
+///
+/// When anything panics, or an action is not finite.
+pub fn image(edits: &[u8]) {
+    let mut words = tiny_image().to_vec();
+    let mut len = words.len() * 4;
+    for Edit { kind, place, value } in script(edits) {
+        // The tables come first: most edits go there.
+        let most = if kind & 0x80 == 0 {
+            4096.min(words.len())
+        } else {
+            words.len()
+        };
+        let other = words[(value as usize) % most];
+        let word = &mut words[place % most];
+        match kind % 8 {
+            0..=2 => *word = value as u32,
+            3 => *word = word.wrapping_add((value as u32 & 0xff).wrapping_sub(128)),
+            4 => *word ^= 1 << (value % 32),
+            5 => *word = other,
+            6 => *word = word.wrapping_mul(value as u32),
+            _ => len = len.min((place + 1).max(value as usize)),
+        }
+    }
+    let mut bytes: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
+    bytes.truncate(len);
+    if bytes.len() >= (CRC_WORD + 1) * 4 {
+        let crc = crc32(&bytes);
+        bytes[CRC_WORD * 4..][..4].copy_from_slice(&crc.to_le_bytes());
+    }
+    open_and_drive(&bytes);
+}
+
+/// Opens an image and drives what opens through a guard.
+fn open_and_drive(bytes: &[u8]) {
+    // In memory that is aligned as images have to be, and not a byte longer.
+    let mut aligned = vec![0_u64; bytes.len().div_ceil(8)];
+    for (to, from) in aligned.iter_mut().zip(bytes.chunks(8)) {
+        let mut word = [0; 8];
+        word[..from.len()].copy_from_slice(from);
+        *to = u64::from_ne_bytes(word);
+    }
+    let aligned: &[u8] = bytemuck::cast_slice(&aligned);
+    let Ok(policy) = Policy::new_checked(&aligned[..bytes.len()]) else {
+        return;
+    };
+    policy.checksum_matches();
+    let contract = policy.contract();
+    let elements = contract
+        .observation_len()
+        .saturating_add(contract.action_len());
+    let lens = [policy.arena_len(), policy.state_len(), elements];
+    if lens.iter().any(|&len| len > MOST_ELEMENTS) {
+        return;
+    }
+    let (mut arena, mut state) = (vec![0.0; policy.arena_len()], vec![0.0; policy.state_len()]);
+    let workspace =
+        Workspace::new(&policy, &mut arena, &mut state).expect("there is as much as it asks for");
+    let mut guard = vec![0.0; GuardedController::memory_len(&policy)];
+    let controller = Controller::new(policy, workspace);
+    let mut guarded = GuardedController::new(controller, &GuardConfig::default(), &mut guard)
+        .expect("the contract's own limits are sound");
+    let _ = guarded.self_test();
+    guarded.arm_untested();
+    let middle = |min: f32, max: f32| min / 2.0 + max / 2.0;
+    let observation: Vec<_> = contract
+        .observations()
+        .map(|e| middle(e.min, e.max))
+        .collect();
+    let limits: Vec<_> = contract.actions().collect();
+    let mut action = vec![0.0; contract.action_len()];
+    for number in 0..2 {
+        let _ = guarded.set_instruction(Instruction::Id(number));
+        for timestamp in 0..12 {
+            let tick = Tick {
+                timestamp,
+                missed: 0,
+            };
+            let _ = guarded.step(
+                &observation,
+                Some(tick).filter(|_| number == 0),
+                &mut action,
+            );
+            let inside = action
+                .iter()
+                .zip(&limits)
+                .all(|(x, e)| x.is_finite() && e.clamp(*x) == *x);
+            assert!(inside, "{action:?}");
+            guarded.resume();
+        }
+    }
+}
+
+/// Edits the protocol buffers of a bundle, opens it, compiles it, and drives the image.
+///
+/// # Panics
+///
+/// When anything panics, an error is not one line, or an image that was made does not open.
+pub fn bundle(edits: &[u8]) {
+    static TREE: OnceLock<Vec<wire::Field>> = OnceLock::new();
+    let mut tree = TREE
+        .get_or_init(|| wire::parse(TINY).expect("a bundle is a message"))
+        .clone();
+    for edit in script(edits) {
+        wire::edit(&mut tree, edit);
+    }
+    let bytes = wire::bytes(&tree);
+    let refused = match Bundle::from_bytes(&bytes) {
+        Err(error) => error.to_string(),
+        Ok(bundle) => match compile(&bundle) {
+            Err(error) => error.to_string(),
+            Ok(image) => {
+                Policy::new_checked(image.as_bytes()).expect("an image that was made opens");
+                return open_and_drive(image.as_bytes());
+            }
+        },
+    };
+    assert!(
+        !refused.is_empty() && !refused.contains('\n'),
+        "{refused:?}"
+    );
+}
