@@ -66,7 +66,9 @@ def _card(arguments, saved, sha256):
         beside.append((label, card.read_results(path)))
     results = card.read_results(arguments.results) if arguments.results else None
     path = Path(arguments.output).with_suffix(".md")
-    bundle.write_atomically(path, card.write(arguments.run, saved, sha256, results, beside).encode())
+    notes = Path(arguments.output).with_suffix(".notes.md")
+    notes = notes.read_text(encoding="utf-8") if notes.is_file() else ""
+    bundle.write_atomically(path, card.write(arguments.run, saved, sha256, results, beside, notes).encode())
     print(f"{path}: model card")
 
 

@@ -73,8 +73,8 @@ def _curves(folder):
     return lines
 
 
-def write(folder, saved, sha256, results=None, beside=()):
-    """The card as Markdown. `folder` is the run's, `saved` its checkpoint."""
+def write(folder, saved, sha256, results=None, beside=(), notes=""):
+    """The card as Markdown. `folder` is the run's, `saved` its checkpoint, `notes` what a person has to say."""
     summary = json.loads((Path(folder) / SUMMARY).read_text(encoding="utf-8"))
     tables, environment, _ = saved["identity"]["tables"]
     steps = ", ".join(f"{name} {count} ({summary['seconds'][name]:.0f} s)" for name, count in summary["steps"].items())
@@ -95,6 +95,7 @@ def write(folder, saved, sha256, results=None, beside=()):
         f"- held out: {held_out}",
         f"- versions: {', '.join(f'{name} {version}' for name, version in summary['versions'].items())}",
         *_results(results, sha256, beside),
+        *(["", notes.strip()] if notes else []),
         "",
         "## Curves",
         "",

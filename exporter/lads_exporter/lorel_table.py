@@ -37,9 +37,14 @@ SUB_TASKS = {
 
 
 class LorelTable:
-    """One environment; `reset` and `step` return the 15 positions."""
+    """`lorel-table`, version 1; `reset` and `step` return the 15 positions."""
 
-    def __init__(self):
+    ID, VERSION = "lorel-table", "1"
+    SUB_TASKS = list(SUB_TASKS)
+
+    def __init__(self, noise="none"):
+        if noise != "none":
+            raise UserError(f"unknown noise level {noise!r}: {self.ID} observes without noise, so give none")
         if not ASSETS.is_dir():
             raise UserError(f"the simulator's assets are missing ({ASSETS}): run make setup")
         spec = mujoco.MjSpec.from_file(str(SCENE))
@@ -72,9 +77,18 @@ class LorelTable:
             self.settled[posture] = state
         return self.settled[posture]
 
-    def reset(self, seed, instruction, episode, commanded=()):
-        """`commanded`: names of sub-tasks; none is the start of a recorded trajectory."""
-        draw, data = np.random.default_rng([seed, instruction, episode]), self.data
+    @staticmethod
+    def versions():
+        return {"mujoco": mujoco.__version__}
+
+    @staticmethod
+    def max_steps(split):
+        """Control steps of an episode of an instruction in this split."""
+        return 40 if split.startswith("composite") else 20
+
+    def reset(self, entropy, commanded=()):
+        """Starts the episode of (seed, instruction, episode); `commanded`: names of sub-tasks, none for a recorded trajectory."""
+        draw, data = np.random.default_rng(entropy), self.data
         posture = 0 if draw.random() < 0.5 else 1 + int(draw.random() * POSTURES)
         mujoco.mj_setState(self.model, data, self._settle(posture), FULL_STATE)
         for mug in (WHITE, BLACK):
@@ -85,7 +99,7 @@ class LorelTable:
         self._advance(100)
         if commanded:
             self._prepare([task for task in SUB_TASKS if task in commanded], draw)
-        self.start = data.qpos.copy()
+        self.start, self.steps, self.completions = data.qpos.copy(), 0, {}
         return data.qpos.copy()
 
     def _prepare(self, commanded, draw):
@@ -111,7 +125,17 @@ class LorelTable:
         self.data.mocap_pos[0] = np.clip(moved, MOCAP_LOW, MOCAP_HIGH)
         self.data.ctrl[:] = [action[4], -action[4]]
         self._advance(5)
+        self.steps += 1
+        for task in SUB_TASKS:
+            if self.succeeded([task]):
+                self.completions.setdefault(task, self.steps)
         return self.data.qpos.copy()
+
+    def state(self):
+        return self.data.qpos.copy()
+
+    def close(self):
+        """Nothing to close."""
 
     def succeeded(self, commanded):
         """Whether all sub-tasks hold now, relative to the start."""

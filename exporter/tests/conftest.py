@@ -15,7 +15,7 @@ def make_policy(name, seed=0):
     return setting, encoded, lads.eval(), model
 
 
-@pytest.fixture(scope="session", params=["tiny", "kitchen"])
+@pytest.fixture(scope="session", params=["tiny", "kitchen", "lorel"])
 def policy(request):
     """(setting, encoded, lads, model) with random weights."""
     return make_policy(request.param)
