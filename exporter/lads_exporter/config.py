@@ -29,6 +29,7 @@ class HighLevel:
     heads: int
     dropout: float
     context_steps: int  # rows of the timestep embedding
+    balance: float  # times the log frequency of each plan is taken off its logit after training; 0 is the paper's
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class LowLevel:
     hidden: int
     layers: int  # linear layers; batch norm on all but the first and the last
     slope: float  # of LeakyReLU
+    gain: float  # the trained low level's actions are multiplied by this; 1 is the paper's
 
 
 @dataclass(frozen=True)

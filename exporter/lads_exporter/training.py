@@ -231,6 +231,21 @@ class Stage:
         self.lads.codebook.start(torch.cat(latents))
 
     @torch.no_grad()
+    def finish(self):
+        """After the stage that trains it, a policy's correction goes into its last layer.
+
+        High level: less what is frequent anyway, the logits say which plan the instruction speaks for. Low level: the mean of
+        random actions is small even where their direction is clear, and a policy that follows it is slow, so it has a gain.
+        """
+        if self.name in ("joint", "high_level"):
+            uses = self.lads.codebook.uses
+            self.lads.high_level.head.bias.sub_(self.trainer.config.high_level.balance * (uses / uses.sum()).log())
+        if self.name in ("joint", "low_level"):
+            gain = self.trainer.config.low_level.gain
+            self.lads.low_level.last.weight.mul_(gain)
+            self.lads.low_level.last.bias.mul_(gain)
+
+    @torch.no_grad()
     def validate(self):
         """Losses on the held-out episodes, segmented from step 0."""
         episodes = self.corpus.validation
@@ -340,6 +355,7 @@ class Trainer:
                 optimizer_state = None
                 if not self._run_stage(stage, quiet):
                     return False
+                stage.finish()
                 self.position = {"stage": self.position["stage"] + 1, "step": 0}
                 self.save(None)
         self._summarise(names)
