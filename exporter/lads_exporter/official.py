@@ -101,8 +101,12 @@ class OfficialKitchen:
             "mujoco": mujoco.__version__,
         }
 
-    def reset(self, entropy):
-        """Starts the episode of (seed, instruction, episode) -> observation [30]."""
+    def max_steps(self, split):
+        """Control steps of an episode, the same in every split."""
+        return self.MAX_STEPS
+
+    def reset(self, entropy, commanded=()):
+        """Starts the episode of (seed, instruction, episode), the same whatever is commanded -> observation [30]."""
         self.official.robot_env._np_random = Noise(entropy, self.object_scale)
         observation, _ = self.official.reset()
         self.steps, self.completions = 0, {}
@@ -128,4 +132,10 @@ class OfficialKitchen:
         self.official.close()
 
 
-ENVIRONMENTS = {OfficialKitchen.ID: OfficialKitchen}
+def _lorel_table(noise):
+    from .lorel_table import LorelTable  # needs the simulator's package
+
+    return LorelTable(noise)
+
+
+ENVIRONMENTS = {OfficialKitchen.ID: OfficialKitchen, "lorel-table": _lorel_table}

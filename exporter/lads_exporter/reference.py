@@ -106,12 +106,13 @@ class FullSequencePolicy:
         return self.acting.high_level([self.words[self.instruction]], observations, actions)[0, -1]
 
 
-def episode(policy, environment, entropy, instruction, commanded, traced):
-    """One episode as a JSON object; it ends when all commanded sub-tasks are done or the environment's steps are up."""
+def episode(policy, environment, entropy, instruction, known, traced):
+    """One episode as a JSON object; it ends when the instruction is carried out or its split's steps are up."""
     policy.start(instruction)
-    observation = environment.reset(entropy)
+    commanded, most = known["sub_tasks"], environment.max_steps(known["split"])
+    observation = environment.reset(entropy, commanded)
     states, observations, actions = [], [], []
-    while environment.steps < environment.MAX_STEPS and not environment.succeeded(commanded):
+    while environment.steps < most and not environment.succeeded(commanded):
         if traced and len(states) < TRACED_STATES:
             states.append(environment.state())
         seen = observation.astype(np.float32)
@@ -144,7 +145,7 @@ def _words(model, contract):
     rows = [torch.from_numpy(table[index, :length].copy()) for index, length in enumerate(lengths)]
     facts = contract["language"]
     try:
-        encoded = language.encode(config.Language(facts["encoder"], facts["layer"]), [row["text"] for row in contract["instructions"]])
+        encoded = language.encode(config.Language(facts["encoder"], facts["layer"], facts.get("pooling") == "mean"), [row["text"] for row in contract["instructions"]])
     except (config.UserError, ImportError):
         return rows, "the bundle's table", None
     if encoded.sha256 != facts["sha256"]:
@@ -238,7 +239,7 @@ def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0"):
         "format_version": FORMAT_VERSION,
         "bundle_sha256": hashlib.sha256(data).hexdigest(),
         "purpose_sha256": purpose_sha256(contract),
-        "environment": {"id": environment.ID, "version": environment.VERSION, "max_steps": environment.MAX_STEPS},
+        "environment": {"id": environment.ID, "version": environment.VERSION, "max_steps": max(environment.max_steps(row["split"]) for row in contract["instructions"])},
         "seed": seed,
         "noise": noise,
         "decision": "argmax",
@@ -264,7 +265,7 @@ def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0"):
                 if (index, number) in progress.done:
                     continue
                 entropy = [seed, index, number]
-                progress.add(index, episode(policy, environment, entropy, index, instruction["sub_tasks"], number < traced))
+                progress.add(index, episode(policy, environment, entropy, index, instruction, number < traced))
                 bar.update()
     environment.close()
     rows = [

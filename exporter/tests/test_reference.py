@@ -65,7 +65,10 @@ class Bench:
     def versions(self):
         return {"bench": "1"}
 
-    def reset(self, entropy):
+    def max_steps(self, split):
+        return self.MAX_STEPS
+
+    def reset(self, entropy, commanded):
         self.numbers, self.steps, self.completions = np.random.default_rng(entropy), 0, {}
         return self._observe()
 

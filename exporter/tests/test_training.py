@@ -261,7 +261,7 @@ def test_word_embeddings_of_the_shipped_language_encoder():
     last = language.encode(setting.config.language, texts)
     assert last.dim == 384 and all(len(row.words) >= len(text.split()) + 1 for row, text in zip(last.instructions, texts))
     assert last.instructions[0].sentence.shape == (384,)
-    other = language.encode(config.Language(setting.config.language.encoder, 2), texts)
+    other = language.encode(config.Language(setting.config.language.encoder, 2, False), texts)
     assert np.abs(other.instructions[0].words - last.instructions[0].words).max() > 0.1
     with pytest.raises(UserError, match="no folder"):
-        language.encode(config.Language("/absent", -1), texts)
+        language.encode(config.Language("/absent", -1, False), texts)
