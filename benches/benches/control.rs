@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use criterion::{Criterion, criterion_group, criterion_main};
 use lads_benches::bundle;
 use lads_compiler::{Bundle, compile};
-use lads_core::{Controller, Instruction, Policy, Workspace};
+use lads_core::{Controller, Instruction, PlanIndex, Policy, Workspace};
 
 /// Tokens in the context of a measured control step.
 const CONTEXT: usize = 300;
@@ -57,13 +57,35 @@ fn control(criterion: &mut Criterion) {
     });
     group.finish();
 
-    criterion.bench_function("instruct", |bencher| {
-        bencher.iter(|| controller.set_instruction(black_box(Instruction::Id(0))));
-    });
+    entries(criterion, &mut controller);
     let mut group = criterion.benchmark_group("self_test");
     group.sample_size(10);
     group.bench_function("whole episode", |bencher| {
         bencher.iter(|| controller.self_test());
+    });
+    group.finish();
+}
+
+/// The entries that a call of its own reaches.
+fn entries(criterion: &mut Criterion, controller: &mut Controller<'_, '_>) {
+    let policy = *controller.policy();
+    let (contract, golden) = (policy.contract(), policy.golden());
+    let golden = golden.expect("the bundle that ships has a golden episode");
+    let horizon = contract.horizon();
+    let steps: Vec<_> = golden.steps().take(horizon).collect();
+    let observations: Vec<f32> = steps.iter().flat_map(|step| step.0).copied().collect();
+    let actions: Vec<f32> = steps.iter().flat_map(|step| step.2).copied().collect();
+    let (observation, plan, _) = steps[0];
+    let mut action = vec![0.0; contract.action_len()];
+    let mut group = criterion.benchmark_group("entry");
+    group.bench_function("high_level/instruct", |bencher| {
+        bencher.iter(|| controller.set_instruction(black_box(Instruction::Id(0))));
+    });
+    group.bench_function("low_level/act", |bencher| {
+        bencher.iter(|| controller.act(black_box(observation), PlanIndex(plan), &mut action));
+    });
+    group.bench_function("trajectory_encoder/encode", |bencher| {
+        bencher.iter(|| controller.encode(black_box(&observations), &actions));
     });
     group.finish();
 }

@@ -56,7 +56,7 @@ pub fn measure(
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Report, BenchError> {
     let _load = Load::start(protocol.load);
-    with_contenders(candidates, bundle, peers, |field, contenders| {
+    with_contenders(candidates, bundle, peers, vec![], |field, contenders| {
         run(field, contenders, protocol, progress)
     })
 }

@@ -61,11 +61,12 @@ pub struct Field<'f> {
     pub absent: Vec<String>,
 }
 
-/// Opens all contenders, compares them, and lends them to `body`.
+/// Opens all contenders, compares them, and lends them to `body`. Guests come last and are not compared: they run no policy.
 pub fn with_contenders<R>(
     candidates: &[Candidate<'_>],
     bundle: &[u8],
     peers: &Peers,
+    mut guests: Vec<Box<dyn Contender>>,
     body: impl FnOnce(&Field<'_>, &mut [&mut dyn Contender]) -> Result<R, BenchError>,
 ) -> Result<R, BenchError> {
     let refused = |error: &dyn std::fmt::Display| {
@@ -112,7 +113,7 @@ pub fn with_contenders<R>(
     let others = others
         .iter_mut()
         .map(|contender| contender.as_mut() as &mut dyn Contender);
-    let mut contenders: Vec<_> = ours.chain(others).collect();
+    let mut contenders: Vec<&mut dyn Contender> = ours.chain(others).collect();
     let mut entrants = vec![];
     for (contender, tolerance) in contenders.iter_mut().zip(tolerances) {
         entrants.push(admit(*contender, &episode, tolerance)?);
@@ -123,6 +124,11 @@ pub fn with_contenders<R>(
         entrants,
         absent,
     };
+    contenders.extend(
+        guests
+            .iter_mut()
+            .map(|guest| guest.as_mut() as &mut dyn Contender),
+    );
     body(&field, &mut contenders)
 }
 

@@ -1,0 +1,83 @@
+//! What a simulated control step costs, and how many of them an evaluation makes in a second; with the simulator that `make setup`
+//! fetches.
+
+use std::sync::atomic::AtomicBool;
+
+use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use lads_benches::bundle;
+use lads_compiler::{Bundle, compile};
+use lads_core::{Decision, Policy};
+use lads_sim::assets::vendor_dir;
+use lads_sim::environment::{Environment, EpisodeSeed};
+use lads_sim::evaluate::{Assignment, Evaluation};
+use lads_sim::fit;
+
+const START: EpisodeSeed = EpisodeSeed {
+    seed: 0,
+    instruction: 0,
+    episode: 0,
+};
+
+fn environment(criterion: &mut Criterion) {
+    let open = lads_sim::registry::load("franka-kitchen", "v0", &vendor_dir())
+        .expect("make setup has fetched the simulator");
+    let mut kitchen = open();
+    let command = vec![0.1; kitchen.action_len()];
+    let mut group = criterion.benchmark_group("environment");
+    group.sample_size(10);
+    group.bench_function("reset", |bencher| {
+        bencher.iter(|| kitchen.reset(START)[0]);
+    });
+    group.bench_function("step", |bencher| {
+        kitchen.reset(START);
+        bencher.iter(|| {
+            if kitchen.steps() == kitchen.max_steps() {
+                kitchen.reset(START);
+            }
+            kitchen.step(&command).expect("the command is finite")[0]
+        });
+    });
+    group.finish();
+}
+
+fn evaluation(criterion: &mut Criterion) {
+    let open = lads_sim::registry::load("franka-kitchen", "v0", &vendor_dir())
+        .expect("make setup has fetched the simulator");
+    let bundle = Bundle::open(&bundle()).expect("the bundle that ships opens");
+    let image = compile(&bundle).expect("it compiles");
+    let policy = Policy::new_checked(image.as_bytes()).expect("its image is sound");
+    let kitchen: Box<dyn Environment> = open();
+    let commanded = policy.contract().instruction(0).map(|known| {
+        let tasks = fit::sub_tasks(known.sub_tasks);
+        let index = |task| kitchen.sub_tasks().iter().position(|known| *known == task);
+        tasks.filter_map(index).collect()
+    });
+    let assignments = [Assignment {
+        instruction: 0,
+        commanded: commanded.expect("the policy knows an instruction"),
+    }];
+    let evaluation = Evaluation {
+        policy,
+        assignments: &assignments,
+        episodes: 1,
+        seed: 0,
+        decision: Decision::Argmax,
+        threads: 1,
+    };
+    let run = || {
+        let evaluated = evaluation.run(&*open, &AtomicBool::new(false), &|| ());
+        let evaluated = evaluated.expect("an episode runs to its end");
+        evaluated.episodes.concat().iter().map(|e| e.steps).sum()
+    };
+    let steps: usize = run();
+    let mut group = criterion.benchmark_group("evaluation");
+    group.sample_size(10);
+    group.throughput(Throughput::Elements(steps as u64));
+    group.bench_function("control steps of an episode, 1 thread", |bencher| {
+        bencher.iter(run);
+    });
+    group.finish();
+}
+
+criterion_group!(benches, environment, evaluation);
+criterion_main!(benches);

@@ -1,0 +1,133 @@
+//! What grows with what: random bundles of growing size, which the exporter makes, and the exponents of power laws through them.
+
+use std::path::Path;
+
+use lads_benches::BenchError;
+use lads_benches::clock::Pace;
+use lads_benches::contender::{Block, Kind, Work};
+use lads_benches::stats::exponent;
+use lads_benches::suite::{Candidate, Peers, with_contenders};
+use lads_benches::turns::take_turns;
+use lads_compiler::{Bundle, compile};
+use lads_core::Policy;
+use serde::{Deserialize, Serialize};
+
+use crate::Effort;
+use crate::measure::CONTEXT;
+
+/// One bundle.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Point {
+    /// Size of the dimension that grows.
+    pub value: f64,
+    /// Bytes of the compiled image.
+    pub image_bytes: f64,
+    /// Bytes of the controller's memory.
+    pub workspace_bytes: f64,
+    /// Medians in microseconds: lads, then ONNX Runtime.
+    pub act: [f64; 2],
+    /// The same of an ordinary step.
+    pub ordinary: [f64; 2],
+    /// The same of a decision step.
+    pub decision: [f64; 2],
+}
+
+/// All bundles that differ in one dimension.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Series {
+    /// The dimension.
+    pub name: String,
+    /// Its points, in order.
+    pub points: Vec<Point>,
+}
+
+impl Series {
+    /// The fitted exponent of a column, and R².
+    pub fn exponent(&self, of: impl Fn(&Point) -> f64) -> Option<(f64, f64)> {
+        let points: Vec<_> = self
+            .points
+            .iter()
+            .map(|point| (point.value, of(point)))
+            .collect();
+        exponent(&points)
+    }
+}
+
+/// Measures every bundle that `index.json` lists.
+pub fn measure(
+    folder: &Path,
+    library: &Path,
+    effort: Effort,
+    progress: &mut dyn FnMut(&str),
+) -> Result<Vec<Series>, BenchError> {
+    let about = |error: &dyn std::fmt::Display| {
+        BenchError::new(
+            folder.display(),
+            error,
+            "make the bundles again (make bench does)",
+        )
+    };
+    let index = std::fs::read(folder.join("index.json")).map_err(|error| about(&error))?;
+    let index: Vec<(String, f64, String)> =
+        serde_json::from_slice(&index).map_err(|error| about(&error))?;
+    let mut all: Vec<Series> = vec![];
+    for (series, value, file) in index {
+        progress(&file);
+        let bytes = std::fs::read(folder.join(&file)).map_err(|error| about(&error))?;
+        let point = point(&bytes, value, library, effort)?;
+        match all.last_mut().filter(|last| last.name == series) {
+            Some(last) => last.points.push(point),
+            None => all.push(Series {
+                name: series,
+                points: vec![point],
+            }),
+        }
+    }
+    Ok(all)
+}
+
+fn point(bytes: &[u8], value: f64, library: &Path, effort: Effort) -> Result<Point, BenchError> {
+    let about =
+        |error: &dyn std::fmt::Display| BenchError::new("a random bundle", error, "make it again");
+    let bundle = Bundle::from_bytes(bytes).map_err(|error| about(&error))?;
+    let image = compile(&bundle).map_err(|error| about(&error))?;
+    let policy = Policy::new_checked(image.as_bytes()).map_err(|error| about(&error))?;
+    let workspace = 4 * (policy.arena_len() + policy.state_len());
+    let tolerance = policy.golden().map_or(0.0, |golden| golden.tolerance());
+    let candidates = [Candidate {
+        weights: "f32",
+        image: image.as_bytes(),
+        tolerance,
+    }];
+    let peers = Peers {
+        onnxruntime: Some(library.to_owned()),
+        ..Peers::default()
+    };
+    with_contenders(&candidates, bytes, &peers, vec![], |field, contenders| {
+        let calls = 20;
+        let first = field.episode.first_around(CONTEXT, field.words, calls);
+        let block = |work| Block {
+            work,
+            pace: Pace::Hot,
+            calls,
+            settle: 3,
+        };
+        let blocks = [block(Work::Act), block(Work::Steps { first })];
+        let runs = take_turns(contenders, &blocks, effort.growth_rounds, &mut |_| ())?;
+        let medians = |kind| {
+            let of = |i: usize| {
+                let summary = runs.get(i).and_then(|rounds| rounds.summary(kind));
+                summary.map_or(f64::NAN, |summary| summary.p50 as f64 / 1e3)
+            };
+            [of(0), of(1)]
+        };
+        Ok(Point {
+            value,
+            image_bytes: image.as_bytes().len() as f64,
+            workspace_bytes: workspace as f64,
+            act: medians(Kind::Act),
+            ordinary: medians(Kind::Ordinary),
+            decision: medians(Kind::Decision),
+        })
+    })
+}
