@@ -12,6 +12,9 @@ use lads_sim::environment::{Environment, EpisodeSeed};
 use lads_sim::evaluate::{Assignment, Evaluation};
 use lads_sim::fit;
 
+/// Control steps of an episode.
+const STEPS: usize = 280;
+
 const START: EpisodeSeed = EpisodeSeed {
     seed: 0,
     instruction: 0,
@@ -26,13 +29,13 @@ fn environment(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("environment");
     group.sample_size(10);
     group.bench_function("reset", |bencher| {
-        bencher.iter(|| kitchen.reset(START)[0]);
+        bencher.iter(|| kitchen.reset(START, &[])[0]);
     });
     group.bench_function("step", |bencher| {
-        kitchen.reset(START);
+        kitchen.reset(START, &[]);
         bencher.iter(|| {
-            if kitchen.steps() == kitchen.max_steps() {
-                kitchen.reset(START);
+            if kitchen.steps() == STEPS {
+                kitchen.reset(START, &[]);
             }
             kitchen.step(&command).expect("the command is finite")[0]
         });
@@ -55,6 +58,7 @@ fn evaluation(criterion: &mut Criterion) {
     let assignments = [Assignment {
         instruction: 0,
         commanded: commanded.expect("the policy knows an instruction"),
+        max_steps: STEPS,
     }];
     let evaluation = Evaluation {
         policy,

@@ -1,7 +1,8 @@
 //! `lads bench`: a policy at its real rate, over whole episodes, alone or beside peers; what a control thread would see.
 //!
-//! A run is made of rounds. In a round every contender gets one block at every part of the episode (two horizons long), one of the
-//! low level alone and one of new instructions; within a block the calls come at the period's absolute deadlines.
+//! A run is made of rounds. In a round every contender gets one block at one part of the episode (two horizons long), one of the low
+//! level alone and one of new instructions; within a block the calls come at the period's absolute deadlines. The rounds go through
+//! the parts of the episode again and again.
 
 use std::fmt::{self, Display, Formatter};
 use std::time::Duration;
@@ -20,8 +21,11 @@ use crate::turns::take_turns;
 /// Calls before the recorded ones of each block.
 const SETTLE: usize = 3;
 
+/// Calls of the low level alone in a round.
+const ACTIONS: usize = 10;
+
 /// New instructions in a round.
-const INSTRUCTIONS: usize = 4;
+const INSTRUCTIONS: usize = 2;
 
 /// How to measure.
 #[derive(Debug, Clone)]
@@ -70,37 +74,29 @@ fn run(
     let steps = field.episode.context_steps;
     let part = (2 * field.episode.horizon).min(steps);
     let parts = steps / part;
-    let ticks = (protocol.rate * protocol.seconds) as usize;
-    // A short run has one round, in fewer parts of the episode.
-    let of_round = parts * (part + SETTLE) + part + INSTRUCTIONS + 2 * SETTLE;
-    let rounds = (ticks / of_round).max(1);
-    let parts = ((ticks / rounds) / (part + SETTLE))
-        .saturating_sub(1)
-        .clamp(1, parts);
     let pace = Pace::Every(Duration::from_secs_f64(1.0 / protocol.rate));
-    let block = |work, calls| Block {
+    let block = |work, calls, settle| Block {
         work,
         pace,
         calls,
-        settle: SETTLE,
+        settle,
     };
-    let first = |number: usize| (number * (steps - part)) / (parts - 1).max(1) / part * part;
-    let mut blocks: Vec<_> = (0..parts)
-        .map(|number| {
-            block(
-                Work::Steps {
-                    first: first(number),
-                },
-                part,
-            )
-        })
-        .collect();
-    blocks.push(block(Work::Act, part));
-    blocks.push(block(Work::Instruct, INSTRUCTIONS));
+    let round = |number: usize| {
+        // By the golden ratio: however many rounds there are, they are spread over the whole episode.
+        let at = ((number as f64 * 0.618_033_988_75).fract() * parts as f64) as usize;
+        let first = at * part;
+        vec![
+            block(Work::Steps { first }, part, SETTLE),
+            block(Work::Act, ACTIONS, SETTLE),
+            block(Work::Instruct, INSTRUCTIONS, 1),
+        ]
+    };
+    let of_round = part + ACTIONS + INSTRUCTIONS + 2 * SETTLE + 1;
+    let rounds = ((protocol.rate * protocol.seconds) as usize / of_round).max(1);
+    let rounds: Vec<_> = (0..rounds).map(round).collect();
     let granted = Realtime::enter();
-    let runs = take_turns(contenders, &blocks, rounds, &mut |done| {
-        progress(done, rounds);
-    })?;
+    let mut told = |done| progress(done, rounds.len());
+    let runs = take_turns(contenders, &rounds, &mut told)?;
     Ok(Report {
         protocol: protocol.clone(),
         granted: granted.to_string(),

@@ -4,15 +4,14 @@ use crate::contender::{Block, Contender};
 use crate::error::BenchError;
 use crate::stats::Rounds;
 
-/// Measures `blocks` (all of one round) for every contender that offers them, `rounds` times. `progress` is told the rounds done.
+/// Measures rounds of blocks for every contender that offers them. `progress` is told the rounds done.
 pub fn take_turns(
     contenders: &mut [&mut dyn Contender],
-    blocks: &[Block],
-    rounds: usize,
+    rounds: &[Vec<Block>],
     progress: &mut dyn FnMut(usize),
 ) -> Result<Vec<Rounds>, BenchError> {
-    let mut measured = vec![Rounds(vec![vec![]; rounds]); contenders.len()];
-    for round in 0..rounds {
+    let mut measured = vec![Rounds(vec![vec![]; rounds.len()]); contenders.len()];
+    for (round, blocks) in rounds.iter().enumerate() {
         for block in blocks {
             let mut order: Vec<_> = (0..contenders.len()).collect();
             if round % 2 == 1 {

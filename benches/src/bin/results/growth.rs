@@ -113,7 +113,11 @@ fn point(bytes: &[u8], value: f64, library: &Path, effort: Effort) -> Result<Poi
             settle: 3,
         };
         let blocks = [block(Work::Act), block(Work::Steps { first })];
-        let runs = take_turns(contenders, &blocks, effort.growth_rounds, &mut |_| ())?;
+        let runs = take_turns(
+            contenders,
+            &vec![blocks.to_vec(); effort.growth_rounds],
+            &mut |_| (),
+        )?;
         let medians = |kind| {
             let of = |i: usize| {
                 let summary = runs.get(i).and_then(|rounds| rounds.summary(kind));

@@ -118,7 +118,11 @@ pub fn hot(
         block(Work::Steps { first }, CALLS),
         block(Work::Instruct, 3),
     ];
-    let mut rounds = take_turns(contenders, &blocks, effort.hot_rounds, progress)?;
+    let mut rounds = take_turns(
+        contenders,
+        &vec![blocks.to_vec(); effort.hot_rounds],
+        progress,
+    )?;
     // Tens of milliseconds a call: a few are enough.
     let whole = [Block {
         settle: 1,
@@ -129,7 +133,11 @@ pub fn hot(
             2,
         )
     }];
-    let recomputed = take_turns(contenders, &whole, effort.recompute_rounds, &mut |_| ())?;
+    let recomputed = take_turns(
+        contenders,
+        &vec![whole.to_vec(); effort.recompute_rounds],
+        &mut |_| (),
+    )?;
     for (rounds, more) in rounds.iter_mut().zip(recomputed) {
         rounds.0.extend(more.0);
     }
@@ -159,7 +167,7 @@ pub fn paced(
     let first = field.episode.first_around(CONTEXT, field.words, CALLS);
     let blocks = [block(Work::Act, CALLS), block(Work::Steps { first }, CALLS)];
     let granted = Realtime::enter();
-    let rounds = take_turns(contenders, &blocks, rounds, progress)?;
+    let rounds = take_turns(contenders, &vec![blocks.to_vec(); rounds], progress)?;
     Ok(Run {
         names: names(contenders),
         rounds,
@@ -184,7 +192,8 @@ pub fn contexts(
             calls: CALLS,
             settle: 3,
         };
-        let runs = take_turns(contenders, &[block], effort.context_rounds, &mut |_| ())?;
+        let rounds = vec![vec![block]; effort.context_rounds];
+        let runs = take_turns(contenders, &rounds, &mut |_| ())?;
         let tokens = field.words + 2 * block.middle();
         for (points, rounds) in points.iter_mut().zip(&runs) {
             if let Some(summary) = rounds.summary(Kind::Ordinary) {

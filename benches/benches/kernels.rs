@@ -1,0 +1,110 @@
+//! The kernels of a control step against the least that their bytes can cost: a bare sweep over as much memory, in the same group.
+
+#[path = "../src/sweep.rs"]
+mod sweep;
+
+use std::hint::black_box;
+
+use criterion::measurement::WallTime;
+use criterion::{BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main};
+use lads_kernels::stored::to_f16;
+use lads_kernels::{
+    Activation, Attention, Isa, LayerNorm, Linear, Panels, attention_scratch_len, keys_len, pack,
+    packed_len,
+};
+
+use sweep::Sweep;
+
+/// Elements that are neither zero nor all the same.
+fn numbers(count: usize) -> Vec<f32> {
+    (0..count)
+        .map(|i| ((i * 37 % 101) as f32 - 50.0) / 50.0)
+        .collect()
+}
+
+/// The sweep of a group, whose kernel has been measured.
+fn roofline(group: &mut BenchmarkGroup<'_, WallTime>, bytes: usize) {
+    let sweep = Sweep::new(bytes);
+    group.bench_function("sweep", |bencher| bencher.iter(|| sweep.read()));
+}
+
+/// One dense layer, in 32 and in 16 bits, for one row and for the two tokens of a control step.
+fn linear(criterion: &mut Criterion) {
+    let isa = Isa::detect();
+    for (k, n) in [(128, 128), (128, 384), (512, 128)] {
+        let dense = numbers(k * n);
+        let mut w = vec![0.0; packed_len(k, n)];
+        pack(&dense, k, n, &mut w);
+        let half: Vec<u16> = w.iter().map(|&x| to_f16(x).unwrap_or(0)).collect();
+        let bias = numbers(n);
+        for rows in [1, 2] {
+            let (x, mut y) = (numbers(rows * k), vec![0.0; rows * n]);
+            let stored = [("f32", Panels::F32(&w), 4), ("f16", Panels::F16(&half), 2)];
+            for (name, panels, bytes) in stored {
+                let layer = Linear {
+                    k,
+                    n,
+                    w: panels,
+                    bias: &bias,
+                    activation: Activation::Relu,
+                    accumulate: false,
+                };
+                let mut group =
+                    criterion.benchmark_group(format!("linear/{k}x{n} {name}, {rows} rows"));
+                group.throughput(Throughput::Bytes((bytes * w.len()) as u64));
+                group.bench_function("kernel", |bencher| {
+                    bencher.iter(|| layer.run(isa, black_box(&x), &mut y));
+                });
+                roofline(&mut group, bytes * w.len());
+                group.finish();
+            }
+        }
+    }
+}
+
+/// Two tokens after three hundred, four heads of 32.
+fn attention(criterion: &mut Criterion) {
+    let isa = Isa::detect();
+    let (heads, head_dim, visible) = (4, 32, 301);
+    let (width, capacity) = (heads * head_dim, 584);
+    let (keys, values) = (
+        numbers(keys_len(capacity, width)),
+        numbers(capacity * width),
+    );
+    let attention = Attention {
+        heads,
+        head_dim,
+        scale: 0.2,
+        q_stride: width,
+        visible,
+        cache_k: &keys,
+        cache_v: &values,
+    };
+    let (q, mut y) = (numbers(2 * width), vec![0.0; 2 * width]);
+    let mut scratch = vec![0.0; attention_scratch_len(2, heads, capacity)];
+    let bytes = 2 * visible * width * size_of::<f32>();
+    let mut group = criterion.benchmark_group("attention/2 on 300, 4 heads of 32");
+    group.throughput(Throughput::Bytes(bytes as u64));
+    group.bench_function("kernel", |bencher| {
+        bencher.iter(|| attention.run(isa, black_box(&q), &mut y, &mut scratch));
+    });
+    roofline(&mut group, bytes);
+    group.finish();
+}
+
+fn layer_norm(criterion: &mut Criterion) {
+    let isa = Isa::detect();
+    let (scale, bias) = (numbers(128), numbers(128));
+    let norm = LayerNorm {
+        gamma: &scale,
+        beta: &bias,
+        eps: 1e-5,
+    };
+    let (x, mut y) = (numbers(256), vec![0.0; 256]);
+    criterion.bench_function("layer norm/2 rows of 128", |bencher| {
+        bencher.iter(|| norm.run(isa, black_box(&x), &mut y));
+    });
+}
+
+criterion_group!(benches, linear, attention, layer_norm);
+criterion_main!(benches);
