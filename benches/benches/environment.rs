@@ -11,6 +11,7 @@ use lads_sim::assets::vendor_dir;
 use lads_sim::environment::{Environment, EpisodeSeed};
 use lads_sim::evaluate::{Assignment, Evaluation};
 use lads_sim::fit;
+use lads_sim::rollout::Actor;
 
 /// Control steps of an episode.
 const STEPS: usize = 280;
@@ -66,6 +67,7 @@ fn evaluation(criterion: &mut Criterion) {
         episodes: 1,
         seed: 0,
         decision: Decision::Argmax,
+        actor: Actor::Policy,
         threads: 1,
     };
     let run = || {

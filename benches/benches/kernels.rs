@@ -1,19 +1,15 @@
 //! The kernels of a control step against the least that their bytes can cost: a bare sweep over as much memory, in the same group.
 
-#[path = "../src/sweep.rs"]
-mod sweep;
-
 use std::hint::black_box;
 
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main};
+use lads_benches::sweep::Sweep;
 use lads_kernels::stored::to_f16;
 use lads_kernels::{
     Activation, Attention, Isa, LayerNorm, Linear, Panels, attention_scratch_len, keys_len, pack,
     packed_len,
 };
-
-use sweep::Sweep;
 
 /// Elements that are neither zero nor all the same.
 fn numbers(count: usize) -> Vec<f32> {

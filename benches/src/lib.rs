@@ -26,7 +26,6 @@ pub mod peers;
 pub mod realtime;
 pub mod stats;
 pub mod suite;
-#[cfg(feature = "results")]
 pub mod sweep;
 pub mod turns;
 

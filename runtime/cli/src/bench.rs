@@ -9,13 +9,16 @@ use std::path::PathBuf;
 use clap::Args;
 use lads_benches::paced::{Protocol, Report, measure};
 use lads_benches::suite::{Candidate, Peers};
-use lads_core::Policy;
+use lads_compiler::{Options, WeightFormat};
 
 use crate::model::Model;
 use crate::refusal::Refusal;
 
 /// Where `benches/setup.py` puts the library of ONNX Runtime.
 const ONNXRUNTIME: &str = "vendor/onnxruntime/libonnxruntime.so";
+
+/// An action that is further from the recorded one than this is not rounding.
+const BROKEN: f32 = 0.1;
 
 /// What to measure and how.
 #[derive(Debug, Args)]
@@ -32,6 +35,15 @@ pub struct Request {
     /// Threads that thrash the caches and compute beside it
     #[arg(long, default_value_t = 0)]
     load: usize,
+    /// Formats of the weights to measure, side by side; an image has those that it was compiled with
+    #[arg(
+        long,
+        value_name = "FORMAT",
+        value_delimiter = ',',
+        default_value = "f32",
+        value_parser = crate::weight_format
+    )]
+    weights: Vec<WeightFormat>,
     /// Beside ONNX Runtime, tract and rten, in turns; with --python also PyTorch and OpenVINO
     #[arg(long)]
     peers: bool,
@@ -82,7 +94,20 @@ impl Request {
 /// Measures as requested.
 pub fn bench(request: &Request) -> Result<Report, Refusal> {
     request.check()?;
-    let model = Model::open(&request.model)?;
+    let mut models = vec![];
+    for &weights in &request.weights {
+        // The tolerance of fewer bits is the gate's; here it only has to tell a sound policy from a broken one.
+        let tolerance = (weights != WeightFormat::F32).then_some(BROKEN);
+        let options = Options {
+            weights,
+            tolerance,
+            force: false,
+        };
+        models.push((weights.name(), Model::compile(&request.model, options)?));
+    }
+    let (_, model) = models
+        .first()
+        .ok_or_else(|| Refusal::new("--weights", "it names none", "name a format, such as f32"))?;
     let mut peers = Peers::default();
     let mut bundle = vec![];
     if request.peers {
@@ -102,15 +127,15 @@ pub fn bench(request: &Request) -> Result<Report, Refusal> {
             .clone()
             .map(|python| (python, model.path.clone()));
     }
-    let tolerance = model
-        .policy()?
-        .golden()
-        .map_or(0.0, |golden| golden.tolerance());
-    let candidate = Candidate {
-        weights: weights(&model.policy()?),
-        image: model.image(),
-        tolerance,
-    };
+    let mut candidates = vec![];
+    for (weights, model) in &models {
+        let golden = model.policy()?.golden();
+        candidates.push(Candidate {
+            weights: if model.is_bundle() { weights } else { "image" },
+            image: model.image(),
+            tolerance: golden.map_or(0.0, |golden| golden.tolerance()),
+        });
+    }
     let protocol = Protocol {
         rate: request.rate,
         seconds: request.seconds,
@@ -125,11 +150,6 @@ pub fn bench(request: &Request) -> Result<Report, Refusal> {
             );
         }
     };
-    measure(&[candidate], &bundle, &peers, &protocol, &mut progress)
+    measure(&candidates, &bundle, &peers, &protocol, &mut progress)
         .map_err(|error| Refusal::with_remedy_inside(model.path.display(), error))
-}
-
-/// How the weights of an image are stored.
-fn weights(_: &Policy<'_>) -> &'static str {
-    "f32"
 }

@@ -26,7 +26,7 @@ use lads_benches::peers::{cut::Source, tract::Tract};
 use lads_benches::stats::{median, quantile};
 use lads_benches::suite::{Candidate, Peers, with_contenders};
 use lads_benches::{BenchError, bundle};
-use lads_compiler::{Bundle, Image, compile};
+use lads_compiler::{Bundle, Image, Options, WeightFormat, compile, compile_with};
 use lads_core::Policy;
 use serde_json::{Value, json};
 
@@ -120,11 +120,30 @@ fn say(text: &str) {
     eprintln!("{text}");
 }
 
-/// The images of the policy that ships, with the weights stored in several ways.
+/// The images of the policy that ships, with the weights stored in every way that gives the same plans.
 fn images(bundle: &Bundle) -> Result<Vec<(&'static str, Image)>, BenchError> {
-    let image = compile(bundle).map_err(|error| about("models/kitchen.onnx", error))?;
-    Ok(vec![("f32", image)])
+    let mut images = vec![];
+    for weights in WeightFormat::ALL {
+        let full = weights == WeightFormat::F32;
+        let options = Options {
+            weights,
+            tolerance: (!full).then_some(BROKEN),
+            force: false,
+        };
+        match compile_with(bundle, options) {
+            Ok(image) => images.push((weights.name(), image)),
+            Err(error) if full => return Err(about("models/kitchen.onnx", error)),
+            Err(error) => say(&format!("without {} weights: {error}", weights.name())),
+        }
+    }
+    Ok(images)
 }
+
+/// Images that the paced run for the tails measures: full and half precision.
+const FOR_TAILS: usize = 2;
+
+/// An action that is further from the recorded one than this is not rounding.
+const BROKEN: f32 = 0.1;
 
 #[allow(clippy::too_many_lines, reason = "the order of the run, step by step")]
 fn run(arguments: &Arguments) -> Result<(), BenchError> {
@@ -149,18 +168,14 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
         .map_err(|error| about(image_file.display(), error))?;
     let cold = cold::measure(&image_file, effort.processes)?;
 
-    let tolerance = |weights: &str, policy: &Policy<'_>| {
-        let recorded = policy.golden().map_or(0.0, |golden| golden.tolerance());
-        if weights == "f32" { recorded } else { 0.1 }
-    };
     let mut candidates = vec![];
     for (weights, image) in &images {
-        let policy =
-            Policy::new_checked(image.as_bytes()).map_err(|error| about("the image", error))?;
-        let tolerance = tolerance(weights, &policy);
+        let image = image.as_bytes();
+        let policy = Policy::new_checked(image).map_err(|error| about("the image", error))?;
+        let tolerance = policy.golden().map_or(0.0, |golden| golden.tolerance());
         candidates.push(Candidate {
             weights,
-            image: image.as_bytes(),
+            image,
             tolerance,
         });
     }
@@ -202,20 +217,16 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
             Ok((entrants, hot, paced, contexts))
         },
     )?;
+    let tails = candidates.get(..FOR_TAILS).unwrap_or(&candidates);
     say("beside ONNX Runtime: at 50 Hz, for the tails");
-    let (paced, loaded) = with_contenders(
-        &candidates,
-        &bytes,
-        &main_peers,
-        bare(),
-        |field, contenders| {
+    let (paced, loaded) =
+        with_contenders(tails, &bytes, &main_peers, bare(), |field, contenders| {
             let rounds = effort.paced_rounds;
             let paced = measure::paced(field, contenders, rounds, 0, &mut |_| ())?;
             say("the same beside a thread that thrashes the caches");
             let loaded = measure::paced(field, contenders, effort.load_rounds, 1, &mut |_| ())?;
             Ok((paced, loaded))
-        },
-    )?;
+        })?;
 
     say("growth with the network");
     let folder = arguments.scratch.join("growth");

@@ -458,7 +458,8 @@ fn starts(measured: &Measured) -> String {
         images,
     ));
     text.push_str(
-        "\nFresh processes, medians [us]; *hot* is the same step later in the same process:\n\n",
+        "\nFresh processes, medians [us], in which other work took the caches before the first instruction; *hot* is the same step later in the same process. \
+         Warming up is the self-test:\n\n",
     );
     let rows = ["without", "with"].into_iter().map(|warm| {
         let s = &measured.cold[warm];
@@ -502,7 +503,11 @@ fn context(measured: &Measured) -> String {
     header.push("exponent (R²)".into());
     header.push("per 100 tokens".into());
     let header: Vec<_> = header.iter().map(String::as_str).collect();
-    let rows = measured.contexts.iter().map(|(name, points)| {
+    let walked = measured
+        .contexts
+        .iter()
+        .filter(|(_, points)| !points.is_empty());
+    let rows = walked.map(|(name, points)| {
         let mut row = vec![name.clone()];
         row.extend(points.iter().map(|(_, us)| plain(*us)));
         row.push(fitted(exponent(points)));
