@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use lads_benches::bundle;
 use lads_compiler::{Bundle, compile};
-use lads_core::{Decision, Policy};
+use lads_core::{Decision, Isa, Policy};
 use lads_sim::assets::vendor_dir;
 use lads_sim::environment::{Environment, EpisodeSeed};
 use lads_sim::evaluate::{Assignment, Evaluation};
@@ -68,6 +68,8 @@ fn evaluation(criterion: &mut Criterion) {
         seed: 0,
         decision: Decision::Argmax,
         actor: Actor::Policy,
+        isa: Isa::detect(),
+        traced: 0,
         threads: 1,
     };
     let run = || {

@@ -66,14 +66,11 @@ pub fn child(image: &Path, warm: bool) -> Result<(), BenchError> {
         *x = x.wrapping_mul(3);
     }
     std::hint::black_box(&other);
-    let (warmed, warm) = timed(|| {
+    let ((), warm) = timed(|| {
         if warm {
-            self::warm(&mut controller)
-        } else {
-            Ok(())
+            controller.warm();
         }
     });
-    warmed?;
     let [instruct, first, second] = begin(&mut controller, &episode)?;
     let again = (0..AGAIN).map(|_| begin(&mut controller, &episode));
     let again = again.collect::<Result<Vec<_>, _>>()?;
@@ -92,11 +89,6 @@ pub fn child(image: &Path, warm: bool) -> Result<(), BenchError> {
     };
     println!("{}", serde_json::to_string(&start).map_err(refused)?);
     Ok(())
-}
-
-/// Brings code and weights into reach of the first step.
-fn warm(controller: &mut Controller<'_, '_>) -> Result<(), BenchError> {
-    controller.self_test().map(drop).map_err(refused)
 }
 
 /// An instruction and two steps.

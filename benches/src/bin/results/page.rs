@@ -459,7 +459,7 @@ fn starts(measured: &Measured) -> String {
     ));
     text.push_str(
         "\nFresh processes, medians [us], in which other work took the caches before the first instruction; *hot* is the same step later in the same process. \
-         Warming up is the self-test:\n\n",
+         Warming up is `Controller::warm`:\n\n",
     );
     let rows = ["without", "with"].into_iter().map(|warm| {
         let s = &measured.cold[warm];
