@@ -371,15 +371,37 @@ impl Layout {
     }
 }
 
+/// What each value of a byte does to the checksum: the reflected polynomial, bit by bit.
+const CRC_TABLE: [u32; 256] = {
+    let mut table = [0; 256];
+    let mut rest: &mut [u32] = &mut table;
+    let mut value = 0;
+    while let Some((entry, more)) = rest.split_first_mut() {
+        let mut crc: u32 = value;
+        let mut bit = 0_u32;
+        while bit < 8 {
+            crc = (crc >> 1) ^ (0xedb8_8320 & (crc & 1).wrapping_neg());
+            bit = bit.wrapping_add(1);
+        }
+        *entry = crc;
+        rest = more;
+        value = value.wrapping_add(1);
+    }
+    table
+};
+
 /// CRC-32 (IEEE 802.3, the one of zip and PNG) of an image, its checksum word taken as zero.
 pub fn crc32(image: &[u8]) -> u32 {
-    let field = CRC_WORD * 4..CRC_WORD * 4 + 4;
+    let byte_in = |crc: u32, byte: u8| {
+        let index = (crc ^ u32::from(byte)) & 0xff;
+        (crc >> 8) ^ CRC_TABLE.get(index as usize).copied().unwrap_or(0)
+    };
+    let (words, rest) = image.as_chunks::<4>();
     let mut crc = u32::MAX;
-    for (i, &byte) in image.iter().enumerate() {
-        crc ^= u32::from(if field.contains(&i) { 0 } else { byte });
-        for _ in 0..8 {
-            crc = (crc >> 1) ^ (0xedb8_8320 & (crc & 1).wrapping_neg());
-        }
+    for (i, word) in words.iter().enumerate() {
+        let word = if i == CRC_WORD { [0; 4] } else { *word };
+        crc = word.into_iter().fold(crc, byte_in);
     }
+    crc = rest.iter().copied().fold(crc, byte_in);
     !crc
 }

@@ -2,6 +2,7 @@
 //! fused multiply-add.
 //!
 //! Error bounds are the largest relative errors that `tests/math.rs` finds against `f64` over a dense sample of all `f32`.
+//! In units in the last place, of which one is a relative 6.0e-8 to 1.2e-7: below 1.2e-7 is below 2 units, below 2.5e-7 below 4.2.
 
 /// `max(x, 0)`; not a number stays not a number.
 #[inline(always)]
