@@ -47,7 +47,7 @@ def _slope(model):
 def _high_level(tensors, contract):
     network, context = contract["network"], contract["context"]
     hidden = network["heads"] * network["head_dim"]
-    setting = HighLevel(hidden, network["layers"], network["heads"], 0.0, context["steps"])
+    setting = HighLevel(hidden, network["layers"], network["heads"], 0.0, context["steps"], 0.0)
     lengths = len(contract["observation"]), len(contract["action"])
     policy = HighLevelPolicy(setting, contract["language"]["dim"], *lengths, contract["codebook"]["size"])
     # As stored for `linear`, [k, n]; PyTorch wants [n, k]. Embeddings of observation and action and the head are stored [n, k].
@@ -70,7 +70,7 @@ def _low_level(tensors, contract, slope):
     layers = sum(name.startswith("low_level.layer.") and name.endswith(".weight") for name in tensors)
     hidden = len(tensors["low_level.layer.0.bias"])
     observations, actions = len(contract["observation"]), len(contract["action"])
-    policy = LowLevelPolicy(LowLevel(hidden, layers, slope), observations, contract["codebook"]["dim"], actions)
+    policy = LowLevelPolicy(LowLevel(hidden, layers, slope, 1.0), observations, contract["codebook"]["dim"], actions)
     last = layers - 1
     state = dict(policy.state_dict())
     for ours, number in (("first", 0), ("last", last)):
