@@ -150,6 +150,11 @@ fn references_of_something_else_are_refused_by_name() {
         r#""plans": [19, 19"#,
         &["not one per horizon"],
     );
+    check(
+        r#""final_state": ["#,
+        r#""final_state": [0.5, "#,
+        &["final state"],
+    );
     refused(
         &["no-such-file.json"],
         &["no-such-file.json", "make reference"],

@@ -3,11 +3,11 @@
 //!
 //! The rules, in this order:
 //!
-//! 1. **DIFFERENT** if the policy answers the reference's questions otherwise (an action beyond the contract's tolerance while the same plan
+//! 1. **DIFFERENT** if the policy answers the reference's questions otherwise (an action beyond the tolerance while the same plan
 //!    is in force, another plan although the reference's margin is no close call, decisions at other steps), if the reference's actions lead
 //!    through other states, if McNemar's test finds a sub-task's outcomes different (5 % over all of them together), or if the 95 % interval
 //!    of a paired difference lies wholly beyond its margin.
-//! 2. **EQUIVALENT** if none of this holds and every paired difference is equivalent: two one-sided tests at 5 %, within 0.05 for rates and
+//! 2. **EQUIVALENT** if none of this holds, actions and states were compared at all, and every paired difference is equivalent: two one-sided tests at 5 %, within 0.05 for rates and
 //!    0.1 for the N-rate.
 //! 3. **INCONCLUSIVE** otherwise; then it says how many more episodes of each instruction would decide, if it stays as it is.
 //!
@@ -133,7 +133,10 @@ impl Certificate {
         rollouts: Paired,
     ) -> Self {
         let different = differences(&policy, &environment, &rollouts);
-        let undecided = undecided(&rollouts);
+        let mut undecided = undecided(&rollouts);
+        let uncompared = uncompared(&policy, &environment);
+        let more_would_help = uncompared.is_empty();
+        undecided.extend(uncompared);
         let (verdict, reasons) = if !different.is_empty() {
             (Verdict::Different, different)
         } else if undecided.is_empty() {
@@ -144,7 +147,7 @@ impl Certificate {
         } else {
             (Verdict::Inconclusive, undecided)
         };
-        let more = (verdict == Verdict::Inconclusive)
+        let more = (verdict == Verdict::Inconclusive && more_would_help)
             .then(|| more_episodes(&rollouts, setting.episodes_per_instruction))
             .flatten();
         Self {
@@ -201,6 +204,17 @@ fn differences(policy: &Answers, environment: &Physics, rollouts: &Paired) -> Ve
     reasons
 }
 
+/// What nothing was found about: silence is no agreement.
+fn uncompared(policy: &Answers, environment: &Physics) -> Vec<String> {
+    let counts = [
+        ("action", policy.compared_steps),
+        ("state", environment.states),
+    ];
+    let none = counts.iter().filter(|(_, compared)| *compared == 0);
+    none.map(|(what, _)| format!("no {what} was compared: the traces hold none that could be"))
+        .collect()
+}
+
 fn undecided(rollouts: &Paired) -> Vec<String> {
     let rates = rollouts
         .rates
@@ -244,4 +258,20 @@ fn more_episodes(rollouts: &Paired, episodes: u32) -> Option<u32> {
         .try_fold(1.0_f64, |most, growth| Some(most.max(growth?)))?;
     let more = ((growth - 1.0) * f64::from(episodes)).ceil();
     Some((more as u32).max(1))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nothing_compared_is_not_agreement() {
+        let (mut policy, mut environment) = (Answers::default(), Physics::default());
+        assert_eq!(uncompared(&policy, &environment).len(), 2);
+        policy.compared_steps = 1;
+        let only = uncompared(&policy, &environment);
+        assert!(only.len() == 1 && only[0].contains("no state"), "{only:?}");
+        environment.states = 1;
+        assert!(uncompared(&policy, &environment).is_empty());
+    }
 }

@@ -18,6 +18,9 @@ use crate::evaluate::Assignment;
 /// Difference of two logits that rounding may reverse. Logits of the shipped policies agree with PyTorch's to 1e-4.
 pub const CLOSE_CALL: f64 = 1e-3;
 
+/// Largest difference of an action element that is ever allowed, whatever tolerance a bundle states: what is judged does not set the bar.
+pub const ACTION_TOLERANCE: f64 = 1e-4;
+
 /// Where a policy first answered otherwise.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Answer {
@@ -57,7 +60,7 @@ pub struct Answers {
     pub compared_steps: usize,
     /// Largest absolute difference of an action element in these.
     pub largest_action_difference: f64,
-    /// What it may be: the contract's tolerance.
+    /// What it may be: the bundle's own tolerance, and at most [`ACTION_TOLERANCE`].
     pub action_tolerance: f64,
     /// Largest difference between the margins of two equal decisions.
     pub largest_margin_difference: f64,
@@ -80,7 +83,8 @@ pub fn ask(
     let mut answers = Answers {
         action_tolerance: policy
             .golden()
-            .map_or(0.0, |golden| f64::from(golden.tolerance())),
+            .map_or(ACTION_TOLERANCE, |golden| f64::from(golden.tolerance()))
+            .min(ACTION_TOLERANCE),
         ..Answers::default()
     };
     let mut memory = Memory::of(policy);

@@ -283,12 +283,19 @@ impl Reference {
         )?;
         let lens = (environment.observation_len(), environment.action_len());
         for episode in self.instructions.iter().flat_map(|row| &row.episodes) {
+            if episode.final_state.len() != lens.0 {
+                return Err(ReferenceError::Content {
+                    path: self.path.clone(),
+                    problem: "the length of a final state is not the environment's".to_owned(),
+                });
+            }
             let Some(trace) = &episode.trace else {
                 continue;
             };
             if trace.observations.len() != episode.steps * lens.0
                 || trace.actions.len() != episode.steps * lens.1
                 || !trace.states.len().is_multiple_of(lens.0)
+                || trace.states.is_empty() != (episode.steps == 0)
             {
                 return Err(ReferenceError::Content {
                     path: self.path.clone(),
