@@ -13,11 +13,15 @@ RUNTIME := -p lads-core -p lads-kernels -p lads-compiler -p lads-ffi -p lads-cli
 
 PREFIX  ?= /usr/local
 
-.PHONY: run test setup lint test-runtime test-sim test-exporter collect train export install bench clean help
+.PHONY: run report test setup lint test-runtime test-sim test-exporter collect train export install bench clean help
 
 ## run: the shipped policy over the paper's seen and unseen instructions
 run: setup
 	cargo run --release -p lads-sim --bin lads-run -- --model $(MODEL) $(ARGS)
+
+## report: the same with charts, as one HTML page
+report: setup
+	cargo run --release -p lads-sim --features report --bin lads-run -- --model $(MODEL) --report report.html $(ARGS)
 
 ## test: format, lints, documentation, all Rust tests, the exporter's tests
 test: setup lint test-runtime test-sim test-exporter
@@ -28,15 +32,15 @@ setup:
 
 lint: setup
 	cargo fmt --all --check
-	cargo clippy --workspace --all-targets -- -D warnings
-	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps --quiet
+	cargo clippy --workspace --all-targets --features lads-sim/report -- -D warnings
+	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --features lads-sim/report --no-deps --quiet
 
 ## test-runtime: the runtime alone; needs neither MuJoCo nor Python
 test-runtime:
 	cargo test $(RUNTIME)
 
 test-sim: setup
-	cargo test -p lads-sim -p lads-tests -p lads-benches
+	cargo test --features lads-sim/report -p lads-sim -p lads-tests -p lads-benches
 
 # The stamp makes the environment anew whenever the package's pins change.
 $(VENV)/stamp: exporter/pyproject.toml

@@ -95,6 +95,11 @@ pub trait Environment: Send {
             .all(|&sub_task| self.completed_at(sub_task).is_some())
     }
 
+    /// Where the gripper is, in metres in the world's frame, for pictures; `None` in an environment without one.
+    fn gripper(&self) -> Option<[f64; 3]> {
+        None
+    }
+
     /// Elements of an observation.
     fn observation_len(&self) -> usize {
         self.observation_names().len()

@@ -13,8 +13,11 @@ use lads_core::{Decision, Isa, Policy, WorkspaceTooSmall};
 use thiserror::Error;
 
 use crate::environment::{Environment, EpisodeSeed};
+use crate::faults::Faults;
+use crate::plans::PlanBook;
 use crate::random::Stream;
 use crate::rollout::{Actor, Driver, Episode, RolloutError, Task, Timing};
+use crate::trace::Trace;
 
 /// Fourth number of the entropy of the stream that seeds plan sampling; the environment's noise has only the first three.
 const DECISION_STREAM: u64 = 1;
@@ -28,6 +31,17 @@ pub struct Assignment {
     pub commanded: Vec<usize>,
     /// Control steps of its episodes.
     pub max_steps: usize,
+}
+
+/// How episodes run besides policy, seed and decision; the default is the plain benchmark.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Setup<'e> {
+    /// What is wrong between policy and environment.
+    pub faults: Faults,
+    /// Plans for the low level alone.
+    pub plans: Option<&'e PlanBook>,
+    /// Whether every control step is kept.
+    pub traced: bool,
 }
 
 /// What to run, and how.
@@ -50,6 +64,8 @@ pub struct Evaluation<'e> {
     pub traced: u32,
     /// Threads, at least one.
     pub threads: usize,
+    /// Everything else about it.
+    pub setup: Setup<'e>,
 }
 
 /// Why an evaluation gave no result.
@@ -78,13 +94,15 @@ pub enum EvaluationError {
 pub struct Evaluated {
     /// One list of episodes per assignment.
     pub episodes: Vec<Vec<Episode>>,
+    /// Every control step, in the same order, where the setup asked for it; empty otherwise.
+    pub traces: Vec<Trace>,
     /// Durations, summed over the threads.
     pub timing: Timing,
 }
 
 /// What one thread did: its episodes with their places in the queue.
 struct Share {
-    episodes: Vec<(usize, Episode)>,
+    episodes: Vec<(usize, Episode, Option<Trace>)>,
     timing: Timing,
 }
 
@@ -138,14 +156,22 @@ impl Evaluation<'_> {
         if all.len() < self.len() {
             return Err(EvaluationError::Interrupted);
         }
-        all.sort_unstable_by_key(|&(place, _)| place);
-        let mut ordered = all.into_iter().map(|(_, episode)| episode);
+        all.sort_unstable_by_key(|&(place, ..)| place);
+        let mut traces = Vec::new();
+        let mut ordered = all.into_iter().map(|(_, episode, trace)| {
+            traces.extend(trace);
+            episode
+        });
         let episodes = self
             .assignments
             .iter()
             .map(|_| ordered.by_ref().take(self.episodes as usize).collect())
             .collect();
-        Ok(Evaluated { episodes, timing })
+        Ok(Evaluated {
+            episodes,
+            traces,
+            timing,
+        })
     }
 
     fn worker(
@@ -160,20 +186,35 @@ impl Evaluation<'_> {
             .controller_with(&self.policy, self.isa)
             .map_err(EvaluationError::Workspace)?;
         let mut driver = Driver::new(controller, environment.as_mut());
+        if self.setup.traced {
+            driver.record();
+        }
         let mut episodes = Vec::new();
         while let Some(place) = next() {
             let episode = (place % self.episodes as usize) as u32;
             let Some(assignment) = self.assignments.get(place / self.episodes as usize) else {
                 break;
             };
+            let task = self.task(assignment, episode);
             let run = driver
-                .run(&self.task(assignment, episode))
+                .run(&task)
                 .map_err(|source| EvaluationError::Rollout {
                     instruction: assignment.instruction,
                     episode,
                     source,
                 })?;
-            episodes.push((place, run));
+            let trace = self.setup.traced.then(|| Trace {
+                instruction: assignment.instruction,
+                episode,
+                sampling_seed: match task.decision {
+                    Decision::Sample { seed, .. } => Some(seed),
+                    Decision::Argmax => None,
+                },
+                commanded: task.plans.is_some(),
+                outcome: run.clone(),
+                steps: driver.take_recording(),
+            });
+            episodes.push((place, run, trace));
             finished();
         }
         Ok(Share {
@@ -182,7 +223,7 @@ impl Evaluation<'_> {
         })
     }
 
-    fn task<'t>(&self, assignment: &'t Assignment, episode: u32) -> Task<'t> {
+    fn task<'t>(&'t self, assignment: &'t Assignment, episode: u32) -> Task<'t> {
         let seed = EpisodeSeed {
             seed: self.seed,
             instruction: u64::from(assignment.instruction),
@@ -203,6 +244,11 @@ impl Evaluation<'_> {
             decision,
             actor: self.actor,
             traced: episode < self.traced,
+            faults: self.setup.faults,
+            plans: self
+                .setup
+                .plans
+                .and_then(|book| book.of(assignment.instruction, episode)),
         }
     }
 }

@@ -9,8 +9,10 @@ use lads_core::{Contract, Decision, KnownInstruction};
 use serde::{Serialize, Serializer};
 
 use crate::environment::Environment;
+use crate::faults::Faults;
 use crate::fit;
 use crate::metrics::{Latency, Outcome, Rate, Score};
+use crate::plans::Agreement;
 use crate::rollout::{Actor, Episode, Timing};
 
 /// Value of the JSON's `format`.
@@ -369,6 +371,15 @@ pub struct Results {
     pub decision: DecisionUsed,
     /// Episodes asked for per instruction.
     pub episodes_per_instruction: u32,
+    /// What was wrong between policy and environment; left out without faults.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub faults: Option<Faults>,
+    /// Whether the low level ran alone on given plans; left out where the policy decided.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub plans_commanded: bool,
+    /// Plans in force against plans encoded from what was executed; left out where not asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub plan_agreement: Option<Agreement>,
     /// Versions of what the numbers depend on, by name.
     pub versions: BTreeMap<&'static str, String>,
     /// Scores by split.
@@ -379,6 +390,14 @@ pub struct Results {
     pub latency_us: LatencyByKind,
     /// Where the time went.
     pub time: TimeUse,
+}
+
+/// Versions of what the numbers depend on besides the bundle, by name.
+pub fn versions() -> BTreeMap<&'static str, String> {
+    BTreeMap::from([
+        ("lads-sim", env!("CARGO_PKG_VERSION").to_owned()),
+        ("mujoco", mujoco_rs::mujoco_version().to_owned()),
+    ])
 }
 
 #[cfg(test)]

@@ -5,12 +5,16 @@
 
 use std::time::{Duration, Instant};
 
-use lads_core::{Controller, Decision, Instruction, InstructionError, StepError};
+use lads_core::{
+    ActError, Controller, Decision, Instruction, InstructionError, PlanIndex, StepError, StepReport,
+};
 use rustix::time::{ClockId, clock_gettime};
 use thiserror::Error;
 
 use crate::environment::{ActionError, Completion, Environment, EpisodeSeed};
+use crate::faults::{Faults, Link};
 use crate::random::Stream;
+use crate::trace::Step;
 
 /// Why an episode could not be finished.
 #[derive(Debug, Error)]
@@ -25,6 +29,14 @@ pub enum RolloutError {
         step: usize,
         /// The controller's reason.
         error: StepError,
+    },
+    /// The low level refused a commanded plan.
+    #[error("the low level gives no action in control step {step}: {error}")]
+    Act {
+        /// Control step, from 0.
+        step: usize,
+        /// The low level's reason.
+        error: ActError,
     },
     /// The environment refused an action.
     #[error("the environment refuses the action of control step {step}: {error}")]
@@ -66,6 +78,10 @@ pub struct Task<'t> {
     pub actor: Actor,
     /// Whether the episode is to have a trace.
     pub traced: bool,
+    /// What is wrong between policy and environment.
+    pub faults: Faults,
+    /// Plans for the low level alone, one per horizon; the episode ends with them. `None`: the high level decides.
+    pub plans: Option<&'t [u32]>,
 }
 
 /// An episode step by step, for comparisons.
@@ -140,8 +156,11 @@ pub struct Driver<'a, 'm, 'e> {
     environment: &'e mut dyn Environment,
     observation: Vec<f32>,
     action: Vec<f32>,
+    executed: Vec<f32>,
     command: Vec<f64>,
     limits: Vec<(f64, f64)>,
+    /// Control steps of the episode, where they are kept.
+    recording: Option<Vec<Step>>,
     /// What was measured so far.
     pub timing: Timing,
 }
@@ -159,33 +178,68 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             environment,
             observation: vec![0.0; observation_len],
             action: vec![0.0; action_len],
+            executed: vec![0.0; action_len],
             command: vec![0.0; action_len],
             limits,
+            recording: None,
             timing: Timing::default(),
         }
     }
 
-    /// Runs one episode to its end: the instruction is carried out, or the steps are used up.
+    /// Keeps the control steps of the episodes to come, for [`take_recording`](Self::take_recording).
+    pub fn record(&mut self) {
+        self.recording = Some(Vec::new());
+    }
+
+    /// The control steps of the last episode; empty where none were kept.
+    pub fn take_recording(&mut self) -> Vec<Step> {
+        self.recording
+            .as_mut()
+            .map(std::mem::take)
+            .unwrap_or_default()
+    }
+
+    /// Runs one episode to its end: the instruction is carried out, or the steps or the commanded plans are used up.
     pub fn run(&mut self, task: &Task<'_>) -> Result<Episode, RolloutError> {
         let episode_cpu = cpu_time();
+        if let Some(recording) = &mut self.recording {
+            recording.clear();
+        }
         self.instruct(task)?;
         let reset_cpu = cpu_time();
-        let start = self.environment.reset(task.seed, task.commanded);
-        narrow(start, &mut self.observation);
+        self.environment.reset(task.seed, task.commanded);
+        let mut link = Link::new(task.faults, task.seed);
+        self.sense(&mut link);
+        self.executed.fill(0.0);
         self.timing.simulator_cpu += cpu_since(reset_cpu);
 
-        let mut plans = Vec::with_capacity(task.max_steps);
+        let horizon = self.controller.policy().contract().horizon();
+        let most = task.plans.map_or(task.max_steps, |plans| {
+            task.max_steps.min(plans.len() * horizon)
+        });
+        let mut plans = Vec::with_capacity(most.div_ceil(horizon));
         let mut uniform = task.actor.stream(task.seed);
         let mut trace = task.traced.then(Trace::default);
         let mut step = 0;
-        while step < task.max_steps && !self.environment.succeeded(task.commanded) {
+        while step < most && !self.environment.succeeded(task.commanded) {
             if let Some(trace) = &mut trace {
                 trace.observations.extend_from_slice(&self.observation);
             }
             match &mut uniform {
-                None => self.control_step(step, &mut plans)?,
+                None => {
+                    let (report, elapsed_ns) = self.decide(step, horizon, task.plans)?;
+                    if report.decided {
+                        plans.push(report.plan.0);
+                    }
+                    let before_cpu = cpu_time();
+                    link.actuate(&self.action, &mut self.executed);
+                    self.keep(&report, elapsed_ns, task.plans.is_some());
+                    self.execute(step)?;
+                    self.timing.simulator_cpu += cpu_since(before_cpu);
+                }
                 Some(stream) => self.uniform_step(step, stream)?,
             }
+            self.sense(&mut link);
             if let Some(trace) = &mut trace {
                 trace.actions.extend_from_slice(&self.action);
             }
@@ -223,31 +277,80 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         Ok(())
     }
 
-    fn control_step(&mut self, step: usize, plans: &mut Vec<u32>) -> Result<(), RolloutError> {
+    /// The policy's action for what it sees, and how long that took in nanoseconds.
+    fn decide(
+        &mut self,
+        step: usize,
+        horizon: usize,
+        commanded: Option<&[u32]>,
+    ) -> Result<(StepReport, u64), RolloutError> {
         let before_cpu = cpu_time();
         let start = Instant::now();
-        let report = self.controller.step(&self.observation, &mut self.action);
+        let report = match commanded.and_then(|plans| plans.get(step / horizon)) {
+            None => self
+                .controller
+                .step(&self.observation, &mut self.action)
+                .map_err(|error| RolloutError::Step { step, error }),
+            Some(&plan) => self
+                .controller
+                .act(&self.observation, PlanIndex(plan), &mut self.action)
+                .map_err(|error| RolloutError::Act { step, error })
+                .map(|()| StepReport {
+                    timestep: step as u32,
+                    plan: PlanIndex(plan),
+                    decided: step.is_multiple_of(horizon),
+                    margin: f32::INFINITY,
+                }),
+        };
         let elapsed_ns = nanoseconds(start.elapsed());
-        let controlled_cpu = cpu_time();
-        self.timing.controller_cpu += controlled_cpu.saturating_sub(before_cpu);
-        let report = report.map_err(|error| RolloutError::Step { step, error })?;
+        self.timing.controller_cpu += cpu_since(before_cpu);
+        let report = report?;
         if report.decided {
-            plans.push(report.plan.0);
             self.timing.decision_ns.push(elapsed_ns);
         } else {
             self.timing.ordinary_ns.push(elapsed_ns);
         }
+        Ok((report, elapsed_ns))
+    }
 
-        for (command, &action) in self.command.iter_mut().zip(&self.action) {
+    /// Lets what the policy sees follow the environment, as far as the link lets it through.
+    fn sense(&mut self, link: &mut Link) {
+        let (observation, state) = (self.environment.observation(), self.environment.state());
+        link.sense(observation, state, &mut self.observation);
+    }
+
+    /// Hands the environment the action that the actuators execute.
+    fn execute(&mut self, step: usize) -> Result<(), RolloutError> {
+        for (command, &action) in self.command.iter_mut().zip(&self.executed) {
             *command = f64::from(action);
         }
-        let observation = self
-            .environment
+        self.environment
             .step(&self.command)
             .map_err(|error| RolloutError::Action { step, error })?;
-        narrow(observation, &mut self.observation);
-        self.timing.simulator_cpu += cpu_since(controlled_cpu);
         Ok(())
+    }
+
+    /// Records the step, where steps are kept.
+    fn keep(&mut self, report: &StepReport, controller_ns: u64, commanded: bool) {
+        let Some(recording) = &mut self.recording else {
+            return;
+        };
+        let logits = if report.decided && !commanded {
+            self.controller.logits()
+        } else {
+            &[]
+        };
+        recording.push(Step {
+            observation: self.observation.clone(),
+            action: self.action.clone(),
+            executed: self.executed.clone(),
+            plan: report.plan.0,
+            decided: report.decided,
+            margin: Some(report.margin).filter(|margin| margin.is_finite()),
+            logits: logits.to_vec(),
+            controller_ns,
+            gripper: self.environment.gripper(),
+        });
     }
 }
 
@@ -256,13 +359,6 @@ impl Actor {
         let [run, instruction, episode] = seed.entropy();
         let entropy = [run, instruction, episode, UNIFORM_STREAM];
         (self == Self::Uniform).then(|| Stream::new(&entropy))
-    }
-}
-
-/// The policy's precision.
-fn narrow(from: &[f64], to: &mut [f32]) {
-    for (to, &from) in to.iter_mut().zip(from) {
-        *to = from as f32;
     }
 }
 

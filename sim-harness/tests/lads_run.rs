@@ -304,3 +304,49 @@ fn an_interrupt_overwrites_nothing() {
         "no temporary file stays"
     );
 }
+
+#[test]
+fn a_log_replays_and_its_plans_run() {
+    let folder = tempfile::tempdir().unwrap();
+    let (log, plans) = (folder.path().join("f.mcap"), folder.path().join("p.json"));
+    let (log, plans) = (log.to_str().unwrap(), plans.to_str().unwrap());
+    let out = |arguments: &[&str]| {
+        let output = lads_run(&kitchen_bundle(), arguments).output().unwrap();
+        let errors = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.success(), "{errors}");
+        String::from_utf8(output.stdout).unwrap()
+    };
+    let json = folder.path().join("r.json");
+    let first = ["--instruction", "mkbs", "--episodes", "1"];
+    let recorded = [&first[..], &["--log", log, "--monitor"]].concat();
+    let (table, results) = results(&recorded, &json);
+    assert!(table.contains("executed segments are encoded as the plan in force"));
+    let text = fs::read_to_string(project_file("sim-harness/results.schema.json")).unwrap();
+    let root: Value = serde_json::from_str(&text).unwrap();
+    schema::check(&results, &root, &root, "results");
+    assert!(out(&["--replay", log]).starts_with("EQUAL: 1 episodes"));
+    out(&["--encode", log, "--json", plans]);
+    let table = out(&[&first[..], &["--plans", plans, "--monitor"]].concat());
+    assert!(table.contains("mkbs"));
+
+    let mut cut = fs::read(log).unwrap();
+    cut.truncate(cut.len() - 9);
+    fs::write(log, cut).unwrap();
+    refused(
+        &kitchen_bundle(),
+        &["--replay", log],
+        &["--replay", "no whole MCAP file"],
+    );
+    refused(&kitchen_bundle(), &["--plans", log], &["--plans", "f.mcap"]);
+    refused(&kitchen_bundle(), &["--replay", "no.mcap"], &["no.mcap"]);
+    refused(
+        &kitchen_bundle(),
+        &["--log", "/no/such/folder/f.mcap"],
+        &["--log", "folder"],
+    );
+    refused(
+        &kitchen_bundle(),
+        &["--drop-rate", "2"],
+        &["--drop-rate 2", "from 0 to 1"],
+    );
+}

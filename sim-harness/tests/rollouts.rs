@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use bench::{Bench, Says, tiny_image};
 use lads_core::{Decision, Isa, Policy};
 use lads_sim::environment::Environment;
-use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError};
+use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Setup};
 use lads_sim::fit;
 use lads_sim::rollout::{Actor, Episode};
 
@@ -46,6 +46,7 @@ fn evaluate(policy: &Policy<'_>, seed: u64, decision: Decision, threads: usize) 
         isa: Isa::detect(),
         traced: 1,
         threads,
+        setup: Setup::default(),
     };
     evaluation
         .run(&open, &AtomicBool::new(false), &|| {})
@@ -165,6 +166,7 @@ fn a_stop_ends_the_work_without_a_result() {
         isa: Isa::portable(),
         traced: 0,
         threads: 2,
+        setup: Setup::default(),
     };
     let (stop, finished) = (AtomicBool::new(false), AtomicUsize::new(0));
     let count = || {

@@ -9,6 +9,7 @@ pub mod spec;
 use std::path::Path;
 use std::sync::Arc;
 
+use mujoco_rs::prelude::MjtObjBase;
 use mujoco_rs::wrappers::{MjData, MjModel};
 use thiserror::Error;
 
@@ -26,6 +27,9 @@ use spec::{
 pub const ID: &str = "franka-kitchen";
 /// The version of its behaviour.
 pub const VERSION: &str = "1";
+
+/// The site that stands for the gripper in pictures.
+const GRIPPER: &str = "end_effector";
 
 const SCENE: &str = "assets/kitchen_franka/kitchen_assets/kitchen_env_model.xml";
 
@@ -76,6 +80,8 @@ impl Scene {
 /// The environment: a scene's own state, one per worker.
 pub struct Kitchen {
     data: MjData<Arc<MjModel>>,
+    /// Index of the site between the fingers.
+    gripper: usize,
     amplitudes: [f64; OBSERVATION_LEN],
     stream: Stream,
     observation: [f64; OBSERVATION_LEN],
@@ -88,6 +94,11 @@ impl Kitchen {
     pub fn new(scene: &Scene, noise: Noise) -> Self {
         let mut kitchen = Self {
             data: MjData::new(Arc::clone(&scene.model)),
+            // Past the end where the scene has none.
+            gripper: scene
+                .model
+                .name_to_id(MjtObjBase::mjOBJ_SITE, GRIPPER)
+                .unwrap_or(usize::MAX),
             amplitudes: noise.amplitudes(),
             stream: Stream::new(&[]),
             observation: [0.0; OBSERVATION_LEN],
@@ -201,6 +212,10 @@ impl Environment for Kitchen {
 
     fn completions(&self) -> &[Completion] {
         &self.completions
+    }
+
+    fn gripper(&self) -> Option<[f64; 3]> {
+        self.data.site_xpos().get(self.gripper).copied()
     }
 }
 

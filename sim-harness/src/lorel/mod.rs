@@ -14,7 +14,7 @@ pub mod spec;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
-use mujoco_rs::prelude::MjtState;
+use mujoco_rs::prelude::{MjtObjBase, MjtState};
 use mujoco_rs::wrappers::{MjData, MjModel, MjSpec};
 use thiserror::Error;
 
@@ -39,6 +39,8 @@ pub const NOISE: &str = "none";
 /// Settled postures above the mugs.
 pub const POSTURES: usize = 256;
 
+/// The body that stands for the gripper in pictures.
+const HAND: &str = "hand";
 const SCENE: &str = include_str!("scene.xml");
 /// Folder of the scene's assets in the vendor folder, and one file of it.
 const ASSETS: &str = "assets/metaworld";
@@ -125,6 +127,8 @@ fn advance(data: &mut MjData<Arc<MjModel>>, physics_steps: usize) {
 pub struct Lorel {
     scene: Scene,
     data: MjData<Arc<MjModel>>,
+    /// Index of the body that carries the fingers.
+    hand: usize,
     start: [f64; OBSERVATION_LEN],
     steps: usize,
     completions: Vec<Completion>,
@@ -136,6 +140,11 @@ impl Lorel {
         let mut lorel = Self {
             scene: scene.clone(),
             data: MjData::new(Arc::clone(&scene.model)),
+            // Past the end where the scene has none.
+            hand: scene
+                .model
+                .name_to_id(MjtObjBase::mjOBJ_BODY, HAND)
+                .unwrap_or(usize::MAX),
             start: [0.0; OBSERVATION_LEN],
             steps: 0,
             completions: Vec::with_capacity(SUB_TASKS.len()),
@@ -306,6 +315,10 @@ impl Environment for Lorel {
 
     fn completions(&self) -> &[Completion] {
         &self.completions
+    }
+
+    fn gripper(&self) -> Option<[f64; 3]> {
+        self.data.xpos().get(self.hand).copied()
     }
 
     fn succeeded(&self, commanded: &[usize]) -> bool {

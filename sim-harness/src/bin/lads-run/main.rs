@@ -6,23 +6,29 @@
 //! `--verify` runs a reference's episodes instead, and its verdict is the exit code: 0 equivalent, 1 different, 3 inconclusive.
 #![forbid(unsafe_code)]
 
+mod arguments;
+mod end;
+mod recordings;
+mod report;
+mod sweep;
 mod verify;
 
-use std::collections::BTreeMap;
 use std::fmt::Display;
-use std::io::{ErrorKind, Write as _};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use clap::Parser;
+use arguments::{Arguments, IsaName};
+use end::{End, check_writable, print, refused, unwritable};
 use indicatif::{ProgressBar, ProgressStyle};
 use lads_compiler::{Bundle, Memory, compile};
-use lads_core::{Decision, Isa, Policy};
+use lads_core::{Contract, Decision, Isa, Policy};
 use lads_sim::environment::Environment;
-use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError};
+use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Setup};
+use lads_sim::faults::Faults;
+use lads_sim::plans;
 use lads_sim::results::{self, DecisionUsed, EnvironmentUsed, InstructionResult, Results};
 use lads_sim::rollout::Actor;
 use lads_sim::table::Table;
@@ -31,81 +37,16 @@ use lads_sim::{assets, command, fit, output, registry};
 /// Exit code after an interrupt, as shells have it: 128 and the signal's number.
 const INTERRUPTED: u8 = 130;
 
-/// Runs a policy bundle in simulation over its instructions; prints success rates and control-step latency.
-#[derive(Debug, Parser)]
-#[command(version)]
-struct Arguments {
-    /// The policy bundle (ONNX)
-    #[arg(long)]
-    model: PathBuf,
-    /// Run only this instruction, by its text or its id
-    #[arg(long)]
-    instruction: Option<String>,
-    /// Episodes of each instruction; left out, 2, and with --verify all that the reference has
-    #[arg(long)]
-    episodes: Option<u32>,
-    /// Seed of all random streams; the same seed gives the same episodes on any number of threads
-    #[arg(long, default_value_t = 0)]
-    seed: u64,
-    /// Observation noise: in the kitchen v0 (D4RL's, the default), v1 (Gymnasium-Robotics') or none
-    #[arg(long)]
-    noise: Option<String>,
-    /// Threads; left out, one per core
-    #[arg(long)]
-    threads: Option<usize>,
-    /// Sample plans from the policy's distribution instead of taking the likeliest
-    #[arg(long)]
-    sample: bool,
-    /// Draw uniform random actions instead of asking the policy: the floor that it is measured against
-    #[arg(long, conflicts_with = "sample")]
-    uniform: bool,
-    /// Write the results to this file as JSON (its form: sim-harness/results.schema.json)
-    #[arg(long)]
-    json: Option<PathBuf>,
-    /// Instructions that the kernels run on; left out, the widest of this CPU. The results have the same bits on all
-    #[arg(long)]
-    isa: Option<IsaName>,
-    /// Run the episodes of a reference and say whether the policy is the reference's: exit code 0 EQUIVALENT, 1 DIFFERENT, 3 INCONCLUSIVE.
-    /// Left out, REFERENCE is the file beside the model that ends in .reference.json
-    #[arg(long, value_name = "REFERENCE", num_args = 0..=1, conflicts_with_all = ["seed", "noise", "sample", "uniform", "json"])]
-    #[expect(
-        clippy::option_option,
-        reason = "clap's form of an option whose value may be left out"
-    )]
-    verify: Option<Option<PathBuf>>,
-    /// Write the certificate of --verify to this file, as JSON (its form: sim-harness/certificate.schema.json) or, where it ends in .html, as
-    /// a page; may be given twice
-    #[arg(long, requires = "verify")]
-    certificate: Vec<PathBuf>,
-}
-
-/// Instruction sets by name.
-#[derive(Debug, Clone, Copy, clap::ValueEnum)]
-enum IsaName {
-    Portable,
-    Avx2,
-    Avx512,
-}
-
-/// How a run ends early.
-enum End {
-    /// With a line that names the thing and the remedy.
-    Refused(String),
-    /// By an interrupt.
-    Interrupted,
-}
-
-fn refused(line: impl Display) -> End {
-    End::Refused(line.to_string())
-}
+/// Episodes of each instruction where nothing is said.
+const EPISODES: u32 = 2;
 
 fn main() -> ExitCode {
-    let arguments = match command::arguments("lads-run") {
+    let arguments: Arguments = match command::arguments("lads-run") {
         Ok(arguments) => arguments,
         Err(code) => return code,
     };
     match run(&arguments) {
-        Ok(code) => ExitCode::from(code),
+        Ok(code) => code,
         Err(End::Interrupted) => {
             eprintln!("interrupted: nothing was written");
             ExitCode::from(INTERRUPTED)
@@ -114,13 +55,11 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(arguments: &Arguments) -> Result<u8, End> {
+fn run(arguments: &Arguments) -> Result<ExitCode, End> {
     let stop = stop_on_interrupt()?;
     let threads = check_numbers(arguments)?;
     let isa = isa(arguments.isa)?;
-    for (option, path) in outputs(arguments) {
-        drop(output::temporary_beside(path).map_err(|error| unwritable(option, path, &error))?);
-    }
+    check_outputs(arguments)?;
     let reference = verify::reference(arguments)?;
 
     let about = |wrong: &dyn Display| refused(format!("{}: {wrong}", arguments.model.display()));
@@ -130,6 +69,16 @@ fn run(arguments: &Arguments) -> Result<u8, End> {
         .map_err(|error| about(&format_args!("{error}; export the bundle again")))?;
     let chosen = choose(&bundle, arguments.instruction.as_deref())?;
     self_test(&policy).map_err(|wrong| about(&wrong))?;
+    let files = &arguments.recordings;
+    if let Some(log) = &files.replay {
+        return recordings::replay(&policy, log);
+    }
+    if let Some(log) = &files.encode {
+        return recordings::encode(&policy, log, arguments.json.as_deref());
+    }
+    let book = files.plans.as_deref();
+    let book = book.map(|path| recordings::plans(&policy, &bundle, path));
+    let book = book.transpose()?;
 
     let contract = policy.contract();
     let id = contract.environment_id();
@@ -146,16 +95,18 @@ fn run(arguments: &Arguments) -> Result<u8, End> {
     let assignments: Vec<_> = (0..)
         .zip(contract.instructions().zip(commanded))
         .filter(|(instruction, _)| chosen.as_ref().is_none_or(|all| all.contains(instruction)))
+        .filter(|(instruction, _)| book.as_ref().is_none_or(|book| book.knows(*instruction)))
         .map(|(instruction, (known, commanded))| Assignment {
             instruction,
             commanded,
             max_steps: environment.max_steps(known.split),
         })
         .collect();
+    check_plans(arguments, book.as_ref(), &assignments, &contract)?;
     let mut evaluation = Evaluation {
         policy,
         assignments: &assignments,
-        episodes: arguments.episodes.unwrap_or(2),
+        episodes: arguments.episodes.unwrap_or(EPISODES),
         seed: arguments.seed,
         decision: decision(&policy, arguments.sample),
         actor: if arguments.uniform {
@@ -166,6 +117,11 @@ fn run(arguments: &Arguments) -> Result<u8, End> {
         isa,
         traced: 0,
         threads,
+        setup: Setup {
+            faults: arguments.faults.faults(),
+            plans: book.as_ref(),
+            traced: files.log.is_some() || files.monitor || arguments.report.is_some(),
+        },
     };
     if let Some(reference) = reference {
         reference
@@ -180,27 +136,95 @@ fn run(arguments: &Arguments) -> Result<u8, End> {
             &stop,
         );
     }
-    let start = Instant::now();
-    let evaluated = evaluate(&evaluation, &open, &stop)?;
-    let wall = start.elapsed();
-
-    let results = report(&evaluation, environment.as_ref(), noise, &evaluated, wall);
-    if let Some(path) = &arguments.json {
-        output::write_json(&results, path).map_err(|error| unwritable("--json", path, &error))?;
+    let bench = Bench {
+        evaluation,
+        open: &open,
+        environment: environment.as_ref(),
+        noise,
+        stop: &stop,
+    };
+    if arguments.faults.sweep {
+        return bench.sweep(arguments.json.as_deref());
     }
-    print(&Table(&results))?;
-    Ok(0)
+    bench.rollouts(arguments)
 }
 
-/// The files that will be written, with the options that name them.
-fn outputs(arguments: &Arguments) -> impl Iterator<Item = (&'static str, &PathBuf)> {
-    let json = arguments.json.iter().map(|path| ("--json", path));
-    json.chain(
-        arguments
-            .certificate
-            .iter()
-            .map(|path| ("--certificate", path)),
-    )
+/// Everything that was checked, ready to run.
+struct Bench<'b> {
+    evaluation: Evaluation<'b>,
+    open: &'b registry::Opener,
+    environment: &'b dyn Environment,
+    noise: &'b str,
+    stop: &'b AtomicBool,
+}
+
+impl Bench<'_> {
+    fn run(&self, setup: Setup<'_>, what: &str) -> Result<(Results, Evaluated), End> {
+        let evaluation = Evaluation {
+            setup,
+            ..self.evaluation
+        };
+        let start = Instant::now();
+        let evaluated = evaluate(&evaluation, self.open, self.stop, what)?;
+        let wall = start.elapsed();
+        let results = sum_up(&evaluation, self.environment, self.noise, &evaluated, wall);
+        Ok((results, evaluated))
+    }
+
+    /// The benchmark once for each level of each fault.
+    fn sweep(&self, json: Option<&Path>) -> Result<ExitCode, End> {
+        let sweep = sweep::sweep(|faults, what| {
+            let setup = Setup {
+                faults,
+                ..self.evaluation.setup
+            };
+            self.run(setup, what).map(|(results, _)| results)
+        })?;
+        if let Some(path) = json {
+            output::write_json(&sweep, path).map_err(|error| unwritable("--json", path, &error))?;
+        }
+        print(&sweep.table())?;
+        Ok(ExitCode::SUCCESS)
+    }
+
+    /// The benchmark, and all files about it that were asked for.
+    fn rollouts(&self, arguments: &Arguments) -> Result<ExitCode, End> {
+        let (files, policy) = (&arguments.recordings, &self.evaluation.policy);
+        let (mut results, evaluated) = self.run(self.evaluation.setup, "")?;
+        if files.monitor {
+            let agreement = plans::agreement(policy, &evaluated.traces);
+            results.plan_agreement = Some(
+                agreement.map_err(|error| refused(format!("--monitor: {error}; leave it out")))?,
+            );
+        }
+        if let Some(path) = &arguments.json {
+            output::write_json(&results, path)
+                .map_err(|error| unwritable("--json", path, &error))?;
+        }
+        if let Some(path) = &files.log {
+            recordings::log(
+                &self.evaluation,
+                self.environment,
+                self.noise,
+                &evaluated.traces,
+                path,
+            )?;
+        }
+        if let Some(path) = &arguments.report {
+            report::write(
+                &results,
+                &evaluated.traces,
+                policy,
+                self.environment.sub_tasks(),
+                path,
+            )?;
+        }
+        print(&Table(&results))?;
+        if let Some(agreement) = &results.plan_agreement {
+            print(&recordings::agreement(agreement))?;
+        }
+        Ok(ExitCode::SUCCESS)
+    }
 }
 
 /// The instructions that were asked for, if this CPU has them.
@@ -216,6 +240,38 @@ fn isa(name: Option<IsaName>) -> Result<Isa, End> {
             offered.join(", ")
         ))
     })
+}
+
+/// Refuses plans that leave an episode without any.
+fn check_plans(
+    arguments: &Arguments,
+    book: Option<&plans::PlanBook>,
+    assignments: &[Assignment],
+    contract: &Contract<'_>,
+) -> Result<(), End> {
+    let Some(book) = book else {
+        return Ok(());
+    };
+    let name = |assignment: &Assignment| {
+        let known = contract.instruction_id(assignment.instruction as usize);
+        known.unwrap_or_default().to_owned()
+    };
+    if assignments.is_empty() {
+        return Err(refused(
+            "--plans: the file has no plans for the instructions asked for; leave --instruction out",
+        ));
+    }
+    for assignment in assignments {
+        let missing = (0..arguments.episodes.unwrap_or(EPISODES))
+            .find(|&e| book.of(assignment.instruction, e).is_none());
+        if let Some(episode) = missing {
+            return Err(refused(format!(
+                "--plans: the file has no plans for episode {episode} of {}; give fewer --episodes, or plans without an episode number",
+                name(assignment)
+            )));
+        }
+    }
+    Ok(())
 }
 
 /// A flag that an interrupt raises; a second interrupt ends the program at once.
@@ -235,8 +291,20 @@ fn stop_on_interrupt() -> Result<Arc<AtomicBool>, End> {
     Ok(stop)
 }
 
+/// Whether all files could be written, before any work.
+fn check_outputs(arguments: &Arguments) -> Result<(), End> {
+    check_writable("--json", arguments.json.as_deref())?;
+    report::check(arguments.report.as_deref())?;
+    check_writable("--log", arguments.recordings.log.as_deref())?;
+    for path in &arguments.certificate {
+        check_writable("--certificate", Some(path))?;
+    }
+    Ok(())
+}
+
 /// Checks what needs no file; returns the number of threads.
 fn check_numbers(arguments: &Arguments) -> Result<usize, End> {
+    arguments.faults.faults().check().map_err(refused)?;
     if arguments.episodes == Some(0) {
         return Err(refused("--episodes 0: nothing to run; give at least 1"));
     }
@@ -247,13 +315,6 @@ fn check_numbers(arguments: &Arguments) -> Result<usize, End> {
         Some(threads) => Ok(threads),
         None => Ok(std::thread::available_parallelism().map_or(1, usize::from)),
     }
-}
-
-fn unwritable(option: &str, path: &Path, error: &std::io::Error) -> End {
-    refused(format!(
-        "{option} {}: cannot be written ({error}); name a file in an existing, writable folder",
-        path.display()
-    ))
 }
 
 /// The numbers of the instructions with the id or the text that was asked for; `None` for all.
@@ -301,27 +362,29 @@ fn decision(policy: &Policy<'_>, sample: bool) -> Decision {
     }
 }
 
+/// A progress bar over episodes; indicatif hides it where stderr is no terminal.
+fn progress(episodes: usize) -> ProgressBar {
+    let bar = ProgressBar::new(episodes as u64);
+    let style = ProgressStyle::with_template(
+        "{bar:40} {pos}/{len} episodes, {elapsed} elapsed, {eta} left {msg}",
+    );
+    bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+    bar.enable_steady_tick(Duration::from_millis(200));
+    bar
+}
+
 /// Runs all episodes behind a progress bar, until `stop` is raised.
 fn evaluate(
     evaluation: &Evaluation<'_>,
     open: &registry::Opener,
     stop: &AtomicBool,
+    what: &str,
 ) -> Result<Evaluated, End> {
-    let bar = progress(evaluation);
+    let bar = progress(evaluation.len());
+    bar.set_message(what.to_owned());
     let evaluated = evaluation.run(open, stop, &|| bar.inc(1));
     bar.finish_and_clear();
     evaluated.map_err(unfinished)
-}
-
-/// A bar over all episodes; hidden by indicatif where stderr is no terminal.
-fn progress(evaluation: &Evaluation<'_>) -> ProgressBar {
-    let bar = ProgressBar::new(evaluation.len() as u64);
-    let style = ProgressStyle::with_template(
-        "{bar:40} {pos}/{len} episodes, {elapsed} elapsed, {eta} left",
-    );
-    bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
-    bar.enable_steady_tick(Duration::from_millis(200));
-    bar
 }
 
 fn unfinished(error: EvaluationError) -> End {
@@ -333,7 +396,8 @@ fn unfinished(error: EvaluationError) -> End {
     }
 }
 
-fn report(
+/// All that was measured, summed up.
+fn sum_up(
     evaluation: &Evaluation<'_>,
     environment: &dyn Environment,
     noise: &str,
@@ -359,29 +423,13 @@ fn report(
         noise: noise.to_owned(),
         decision: DecisionUsed::of(evaluation.decision, evaluation.actor),
         episodes_per_instruction: evaluation.episodes,
-        versions: versions(),
+        faults: Some(evaluation.setup.faults).filter(|&faults| faults != Faults::default()),
+        plans_commanded: evaluation.setup.plans.is_some(),
+        plan_agreement: None,
+        versions: results::versions(),
         splits: results::Splits::of(&splits, &instructions, watched),
         instructions,
         latency_us: results::LatencyByKind::of(&evaluated.timing),
         time: results::TimeUse::of(&evaluated.timing, wall, threads),
-    }
-}
-
-/// What the numbers depend on besides the bundle.
-fn versions() -> BTreeMap<&'static str, String> {
-    BTreeMap::from([
-        ("lads-sim", env!("CARGO_PKG_VERSION").to_owned()),
-        ("mujoco", mujoco_rs::mujoco_version().to_owned()),
-    ])
-}
-
-/// Prints to stdout; a reader that has left is no failure.
-fn print(table: &dyn Display) -> Result<(), End> {
-    let mut stdout = std::io::stdout().lock();
-    match write!(stdout, "{table}").and_then(|()| stdout.flush()) {
-        Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(refused(format!(
-            "stdout: cannot be written ({error}); connect it to a place with room"
-        ))),
-        _ => Ok(()),
     }
 }

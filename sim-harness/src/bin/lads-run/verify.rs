@@ -10,11 +10,14 @@ use lads_core::Decision;
 use lads_sim::evaluate::Evaluation;
 use lads_sim::output;
 use lads_sim::registry::Opener;
+use lads_sim::results::versions;
 use lads_sim::verify::certificate::Certificate;
 use lads_sim::verify::page::Page;
 use lads_sim::verify::reference::Reference;
 
-use crate::{Arguments, End, print, progress, refused, unfinished, unwritable, versions};
+use std::process::ExitCode;
+
+use crate::{Arguments, End, print, progress, refused, unfinished, unwritable};
 
 /// The reference that is asked for, read; `None` without `--verify`.
 pub fn reference(arguments: &Arguments) -> Result<Option<Reference>, End> {
@@ -54,8 +57,8 @@ pub fn run(
     open: &Opener,
     certificates: &[PathBuf],
     stop: &AtomicBool,
-) -> Result<u8, End> {
-    let bar = progress(evaluation);
+) -> Result<ExitCode, End> {
+    let bar = progress(evaluation.len());
     let certificate = lads_sim::verify::run(evaluation, reference, open, versions(), stop, &|| {
         bar.inc(1);
     });
@@ -71,7 +74,7 @@ pub fn run(
         written.map_err(|error| unwritable("--certificate", path, &error))?;
     }
     print(&Summary(&certificate))?;
-    Ok(certificate.verdict.exit_code())
+    Ok(ExitCode::from(certificate.verdict.exit_code()))
 }
 
 /// The certificate on a terminal.

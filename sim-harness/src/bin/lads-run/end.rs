@@ -1,0 +1,49 @@
+//! How a run ends, and where its words go.
+
+use std::fmt::Display;
+use std::io::{ErrorKind, Write as _};
+use std::path::Path;
+
+use lads_sim::output;
+
+/// How a run ends early.
+pub enum End {
+    /// With a line that names the thing and the remedy.
+    Refused(String),
+    /// By an interrupt.
+    Interrupted,
+}
+
+pub fn refused(line: impl Display) -> End {
+    End::Refused(line.to_string())
+}
+
+/// A file that an option asks for and that cannot be written.
+pub fn unwritable(option: &str, path: &Path, error: &dyn Display) -> End {
+    refused(format!(
+        "{option} {}: cannot be written ({error}); name a file in an existing, writable folder",
+        path.display()
+    ))
+}
+
+/// Whether an option's file could be written, before any work.
+pub fn check_writable(option: &str, path: Option<&Path>) -> Result<(), End> {
+    let Some(path) = path else {
+        return Ok(());
+    };
+    let there = output::temporary_beside(path);
+    there
+        .map(drop)
+        .map_err(|error| unwritable(option, path, &error))
+}
+
+/// Prints to stdout; a reader that has left is no failure.
+pub fn print(text: &dyn Display) -> Result<(), End> {
+    let mut stdout = std::io::stdout().lock();
+    match write!(stdout, "{text}").and_then(|()| stdout.flush()) {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(refused(format!(
+            "stdout: cannot be written ({error}); connect it to a place with room"
+        ))),
+        _ => Ok(()),
+    }
+}

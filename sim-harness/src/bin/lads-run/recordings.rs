@@ -1,0 +1,233 @@
+//! `--log`, `--replay`, `--encode`, `--plans` and `--monitor`.
+
+use std::fmt::Write as _;
+use std::path::Path;
+use std::process::ExitCode;
+
+use lads_compiler::Bundle;
+use lads_core::Policy;
+use lads_sim::environment::Environment;
+use lads_sim::evaluate::Evaluation;
+use lads_sim::plans::{self, Agreement, PlanBook, PlanFile, PlanSequence};
+use lads_sim::recorder::{self, Flight, Log, Origin};
+use lads_sim::replay::{self, Difference};
+use lads_sim::trace::Trace;
+use lads_sim::{output, results};
+
+use crate::end::{End, print, refused, unwritable};
+use crate::progress;
+
+/// Exit code of a replay that came out otherwise.
+const DIFFERENT: u8 = 1;
+
+/// At most so many differences are printed.
+const SHOWN: usize = 10;
+
+fn read(option: &str, path: &Path) -> Result<Log, End> {
+    recorder::read(path).map_err(|error| refused(format!("{option} {}: {error}", path.display())))
+}
+
+/// Computes a log again.
+pub fn replay(policy: &Policy<'_>, path: &Path) -> Result<ExitCode, End> {
+    let log = read("--replay", path)?;
+    let about = |error: &dyn std::fmt::Display| {
+        refused(format!(
+            "--replay {}: {error}; name the bundle that it was recorded with",
+            path.display()
+        ))
+    };
+    let bar = progress(log.flights.len());
+    let replayed = replay::replay(policy, &log, &|| bar.inc(1));
+    bar.finish_and_clear();
+    let replayed = replayed.map_err(|error| about(&error))?;
+
+    let mut text = String::new();
+    let (was, is) = (&log.origin.bundle_sha256, policy.contract().bundle_sha256());
+    if was != is {
+        let _ = writeln!(
+            text,
+            "recorded with another bundle: sha256 {was:.12}, this one {is:.12}"
+        );
+    }
+    for difference in replayed.differences.iter().take(SHOWN) {
+        let _ = writeln!(text, "{}", said(difference));
+    }
+    let more = replayed.differences.len().saturating_sub(SHOWN);
+    if more > 0 {
+        let _ = writeln!(text, "and {more} more episodes");
+    }
+    let (episodes, steps) = (replayed.episodes, replayed.steps);
+    let different = replayed.differences.len();
+    let _ = if different == 0 {
+        writeln!(
+            text,
+            "EQUAL: {episodes} episodes, {steps} control steps, every action and plan bit for bit"
+        )
+    } else {
+        writeln!(
+            text,
+            "DIFFERENT: {different} of {episodes} episodes, {steps} control steps"
+        )
+    };
+    print(&text)?;
+    Ok(if different == 0 {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::from(DIFFERENT)
+    })
+}
+
+fn said(difference: &Difference) -> String {
+    let mut line = format!(
+        "{} episode {}: differs first at control step {}:",
+        difference.instruction, difference.episode, difference.step
+    );
+    if let Some((was, is)) = difference.plans {
+        let _ = write!(line, " plan {was} in the log, {is} now;");
+    }
+    if let Some((name, was, is)) = &difference.action {
+        let by = (was - is).abs();
+        let _ = write!(line, " {name} {was} in the log, {is} now (by {by:.1e})");
+    }
+    line
+}
+
+/// Prints, or writes, the plans that the encoder sees in a log.
+pub fn encode(policy: &Policy<'_>, path: &Path, json: Option<&Path>) -> Result<ExitCode, End> {
+    let log = read("--encode", path)?;
+    let about =
+        |error: &dyn std::fmt::Display| refused(format!("--encode {}: {error}", path.display()));
+    let recordings = log
+        .flights
+        .iter()
+        .map(|flight| flight.trace.steps.as_slice());
+    let plans = plans::encode(policy, recordings).map_err(|error| about(&error))?;
+    let sequence = |(flight, plans): (&Flight, Vec<u32>)| PlanSequence {
+        instruction: flight.instruction_id.clone(),
+        episode: Some(flight.trace.episode),
+        plans,
+    };
+    let sequences = log.flights.iter().zip(plans).map(sequence);
+    // An episode shorter than a horizon has no plan to follow.
+    let sequences = sequences.filter(|sequence| !sequence.plans.is_empty());
+    let file = PlanFile::new(policy.contract().horizon(), sequences.collect());
+    match json {
+        Some(path) => {
+            output::write_json(&file, path).map_err(|e| unwritable("--json", path, &e))?;
+        }
+        None => print(&format_args!("{}\n", pretty(&file)))?,
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// One line per episode: sequences are read by people.
+fn pretty(file: &PlanFile) -> String {
+    let lines = file.episodes.iter().map(|sequence| {
+        let line = serde_json::to_string(sequence).unwrap_or_default();
+        format!("  {line}")
+    });
+    let lines = lines.collect::<Vec<_>>().join(",\n");
+    format!(
+        "{{\"format\": \"{}\", \"format_version\": {}, \"horizon\": {}, \"episodes\": [\n{lines}\n]}}",
+        file.format, file.format_version, file.horizon
+    )
+}
+
+/// Reads and checks a file of plans.
+pub fn plans(policy: &Policy<'_>, bundle: &Bundle, path: &Path) -> Result<PlanBook, End> {
+    let index = |wanted: &str| {
+        let found = bundle.instruction_indices(wanted);
+        found.first().map(|&index| index as u32)
+    };
+    let read = PlanFile::read(path);
+    let book = read.and_then(|file| file.check(&policy.contract(), index));
+    book.map_err(|error| refused(format!("--plans {}: {error}", path.display())))
+}
+
+/// Writes what happened.
+pub fn log(
+    evaluation: &Evaluation<'_>,
+    environment: &dyn Environment,
+    noise: &str,
+    traces: &[Trace],
+    path: &Path,
+) -> Result<(), End> {
+    let contract = evaluation.policy.contract();
+    let flight = |trace: &Trace| {
+        let known = contract.instruction(trace.instruction as usize)?;
+        let watched = environment.sub_tasks();
+        let completed = trace.outcome.completions.iter();
+        let completed = completed.filter_map(|done| watched.get(done.sub_task));
+        Some(Flight {
+            instruction_id: known.id.to_owned(),
+            instruction_text: known.text.to_owned(),
+            completed: completed.map(|&name| name.to_owned()).collect(),
+            trace: trace.clone(),
+        })
+    };
+    let mut notes: std::collections::BTreeMap<_, _> = results::versions()
+        .into_iter()
+        .map(|(name, version)| (name.to_owned(), version))
+        .collect();
+    let faults = serde_json::to_string(&evaluation.setup.faults).unwrap_or_default();
+    notes.insert("faults".to_owned(), faults);
+    let log = Log {
+        origin: Origin {
+            bundle_sha256: contract.bundle_sha256().to_owned(),
+            environment: environment.id().to_owned(),
+            environment_version: environment.version().to_owned(),
+            seed: evaluation.seed,
+            noise: noise.to_owned(),
+            control_period_s: environment.control_period_s(),
+            horizon: contract.horizon(),
+            observation_names: contract.observations().map(|e| e.name.to_owned()).collect(),
+            action_names: contract.actions().map(|e| e.name.to_owned()).collect(),
+            notes,
+        },
+        flights: traces.iter().filter_map(flight).collect(),
+    };
+    let written = || -> Result<(), Box<dyn std::error::Error>> {
+        let mut file = output::temporary_beside(path)?;
+        recorder::write(&log, file.as_file_mut())?;
+        file.persist(path)?;
+        Ok(())
+    };
+    written().map_err(|error| unwritable("--log", path, &error))
+}
+
+/// The monitor's table.
+pub fn agreement(agreement: &Agreement) -> String {
+    let mut text = String::new();
+    let Agreement {
+        agreed, segments, ..
+    } = agreement;
+    let _ = write!(
+        text,
+        "\nmonitor: {agreed} of {segments} executed segments are encoded as the plan in force"
+    );
+    if let Some(interval) = agreement.interval {
+        let share = *agreed as f64 / (*segments).max(1) as f64;
+        let _ = write!(text, " ({share:.3} {interval})");
+    }
+    text.push('\n');
+    for (plan, seen) in &agreement.encoded_as {
+        let total: usize = seen.values().sum();
+        let same = seen.get(plan).copied().unwrap_or(0);
+        let mut others: Vec<_> = seen.iter().filter(|(other, _)| *other != plan).collect();
+        others.sort_by_key(|&(_, &count)| std::cmp::Reverse(count));
+        let others = others.iter().take(5);
+        let others: Vec<_> = others
+            .map(|(plan, count)| format!("{plan} ({count})"))
+            .collect();
+        let _ = writeln!(
+            text,
+            "  plan {plan:>3}: {same:>5} of {total:<5} also seen as {}",
+            if others.is_empty() {
+                "no other".to_owned()
+            } else {
+                others.join(", ")
+            }
+        );
+    }
+    text
+}

@@ -1,0 +1,165 @@
+//! The channels and their JSON schemas.
+
+use serde_json::{Value, json};
+
+/// A topic with the name and the JSON schema of its messages.
+pub struct Topic {
+    /// Its name.
+    pub name: &'static str,
+    /// Name of the schema.
+    pub schema: &'static str,
+    /// What the messages are, for people.
+    about: &'static str,
+    /// Name, JSON type and meaning of each field.
+    fields: &'static [(&'static str, Kind, &'static str)],
+}
+
+enum Kind {
+    Number,
+    Integer,
+    Flag,
+    Text,
+    Numbers,
+    MaybeNumber,
+    MaybeText,
+}
+
+impl Kind {
+    fn schema(&self) -> Value {
+        match self {
+            Self::Number => json!({"type": "number"}),
+            Self::Integer => json!({"type": "integer"}),
+            Self::Flag => json!({"type": "boolean"}),
+            Self::Text => json!({"type": "string"}),
+            Self::Numbers => json!({"type": "array", "items": {"type": "number"}}),
+            Self::MaybeNumber => json!({"type": ["number", "null"]}),
+            Self::MaybeText => json!({"type": ["string", "null"]}),
+        }
+    }
+}
+
+impl Topic {
+    /// The JSON schema as text.
+    pub fn json_schema(&self) -> String {
+        let properties: serde_json::Map<String, Value> = self
+            .fields
+            .iter()
+            .map(|(name, kind, about)| {
+                let mut schema = kind.schema();
+                schema["description"] = json!(about);
+                ((*name).to_owned(), schema)
+            })
+            .collect();
+        json!({
+            "title": self.schema,
+            "description": self.about,
+            "type": "object",
+            "properties": properties,
+        })
+        .to_string()
+    }
+}
+
+pub const EPISODE: usize = 0;
+pub const OBSERVATION: usize = 1;
+pub const ACTION: usize = 2;
+pub const PLAN: usize = 3;
+pub const LOGITS: usize = 4;
+pub const TIMING: usize = 5;
+pub const GRIPPER: usize = 6;
+pub const COMPLETION: usize = 7;
+
+/// All topics, by the constants above.
+pub const TOPICS: [Topic; 8] = [
+    Topic {
+        name: "/episode",
+        schema: "lads.Episode",
+        about: "An episode begins.",
+        fields: &[
+            ("instruction", Kind::Integer, "index in the policy's table"),
+            ("instruction_id", Kind::Text, "short name"),
+            ("instruction_text", Kind::Text, "what the policy is told"),
+            ("episode", Kind::Integer, "number within the instruction"),
+            (
+                "sampling_seed",
+                Kind::MaybeText,
+                "seed of plan sampling, null for argmax",
+            ),
+            (
+                "commanded",
+                Kind::Flag,
+                "plans were given; the low level ran alone",
+            ),
+            ("steps", Kind::Integer, "control steps that follow"),
+            ("success", Kind::Flag, "the instruction was carried out"),
+        ],
+    },
+    Topic {
+        name: "/observation",
+        schema: "lads.Observation",
+        about: "What the policy saw.",
+        fields: &[(
+            "values",
+            Kind::Numbers,
+            "elements in the contract's order and units",
+        )],
+    },
+    Topic {
+        name: "/action",
+        schema: "lads.Action",
+        about: "What the policy answered and what was executed.",
+        fields: &[
+            ("policy", Kind::Numbers, "the controller's action"),
+            ("executed", Kind::Numbers, "what the actuators were given"),
+        ],
+    },
+    Topic {
+        name: "/plan",
+        schema: "lads.Plan",
+        about: "The latent plan in force.",
+        fields: &[
+            ("index", Kind::Integer, "entry of the codebook"),
+            ("decided", Kind::Flag, "decided in this control step"),
+            (
+                "margin",
+                Kind::MaybeNumber,
+                "largest logit minus the second largest",
+            ),
+        ],
+    },
+    Topic {
+        name: "/logits",
+        schema: "lads.Logits",
+        about: "The high level's logits at a decision.",
+        fields: &[("values", Kind::Numbers, "one per codebook entry")],
+    },
+    Topic {
+        name: "/timing",
+        schema: "lads.Timing",
+        about: "How long the control step took.",
+        fields: &[("controller_ns", Kind::Integer, "inside the controller, ns")],
+    },
+    Topic {
+        name: "/gripper",
+        schema: "lads.Gripper",
+        about: "Where the gripper was when the observation was taken, m.",
+        fields: &[
+            ("x", Kind::Number, "world frame"),
+            ("y", Kind::Number, "world frame"),
+            ("z", Kind::Number, "world frame"),
+        ],
+    },
+    Topic {
+        name: "/completion",
+        schema: "lads.Completion",
+        about: "A sub-task was completed.",
+        fields: &[
+            ("sub_task", Kind::Text, "its name"),
+            (
+                "step",
+                Kind::Integer,
+                "control step, from 1, after which it held",
+            ),
+        ],
+    },
+];

@@ -1,0 +1,161 @@
+//! Episodes into an MCAP file.
+
+use std::collections::BTreeMap;
+use std::io::{BufWriter, Seek, Write};
+
+use mcap::records::{MessageHeader, Metadata};
+use mcap::{WriteOptions, Writer};
+use serde::Serialize;
+
+use super::schema::{
+    ACTION, COMPLETION, EPISODE, GRIPPER, LOGITS, OBSERVATION, PLAN, TIMING, TOPICS,
+};
+use super::{
+    ActionMessage, CompletionMessage, EpisodeMessage, FORMAT_VERSION, Flight, GripperMessage, Log,
+    METADATA, Origin, PlanMessage, TimingMessage, Values,
+};
+
+/// Simulated time between two episodes, in nanoseconds, so that they stay apart on a time axis.
+const PAUSE_NS: u64 = 1_000_000_000;
+
+/// Writes a log; the file is whole once this returns without an error.
+pub fn write<W: Write + Seek>(log: &Log, to: W) -> mcap::McapResult<()> {
+    let options = WriteOptions::new()
+        .compression(None)
+        .profile("")
+        .library(concat!("lads-sim ", env!("CARGO_PKG_VERSION")));
+    let mut writer = Writer::with_options(BufWriter::new(to), options)?;
+    writer.write_metadata(&metadata(&log.origin, log.flights.len()))?;
+    let mut recorder = Recorder::new(writer, &log.origin)?;
+    log.flights
+        .iter()
+        .try_for_each(|flight| recorder.flight(flight))?;
+    recorder.writer.finish()?;
+    recorder.writer.into_inner().flush()?;
+    Ok(())
+}
+
+fn metadata(origin: &Origin, episodes: usize) -> Metadata {
+    let known = [
+        ("format_version", FORMAT_VERSION.to_string()),
+        ("episodes", episodes.to_string()),
+        ("bundle_sha256", origin.bundle_sha256.clone()),
+        ("environment", origin.environment.clone()),
+        ("environment_version", origin.environment_version.clone()),
+        ("seed", origin.seed.to_string()),
+        ("noise", origin.noise.clone()),
+        ("control_period_s", origin.control_period_s.to_string()),
+        ("horizon", origin.horizon.to_string()),
+        ("observation_names", origin.observation_names.join(" ")),
+        ("action_names", origin.action_names.join(" ")),
+    ];
+    let known = known.map(|(key, value)| (key.to_owned(), value));
+    let notes = origin.notes.iter();
+    let notes = notes.map(|(key, value)| (format!("note.{key}"), value.clone()));
+    Metadata {
+        name: METADATA.to_owned(),
+        metadata: known.into_iter().chain(notes).collect(),
+    }
+}
+
+struct Recorder<W: Write + Seek> {
+    writer: Writer<W>,
+    channels: Vec<u16>,
+    time_ns: u64,
+    period_ns: u64,
+    sequence: u32,
+}
+
+impl<W: Write + Seek> Recorder<W> {
+    fn new(mut writer: Writer<W>, origin: &Origin) -> mcap::McapResult<Self> {
+        let mut channels = Vec::with_capacity(TOPICS.len());
+        for (index, topic) in TOPICS.iter().enumerate() {
+            let schema =
+                writer.add_schema(topic.schema, "jsonschema", topic.json_schema().as_bytes())?;
+            let names = match index {
+                OBSERVATION => Some(&origin.observation_names),
+                ACTION => Some(&origin.action_names),
+                _ => None,
+            };
+            let about: BTreeMap<_, _> = names
+                .map(|names| ("elements".to_owned(), names.join(" ")))
+                .into_iter()
+                .collect();
+            channels.push(writer.add_channel(schema, topic.name, "json", &about)?);
+        }
+        Ok(Self {
+            writer,
+            channels,
+            time_ns: 0,
+            period_ns: (origin.control_period_s * 1e9).round() as u64,
+            sequence: 0,
+        })
+    }
+
+    fn flight(&mut self, flight: &Flight) -> mcap::McapResult<()> {
+        let trace = &flight.trace;
+        let start = EpisodeMessage {
+            instruction: trace.instruction,
+            instruction_id: flight.instruction_id.clone(),
+            instruction_text: flight.instruction_text.clone(),
+            episode: trace.episode,
+            sampling_seed: trace.sampling_seed.map(|seed| seed.to_string()),
+            commanded: trace.commanded,
+            steps: trace.steps.len(),
+            success: trace.outcome.success,
+        };
+        self.message(EPISODE, &start)?;
+        let mut completions = trace
+            .outcome
+            .completions
+            .iter()
+            .zip(&flight.completed)
+            .peekable();
+        for (number, step) in (1..).zip(&trace.steps) {
+            let values = step.observation.clone();
+            self.message(OBSERVATION, &Values { values })?;
+            let action = ActionMessage {
+                policy: step.action.clone(),
+                executed: step.executed.clone(),
+            };
+            self.message(ACTION, &action)?;
+            let plan = PlanMessage {
+                index: step.plan,
+                decided: step.decided,
+                margin: step.margin,
+            };
+            self.message(PLAN, &plan)?;
+            if !step.logits.is_empty() {
+                let values = step.logits.clone();
+                self.message(LOGITS, &Values { values })?;
+            }
+            let controller_ns = step.controller_ns;
+            self.message(TIMING, &TimingMessage { controller_ns })?;
+            if let Some([x, y, z]) = step.gripper {
+                self.message(GRIPPER, &GripperMessage { x, y, z })?;
+            }
+            self.time_ns += self.period_ns;
+            while let Some((completion, name)) = completions.next_if(|(c, _)| c.step <= number) {
+                let message = CompletionMessage {
+                    sub_task: name.clone(),
+                    step: completion.step,
+                };
+                self.message(COMPLETION, &message)?;
+            }
+        }
+        self.time_ns += PAUSE_NS;
+        Ok(())
+    }
+
+    fn message(&mut self, topic: usize, message: &impl Serialize) -> mcap::McapResult<()> {
+        let data = serde_json::to_vec(message).map_err(std::io::Error::from)?;
+        let header = MessageHeader {
+            channel_id: self.channels[topic],
+            sequence: self.sequence,
+            log_time: self.time_ns,
+            publish_time: self.time_ns,
+        };
+        self.sequence = self.sequence.wrapping_add(1);
+        self.writer.write_to_known_channel(&header, &data)
+    }
+}

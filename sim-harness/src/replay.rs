@@ -1,0 +1,231 @@
+//! Recorded episodes computed again: the same observations through a policy, its actions and plans against the recorded ones.
+//!
+//! Equal means bit for bit: the runtime promises the same bits on every target, so any difference is another policy, another runtime or a
+//! damaged log. What can fail: a log of a policy with other sizes, an instruction that this policy does not know, an observation that it
+//! refuses.
+
+use lads_compiler::Memory;
+use lads_core::{
+    ActError, Contract, Decision, Element, Instruction, InstructionError, PlanIndex, Policy,
+    StepError, WorkspaceTooSmall,
+};
+use thiserror::Error;
+
+use crate::recorder::{Flight, Log};
+use crate::trace::Step;
+
+/// Why a log cannot be replayed.
+#[derive(Debug, Error)]
+pub enum ReplayError {
+    /// The log is from a policy with other sizes or names.
+    #[error("the log's {what} is not the policy's: {log} against {policy}")]
+    Sizes {
+        /// What differs.
+        what: &'static str,
+        /// In the log.
+        log: String,
+        /// In the policy.
+        policy: String,
+    },
+    /// The policy does not know a recorded instruction.
+    #[error("the policy does not know the recorded instruction '{0}'")]
+    Instruction(String),
+    /// The policy refused it.
+    #[error("the policy refuses the instruction: {0}")]
+    Instruct(InstructionError),
+    /// The policy's own numbers do not add up.
+    #[error("the policy's workspace is too small: {0}")]
+    Workspace(WorkspaceTooSmall),
+    /// The controller refused an observation.
+    #[error("{episode}: the controller refuses the observation of control step {step}: {error}")]
+    Step {
+        /// Which episode.
+        episode: String,
+        /// Control step, from 0.
+        step: usize,
+        /// Its reason.
+        error: StepError,
+    },
+    /// The low level refused a commanded plan.
+    #[error("{episode}: the low level gives no action in control step {step}: {error}")]
+    Act {
+        /// Which episode.
+        episode: String,
+        /// Control step, from 0.
+        step: usize,
+        /// Its reason.
+        error: ActError,
+    },
+}
+
+/// The first step of an episode that came out otherwise.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Difference {
+    /// The instruction's id.
+    pub instruction: String,
+    /// Number of the episode.
+    pub episode: u32,
+    /// Control step, from 0.
+    pub step: usize,
+    /// Plan in the log and now, where they differ.
+    pub plans: Option<(u32, u32)>,
+    /// The element with the largest difference, its name, and its value in the log and now; `None` where all have the same bits.
+    pub action: Option<(String, f32, f32)>,
+}
+
+/// What replaying a log came to.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Replayed {
+    /// Episodes computed again.
+    pub episodes: usize,
+    /// Control steps, in all.
+    pub steps: usize,
+    /// The first difference of each episode that has one.
+    pub differences: Vec<Difference>,
+}
+
+/// Computes all episodes of a log again; `finished` is called after each.
+pub fn replay(
+    policy: &Policy<'_>,
+    log: &Log,
+    finished: &dyn Fn(),
+) -> Result<Replayed, ReplayError> {
+    fits(&policy.contract(), log)?;
+    let mut memory = Memory::of(policy);
+    let mut controller = memory.controller(policy).map_err(ReplayError::Workspace)?;
+    let mut replayed = Replayed::default();
+    let mut action = vec![0.0; policy.contract().action_len()];
+    for flight in &log.flights {
+        let instruction = find(&policy.contract(), flight)?;
+        controller.set_decision(match flight.trace.sampling_seed {
+            None => Decision::Argmax,
+            Some(seed) => Decision::Sample {
+                temperature: temperature(&policy.contract()),
+                seed,
+            },
+        });
+        controller
+            .set_instruction(Instruction::Id(instruction))
+            .map_err(ReplayError::Instruct)?;
+        let episode = || format!("{} episode {}", flight.instruction_id, flight.trace.episode);
+        let mut first = None;
+        for (number, step) in flight.trace.steps.iter().enumerate() {
+            let plan = if flight.trace.commanded {
+                let plan = PlanIndex(step.plan);
+                let acted = controller.act(&step.observation, plan, &mut action);
+                acted.map_err(|error| ReplayError::Act {
+                    episode: episode(),
+                    step: number,
+                    error,
+                })?;
+                plan.0
+            } else {
+                let stepped = controller.step(&step.observation, &mut action);
+                let report = stepped.map_err(|error| ReplayError::Step {
+                    episode: episode(),
+                    step: number,
+                    error,
+                })?;
+                report.plan.0
+            };
+            if first.is_none() {
+                first = compare(log, flight, number, step, plan, &action);
+            }
+        }
+        replayed.episodes += 1;
+        replayed.steps += flight.trace.steps.len();
+        replayed.differences.extend(first);
+        finished();
+    }
+    Ok(replayed)
+}
+
+/// The contract's temperature, or the 1 that `--sample` takes where the contract's rule is argmax.
+fn temperature(contract: &Contract<'_>) -> f32 {
+    match contract.decision() {
+        Decision::Sample { temperature, .. } => temperature,
+        Decision::Argmax => 1.0,
+    }
+}
+
+fn fits(contract: &Contract<'_>, log: &Log) -> Result<(), ReplayError> {
+    let origin = &log.origin;
+    let sizes = |what, log: String, policy: String| {
+        if log == policy {
+            return Ok(());
+        }
+        Err(ReplayError::Sizes { what, log, policy })
+    };
+    elements(
+        "observation",
+        &origin.observation_names,
+        contract.observations(),
+    )?;
+    elements("action", &origin.action_names, contract.actions())?;
+    sizes(
+        "horizon",
+        origin.horizon.to_string(),
+        contract.horizon().to_string(),
+    )
+}
+
+/// Number and names of the elements; says the first that differs.
+fn elements<'c>(
+    what: &'static str,
+    log: &[String],
+    policy: impl Iterator<Item = Element<'c>>,
+) -> Result<(), ReplayError> {
+    let policy: Vec<&str> = policy.map(|element| element.name).collect();
+    let sizes = |log: String, policy: String| Err(ReplayError::Sizes { what, log, policy });
+    if log.len() != policy.len() {
+        let counted = |count| format!("{count} elements");
+        return sizes(counted(log.len()), counted(policy.len()));
+    }
+    match log.iter().zip(policy).find(|(was, is)| was != is) {
+        Some((was, is)) => sizes(was.clone(), is.to_owned()),
+        None => Ok(()),
+    }
+}
+
+/// The policy's index of the recorded instruction, by its text: another bundle may number them otherwise.
+fn find(contract: &Contract<'_>, flight: &Flight) -> Result<u32, ReplayError> {
+    let place = contract
+        .instructions()
+        .position(|known| known.text == flight.instruction_text);
+    place
+        .map(|place| place as u32)
+        .ok_or_else(|| ReplayError::Instruction(flight.instruction_text.clone()))
+}
+
+fn compare(
+    log: &Log,
+    flight: &Flight,
+    number: usize,
+    step: &Step,
+    plan: u32,
+    action: &[f32],
+) -> Option<Difference> {
+    let distance = |&(_, was, is): &(usize, f32, f32)| (was - is).abs();
+    let worst = step
+        .action
+        .iter()
+        .zip(action)
+        .enumerate()
+        .filter(|(_, (was, is))| was.to_bits() != is.to_bits())
+        .map(|(element, (&was, &is))| (element, was, is))
+        .max_by(|a, b| distance(a).total_cmp(&distance(b)));
+    if worst.is_none() && step.plan == plan {
+        return None;
+    }
+    let names = &log.origin.action_names;
+    Some(Difference {
+        instruction: flight.instruction_id.clone(),
+        episode: flight.trace.episode,
+        step: number,
+        plans: (step.plan != plan).then_some((step.plan, plan)),
+        action: worst.map(|(element, was, is)| {
+            let name = names.get(element).cloned().unwrap_or_default();
+            (name, was, is)
+        }),
+    })
+}

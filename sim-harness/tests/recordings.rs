@@ -1,0 +1,289 @@
+//! Recorded episodes in an environment without a simulator: what is written is read, replayed, encoded and followed.
+
+#[path = "common/bench.rs"]
+mod bench;
+
+use std::io::Cursor;
+use std::sync::atomic::AtomicBool;
+
+use bench::{Bench, Says, tiny_image};
+use lads_core::{Decision, Isa, Policy};
+use lads_sim::environment::Environment;
+use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, Setup};
+use lads_sim::faults::Faults;
+use lads_sim::fit;
+use lads_sim::plans::{self, PlanFile, PlanSequence};
+use lads_sim::recorder::{self, Flight, Log, Origin};
+use lads_sim::replay::{Replayed, replay};
+use lads_sim::rollout::Actor;
+
+const SAMPLE: Decision = Decision::Sample {
+    temperature: 1.0,
+    seed: 0,
+};
+
+fn evaluate(
+    policy: &Policy<'_>,
+    decision: Decision,
+    threads: usize,
+    setup: Setup<'_>,
+) -> Evaluated {
+    let commanded = fit::check(&policy.contract(), &Bench::new(Says::default())).unwrap();
+    let assignments: Vec<_> = (0..)
+        .zip(commanded)
+        .map(|(instruction, commanded)| Assignment {
+            instruction,
+            commanded,
+            max_steps: 40,
+        })
+        .collect();
+    let evaluation = Evaluation {
+        policy: *policy,
+        assignments: &assignments,
+        episodes: 3,
+        seed: 5,
+        decision,
+        actor: Actor::Policy,
+        isa: Isa::detect(),
+        traced: 0,
+        threads,
+        setup: Setup {
+            traced: true,
+            ..setup
+        },
+    };
+    let open = || -> Box<dyn Environment> { Box::new(Bench::new(Says::default())) };
+    evaluation
+        .run(&open, &AtomicBool::new(false), &|| {})
+        .unwrap()
+}
+
+fn log(policy: &Policy<'_>, evaluated: &Evaluated) -> Log {
+    let contract = policy.contract();
+    let flights = evaluated.traces.iter().map(|trace| {
+        let known = contract.instruction(trace.instruction as usize).unwrap();
+        let mut trace = trace.clone();
+        // A log has no final state.
+        trace.outcome.final_state.clear();
+        let done = &mut trace.outcome.completions;
+        let completed = done
+            .iter()
+            .map(|c| Says::default().sub_tasks[c.sub_task].to_owned());
+        let completed: Vec<_> = completed.collect();
+        // As a log has it: its place among the completed.
+        done.iter_mut()
+            .enumerate()
+            .for_each(|(i, c)| c.sub_task = i);
+        Flight {
+            instruction_id: known.id.to_owned(),
+            instruction_text: known.text.to_owned(),
+            completed,
+            trace,
+        }
+    });
+    Log {
+        origin: Origin {
+            bundle_sha256: contract.bundle_sha256().to_owned(),
+            environment: "tiny-bench".to_owned(),
+            environment_version: "1".to_owned(),
+            seed: 5,
+            noise: "none".to_owned(),
+            control_period_s: 0.05,
+            horizon: contract.horizon(),
+            observation_names: contract.observations().map(|e| e.name.to_owned()).collect(),
+            action_names: contract.actions().map(|e| e.name.to_owned()).collect(),
+            notes: [("mujoco".to_owned(), "none".to_owned())].into(),
+        },
+        flights: flights.collect(),
+    }
+}
+
+fn bytes(log: &Log) -> Vec<u8> {
+    let mut file = Cursor::new(Vec::new());
+    recorder::write(log, &mut file).unwrap();
+    file.into_inner()
+}
+
+fn read(bytes: &[u8]) -> Result<Log, recorder::LogError> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("log.mcap");
+    std::fs::write(&path, bytes).unwrap();
+    recorder::read(&path)
+}
+
+fn replayed(policy: &Policy<'_>, log: &Log) -> Replayed {
+    replay(policy, log, &|| {}).unwrap()
+}
+
+#[test]
+fn a_log_reads_back_and_replays_bit_for_bit() {
+    let image = tiny_image();
+    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    for decision in [Decision::Argmax, SAMPLE] {
+        let evaluated = evaluate(&policy, decision, 2, Setup::default());
+        assert_eq!(evaluated.traces.len(), 12);
+        let log = log(&policy, &evaluated);
+        let again = read(&bytes(&log)).unwrap();
+        assert_eq!(again, log);
+        let replayed = replayed(&policy, &again);
+        let steps = log
+            .flights
+            .iter()
+            .map(|flight| flight.trace.steps.len())
+            .sum();
+        assert_eq!((replayed.episodes, replayed.steps), (12, steps));
+        assert_eq!(replayed.differences, []);
+    }
+}
+
+#[test]
+fn the_first_step_that_differs_is_named() {
+    let image = tiny_image();
+    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let mut log = log(
+        &policy,
+        &evaluate(&policy, Decision::Argmax, 1, Setup::default()),
+    );
+    let steps = &mut log.flights[4].trace.steps;
+    steps[7].action[1] = f32::from_bits(steps[7].action[1].to_bits() ^ 1);
+    steps[9].plan += 1;
+    let differences = replayed(&policy, &log).differences;
+    assert_eq!(differences.len(), 1);
+    let flight = &log.flights[4];
+    let difference = &differences[0];
+    assert_eq!(difference.instruction, flight.instruction_id);
+    assert_eq!(
+        (difference.episode, difference.step),
+        (flight.trace.episode, 7)
+    );
+    assert_eq!(difference.plans, None);
+    assert_eq!(difference.action.as_ref().unwrap().0, "joint2_velocity");
+
+    log.origin.action_names[0].push('x');
+    let error = replay(&policy, &log, &|| {}).unwrap_err().to_string();
+    assert!(error.contains("joint1_velocityx"), "{error}");
+}
+
+#[test]
+fn a_damaged_log_is_refused() {
+    let image = tiny_image();
+    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let whole = bytes(&log(
+        &policy,
+        &evaluate(&policy, Decision::Argmax, 1, Setup::default()),
+    ));
+    for end in [0, 7, 100, whole.len() / 2, whole.len() - 1] {
+        assert!(read(&whole[..end]).is_err(), "cut off at {end}");
+    }
+    // Any changed bit is either refused or changes nothing that is read.
+    let good = read(&whole).unwrap();
+    for place in (0..whole.len()).step_by(whole.len() / 97) {
+        let mut damaged = whole.clone();
+        damaged[place] ^= 0x10;
+        if let Ok(log) = read(&damaged) {
+            assert!(log.flights == good.flights, "byte {place}");
+        }
+    }
+    assert!(read(b"not a log").unwrap_err().to_string().contains("MCAP"));
+}
+
+#[test]
+fn faults_depend_on_the_episode_alone_and_are_recorded() {
+    let image = tiny_image();
+    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let faults = Faults {
+        delay_steps: 2,
+        drop_rate: 0.3,
+        noise_scale: 0.5,
+        action_lag: 1.5,
+    };
+    let setup = Setup {
+        faults,
+        ..Setup::default()
+    };
+    let one = evaluate(&policy, Decision::Argmax, 1, setup);
+    let plain = evaluate(&policy, Decision::Argmax, 1, Setup::default());
+    assert_ne!(one.traces, plain.traces);
+    let timeless = |evaluated: &Evaluated| {
+        let mut log = log(&policy, evaluated);
+        for step in log
+            .flights
+            .iter_mut()
+            .flat_map(|flight| &mut flight.trace.steps)
+        {
+            step.controller_ns = 0;
+        }
+        log
+    };
+    let many = evaluate(&policy, Decision::Argmax, 3, setup);
+    assert_eq!(timeless(&many), timeless(&one));
+    let steps = one.traces.iter().flat_map(|trace| &trace.steps);
+    assert!(steps.clone().any(|step| step.action != step.executed));
+    assert!(
+        plain
+            .traces
+            .iter()
+            .flat_map(|trace| &trace.steps)
+            .all(|step| step.action == step.executed)
+    );
+    assert_eq!(replayed(&policy, &log(&policy, &one)).differences, []);
+}
+
+#[test]
+fn commanded_plans_are_followed_and_encoded() {
+    let image = tiny_image();
+    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let contract = policy.contract();
+    let horizon = contract.horizon();
+    let ids: Vec<_> = contract
+        .instructions()
+        .map(|known| known.id.to_owned())
+        .collect();
+    let index = |id: &str| ids.iter().position(|known| known == id).map(|i| i as u32);
+    let sequence = |id: &String| PlanSequence {
+        instruction: id.clone(),
+        episode: None,
+        plans: vec![1, 0, 2],
+    };
+    let file = PlanFile::new(horizon, ids.iter().map(sequence).collect());
+    let book = file.check(&contract, index).unwrap();
+    let setup = Setup {
+        plans: Some(&book),
+        ..Setup::default()
+    };
+    let evaluated = evaluate(&policy, Decision::Argmax, 2, setup);
+    for trace in &evaluated.traces {
+        assert!(trace.commanded && trace.steps.len() <= 3 * horizon);
+        for (number, step) in trace.steps.iter().enumerate() {
+            assert_eq!(step.plan, [1, 0, 2][number / horizon]);
+        }
+    }
+    assert_eq!(replayed(&policy, &log(&policy, &evaluated)).differences, []);
+
+    let agreement = plans::agreement(&policy, &evaluated.traces).unwrap();
+    let full: usize = evaluated
+        .traces
+        .iter()
+        .map(|trace| trace.steps.len() / horizon)
+        .sum();
+    assert_eq!(agreement.segments, full);
+    let recordings = evaluated.traces.iter().map(|trace| trace.steps.as_slice());
+    let encoded = plans::encode(&policy, recordings).unwrap();
+    let agreed = encoded.iter().flatten().zip([1, 0, 2].iter().cycle());
+    assert!(encoded.iter().all(|plans| plans.len() <= 3));
+    if encoded.iter().all(|plans| plans.len() == 3) {
+        assert_eq!(agreement.agreed, agreed.filter(|(a, b)| a == b).count());
+    }
+
+    let refused = |change: &dyn Fn(&mut PlanFile)| {
+        let mut file = file.clone();
+        change(&mut file);
+        file.check(&contract, index).unwrap_err().to_string()
+    };
+    let size = contract.codebook_len() as u32;
+    assert!(refused(&|file| file.horizon += 1).contains("control steps each"));
+    assert!(refused(&|file| file.episodes[0].plans[1] = size).contains("the codebook has"));
+    assert!(refused(&|file| file.episodes[0].plans.clear()).contains("has no plans"));
+    assert!(refused(&|file| file.episodes[1] = file.episodes[0].clone()).contains("twice"));
+    assert!(refused(&|file| file.episodes[0].instruction.push('?')).contains("does not know"));
+}
