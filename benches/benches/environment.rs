@@ -71,6 +71,7 @@ fn evaluation(criterion: &mut Criterion) {
         isa: Isa::detect(),
         traced: 0,
         threads: 1,
+        setup: lads_sim::evaluate::Setup::default(),
     };
     let run = || {
         let evaluated = evaluation.run(&*open, &AtomicBool::new(false), &|| ());
