@@ -13,7 +13,7 @@ RUNTIME := -p lads-core -p lads-kernels -p lads-compiler -p lads-ffi -p lads-cli
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report test setup lint test-runtime test-sim test-exporter collect train export install bench clean help
+.PHONY: run report verify test setup lint test-runtime test-sim test-exporter collect train export reference install bench clean help
 
 ## run: the shipped policy over the paper's seen and unseen instructions
 run: setup
@@ -70,7 +70,7 @@ export: $(VENV)/stamp
 reference: $(VENV)/stamp
 	$(PY) -m lads_exporter reference --model $(MODEL) -o $(MODEL:.onnx=.reference.json)
 
-## verify: is the compiled policy the reference's? Exit code 0 EQUIVALENT, 1 DIFFERENT, 3 INCONCLUSIVE
+## verify: is the compiled policy the reference's? Fails unless EQUIVALENT; `lads-run --verify` itself exits with 0, 1 DIFFERENT or 3 INCONCLUSIVE
 verify: setup
 	cargo run --release -p lads-sim --bin lads-run -- --model $(MODEL) --verify $(ARGS)
 

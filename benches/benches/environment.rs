@@ -69,7 +69,6 @@ fn evaluation(criterion: &mut Criterion) {
         decision: Decision::Argmax,
         actor: Actor::Policy,
         isa: Isa::detect(),
-        traced: 0,
         threads: 1,
         setup: lads_sim::evaluate::Setup::default(),
     };

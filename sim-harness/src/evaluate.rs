@@ -40,8 +40,8 @@ pub struct Setup<'e> {
     pub faults: Faults,
     /// Plans for the low level alone.
     pub plans: Option<&'e PlanBook>,
-    /// Whether every control step is kept.
-    pub traced: bool,
+    /// How many of each instruction's episodes, from the first, keep every control step.
+    pub traced: u32,
 }
 
 /// What to run, and how.
@@ -60,8 +60,6 @@ pub struct Evaluation<'e> {
     pub actor: Actor,
     /// The instructions that the kernels run on.
     pub isa: Isa,
-    /// How many of each instruction's episodes, from the first, keep a trace.
-    pub traced: u32,
     /// Threads, at least one.
     pub threads: usize,
     /// Everything else about it.
@@ -186,7 +184,7 @@ impl Evaluation<'_> {
             .controller_with(&self.policy, self.isa)
             .map_err(EvaluationError::Workspace)?;
         let mut driver = Driver::new(controller, environment.as_mut());
-        if self.setup.traced {
+        if self.setup.traced > 0 {
             driver.record();
         }
         let mut episodes = Vec::new();
@@ -203,7 +201,7 @@ impl Evaluation<'_> {
                     episode,
                     source,
                 })?;
-            let trace = self.setup.traced.then(|| Trace {
+            let trace = (episode < self.setup.traced).then(|| Trace {
                 instruction: assignment.instruction,
                 episode,
                 sampling_seed: match task.decision {
@@ -243,7 +241,6 @@ impl Evaluation<'_> {
             seed,
             decision,
             actor: self.actor,
-            traced: episode < self.traced,
             faults: self.setup.faults,
             plans: self
                 .setup

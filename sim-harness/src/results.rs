@@ -414,7 +414,6 @@ mod tests {
             completions: done.iter().map(completion).collect(),
             plans: vec![0; 14],
             final_state: vec![0.0; 5],
-            trace: None,
         }
     }
 

@@ -76,21 +76,10 @@ pub struct Task<'t> {
     pub decision: Decision,
     /// Who acts.
     pub actor: Actor,
-    /// Whether the episode is to have a trace.
-    pub traced: bool,
     /// What is wrong between policy and environment.
     pub faults: Faults,
     /// Plans for the low level alone, one per horizon; the episode ends with them. `None`: the high level decides.
     pub plans: Option<&'t [u32]>,
-}
-
-/// An episode step by step, for comparisons.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct Trace {
-    /// What the policy saw, `[steps, O]`.
-    pub observations: Vec<f32>,
-    /// What it did, `[steps, A]`.
-    pub actions: Vec<f32>,
 }
 
 /// What happened in one episode.
@@ -106,8 +95,6 @@ pub struct Episode {
     pub plans: Vec<u32>,
     /// Noise-free state after the last step.
     pub final_state: Vec<f64>,
-    /// What was seen and done, where the task asked for it.
-    pub trace: Option<Trace>,
 }
 
 /// How long everything took, over all episodes of one driver.
@@ -219,12 +206,8 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         });
         let mut plans = Vec::with_capacity(most.div_ceil(horizon));
         let mut uniform = task.actor.stream(task.seed);
-        let mut trace = task.traced.then(Trace::default);
         let mut step = 0;
         while step < most && !self.environment.succeeded(task.commanded) {
-            if let Some(trace) = &mut trace {
-                trace.observations.extend_from_slice(&self.observation);
-            }
             match &mut uniform {
                 None => {
                     let (report, elapsed_ns) = self.decide(step, horizon, task.plans)?;
@@ -240,9 +223,6 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
                 Some(stream) => self.uniform_step(step, stream)?,
             }
             self.sense(&mut link);
-            if let Some(trace) = &mut trace {
-                trace.actions.extend_from_slice(&self.action);
-            }
             step += 1;
         }
         self.timing.episodes_cpu += cpu_since(episode_cpu);
@@ -252,7 +232,6 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             completions: self.environment.completions().to_vec(),
             plans,
             final_state: self.environment.state().to_vec(),
-            trace,
         })
     }
 

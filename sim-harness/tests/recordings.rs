@@ -45,10 +45,9 @@ fn evaluate(
         decision,
         actor: Actor::Policy,
         isa: Isa::detect(),
-        traced: 0,
         threads,
         setup: Setup {
-            traced: true,
+            traced: u32::MAX,
             ..setup
         },
     };

@@ -44,7 +44,6 @@ fn evaluate(policy: &Policy<'_>, seed: u64, decision: Decision, threads: usize) 
         decision,
         actor: Actor::Policy,
         isa: Isa::detect(),
-        traced: 1,
         threads,
         setup: Setup::default(),
     };
@@ -164,7 +163,6 @@ fn a_stop_ends_the_work_without_a_result() {
         decision: Decision::Argmax,
         actor: Actor::Policy,
         isa: Isa::portable(),
-        traced: 0,
         threads: 2,
         setup: Setup::default(),
     };

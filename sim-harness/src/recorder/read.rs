@@ -202,7 +202,6 @@ fn begun(start: EpisodeMessage) -> Result<Flight, LogError> {
                 completions: Vec::new(),
                 plans: Vec::new(),
                 final_state: Vec::new(),
-                trace: None,
             },
             steps: Vec::new(),
         },

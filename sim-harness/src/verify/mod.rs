@@ -33,7 +33,7 @@ pub fn run(
     finished: &(dyn Fn() + Sync),
 ) -> Result<Certificate, EvaluationError> {
     let contract = evaluation.policy.contract();
-    let traced = evaluation.traced;
+    let traced = evaluation.setup.traced;
     let answers = policy::ask(
         &evaluation.policy,
         evaluation.isa,
@@ -54,7 +54,7 @@ pub fn run(
         reference,
         evaluation.assignments,
         environment.sub_tasks(),
-        &evaluated.episodes,
+        &evaluated,
         [contract.observation_len(), contract.action_len()],
     );
     let setting = Setting {

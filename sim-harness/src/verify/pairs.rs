@@ -7,8 +7,9 @@ use serde::Serialize;
 
 use super::reference::Reference;
 use super::statistics::{Counts, Difference, Pairs};
-use crate::evaluate::Assignment;
+use crate::evaluate::{Assignment, Evaluated};
 use crate::rollout::Episode;
+use crate::trace::Step;
 
 /// Largest negligible difference of a success rate.
 pub const RATE_MARGIN: f64 = 0.05;
@@ -81,14 +82,14 @@ impl Paired {
         reference: &Reference,
         assignments: &[Assignment],
         sub_tasks: &[&str],
-        episodes: &[Vec<Episode>],
+        evaluated: &Evaluated,
         lens: [usize; 2],
     ) -> Self {
         let mut sum = Sum {
             outcomes: vec![Pairs::default(); sub_tasks.len() + 1],
             ..Sum::default()
         };
-        for (assignment, ours) in assignments.iter().zip(episodes) {
+        for (assignment, ours) in assignments.iter().zip(&evaluated.episodes) {
             let Some(theirs) = reference.instructions.get(assignment.instruction as usize) else {
                 continue;
             };
@@ -100,7 +101,13 @@ impl Paired {
                     sub_tasks,
                     reference.horizon,
                 );
-                sum.follow(run, recorded, lens);
+            }
+        }
+        for trace in &evaluated.traces {
+            let instruction = reference.instructions.get(trace.instruction as usize);
+            let recorded = instruction.and_then(|row| row.episodes.get(trace.episode as usize));
+            if let Some(theirs) = recorded.and_then(|episode| episode.trace.as_ref()) {
+                sum.follow(&trace.steps, theirs, lens);
             }
         }
         sum.finish(sub_tasks)
@@ -177,34 +184,27 @@ impl Sum {
     /// Compares actions as long as both trajectories are the same.
     fn follow(
         &mut self,
-        run: &Episode,
-        recorded: &super::reference::Episode,
+        ours: &[Step],
+        theirs: &super::reference::Trace,
         [observation_len, action_len]: [usize; 2],
     ) {
-        let (Some(ours), Some(theirs)) = (&run.trace, &recorded.trace) else {
-            return;
-        };
-        self.agreeing_steps[1] += recorded.steps;
-        let seen = ours
-            .observations
-            .chunks_exact(observation_len)
-            .zip(theirs.observations.chunks_exact(observation_len));
-        let done = ours
-            .actions
-            .chunks_exact(action_len)
-            .zip(theirs.actions.chunks_exact(action_len));
-        let largest = |(a, b): (&[f32], &[f32])| {
+        let seen = theirs.observations.chunks_exact(observation_len);
+        let done = theirs.actions.chunks_exact(action_len);
+        self.agreeing_steps[1] += done.len();
+        let largest = |a: &[f32], b: &[f32]| {
             a.iter()
                 .zip(b)
                 .map(|(a, b)| f64::from((a - b).abs()))
                 .fold(0.0, f64::max)
         };
-        for (seen, done) in seen.zip(done) {
-            if largest(seen) > TRAJECTORY_TOLERANCE {
+        for (step, (seen, done)) in ours.iter().zip(seen.zip(done)) {
+            if largest(&step.observation, seen) > TRAJECTORY_TOLERANCE {
                 return;
             }
             self.agreeing_steps[0] += 1;
-            self.largest_action_difference = self.largest_action_difference.max(largest(done));
+            self.largest_action_difference = self
+                .largest_action_difference
+                .max(largest(&step.action, done));
         }
     }
 

@@ -115,12 +115,15 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
             Actor::Policy
         },
         isa,
-        traced: 0,
         threads,
         setup: Setup {
             faults: arguments.faults.faults(),
             plans: book.as_ref(),
-            traced: files.log.is_some() || files.monitor || arguments.report.is_some(),
+            traced: if files.log.is_some() || files.monitor || arguments.report.is_some() {
+                u32::MAX
+            } else {
+                0
+            },
         },
     };
     if let Some(reference) = reference {

@@ -46,7 +46,7 @@ pub fn prepare(
     evaluation.episodes = episodes;
     evaluation.seed = reference.seed;
     evaluation.decision = Decision::Argmax;
-    evaluation.traced = reference.traced_episodes.min(episodes);
+    evaluation.setup.traced = reference.traced_episodes.min(episodes);
     Ok(())
 }
 
