@@ -153,7 +153,7 @@ fn the_header_is_read_first() {
         Policy::new_checked(changed.bytes()).map(|_| ())
     };
     assert_eq!(edited(0, 0x1234), Err(PolicyError::Magic));
-    assert_eq!(edited(1, 2), Err(PolicyError::Version(2)));
+    assert_eq!(edited(1, 99), Err(PolicyError::Version(99)));
     assert_eq!(edited(2, 3), Err(PolicyError::Length));
     assert!(matches!(
         edited(2, 0x7fff_fffc),
@@ -315,8 +315,9 @@ fn each_rule_of_an_op_is_enforced() {
     let shrink = |ops: &mut Vec<Op>| {
         edit_first!(ops, Attention, op => {
             let width = op.heads * op.head_dim;
-            op.cache_k.len -= width;
             op.cache_v.len -= width;
+            let capacity = (op.cache_v.len / width) as usize;
+            op.cache_k.len = lads_kernels::keys_len(capacity, width as usize) as u32;
         });
     };
     assert_eq!(fault(StepDecide, shrink), Some(Fault::Capacity));
