@@ -22,7 +22,7 @@ def table_of(base, series, value):
     """The base's configuration and environment with one dimension changed."""
     table, environment, instructions = copy.deepcopy(base.tables)
     table["name"] = f"{series}-{value}"
-    table["language"] = {"encoder": "random-384", "layer": -1}
+    table["language"] |= {"encoder": "random-384", "layer": -1, "pool": False}
     table["high_level"]["context_steps"] = STEPS
     table["encoder"]["hidden"] = 16  # it does not run in a control step
     if series == "layers":
