@@ -24,6 +24,7 @@ use crate::decision::{Decider, PlanIndex, margin};
 use crate::errors::{ActError, EncodeError, InstructionError, StepError};
 use crate::exec::{ExecError, Inputs};
 use crate::image::{Beyond, ProgramKind};
+use crate::low_level::{self, take_finite};
 use crate::op::Port;
 use crate::policy::Policy;
 use crate::workspace::Workspace;
@@ -280,38 +281,14 @@ impl<'a, 'm> Controller<'a, 'm> {
         if let Some(index) = observation.iter().position(|x| !x.is_finite()) {
             return Err(ActError::NotFinite { index });
         }
-        let Workspace { machine, next, .. } = &mut self.workspace;
-        let (policy, weights) = (&self.policy, self.policy.weights());
-        let lookup = policy.program(ProgramKind::Lookup);
-        let inputs = Inputs {
-            plan_index: plan.0,
-            ..Inputs::default()
-        };
-        machine
-            .run(lookup, weights, 0, &inputs)
-            .map_err(ActError::Program)?;
-        // The second bank holds nothing between two steps.
-        take_finite(machine.output(lookup, Port::Plan), next.plan)
-            .map_err(|_| ActError::NotFiniteResult)?;
-        let program = policy.program(ProgramKind::Act);
-        let inputs = Inputs {
-            observation,
-            plan: next.plan,
-            plan_index: plan.0,
-            ..Inputs::default()
-        };
-        machine
-            .run(program, weights, 0, &inputs)
-            .map_err(ActError::Program)?;
-        take_finite(machine.output(program, Port::Action), next.action)
-            .map_err(|_| ActError::NotFiniteResult)?;
-        for ((to, from), limits) in action
-            .iter_mut()
-            .zip(next.action.iter())
-            .zip(contract.actions())
-        {
-            *to = from.clamp(limits.min, limits.max);
+        if self.workspace.bank_lens() != self.policy.bank_lens() {
+            return Err(ActError::Program(ExecError::Span));
         }
+        // The second bank holds nothing between two steps.
+        let Workspace { machine, next, .. } = &mut self.workspace;
+        low_level::look_up(machine, &self.policy, plan, next)?;
+        low_level::act(machine, &self.policy, observation, plan, next)?;
+        assign(action, next.action);
         Ok(())
     }
 
@@ -391,30 +368,9 @@ impl<'a, 'm> Controller<'a, 'm> {
             take_finite(machine.output(high, Port::Logits), next.logits)?;
             plan = decider.pick(next.logits);
             plan_margin = margin(next.logits);
-            let lookup = policy.program(ProgramKind::Lookup);
-            let inputs = Inputs {
-                plan_index: plan.0,
-                ..Inputs::default()
-            };
-            machine
-                .run(lookup, weights, 0, &inputs)
-                .map_err(StepError::Program)?;
-            take_finite(machine.output(lookup, Port::Plan), next.plan)?;
+            low_level::look_up(machine, policy, plan, next)?;
         }
-        let act = policy.program(ProgramKind::Act);
-        let inputs = Inputs {
-            observation,
-            plan: next.plan,
-            plan_index: plan.0,
-            ..Inputs::default()
-        };
-        machine
-            .run(act, weights, 0, &inputs)
-            .map_err(StepError::Program)?;
-        take_finite(machine.output(act, Port::Action), next.action)?;
-        for (action, limits) in next.action.iter_mut().zip(policy.contract().actions()) {
-            *action = limits.clamp(*action);
-        }
+        low_level::act(machine, policy, observation, plan, next)?;
 
         now.copy_from(next);
         self.decider = decider;
@@ -488,13 +444,4 @@ impl<'a, 'm> Controller<'a, 'm> {
             inputs,
         )
     }
-}
-
-/// Copies what a program gave, if all of it is finite.
-fn take_finite(from: &[f32], to: &mut [f32]) -> Result<(), StepError> {
-    if from.len() != to.len() || !from.iter().all(|x| x.is_finite()) {
-        return Err(StepError::NotFiniteResult);
-    }
-    assign(to, from);
-    Ok(())
 }

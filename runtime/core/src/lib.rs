@@ -61,6 +61,7 @@ mod exec;
 mod golden;
 mod guard;
 pub mod image;
+mod low_level;
 pub mod op;
 mod policy;
 pub mod program;
