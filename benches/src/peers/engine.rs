@@ -46,6 +46,15 @@ pub trait Session {
     fn output_names(&self) -> Vec<String>;
 }
 
+/// The tensor for an input of a model.
+pub fn given<'t>(inputs: &Named<'t>, wanted: &str) -> Result<&'t Tensor, String> {
+    inputs
+        .iter()
+        .find(|(name, _)| name == wanted)
+        .map(|(_, tensor)| *tensor)
+        .ok_or_else(|| format!("no value for input {wanted}"))
+}
+
 /// An error of a runtime, in one line.
 pub fn failed(engine: &str, error: impl std::fmt::Display) -> BenchError {
     BenchError::new(engine, error, "leave this peer out or fix its installation")

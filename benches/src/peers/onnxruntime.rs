@@ -10,7 +10,7 @@ use ort::session::{IoBinding, Session as OrtSession};
 use ort::value::{DynValue, Tensor as OrtTensor, TensorElementType};
 
 use super::cut::{Data, Tensor};
-use super::engine::{Engine, Named, Session, failed};
+use super::engine::{Engine, Named, Session, failed, given};
 use crate::error::BenchError;
 
 const NAME: &str = "ONNX Runtime";
@@ -99,10 +99,7 @@ impl Bound {
         self.outputs.clear();
         let mut past = 0;
         for outlet in self.session.inputs() {
-            let (_, tensor) = inputs
-                .iter()
-                .find(|(name, _)| name == outlet.name())
-                .ok_or_else(|| ort::Error::new(format!("no value for input {}", outlet.name())))?;
+            let tensor = given(inputs, outlet.name()).map_err(ort::Error::new)?;
             if outlet.name().contains("past_key_values") {
                 past = tensor.shape.get(2).copied().unwrap_or(0);
             }

@@ -7,7 +7,7 @@ use rten_tensor::Tensor as RtenTensor;
 use rten_tensor::prelude::{AsView, Layout};
 
 use super::cut::{Data, Tensor};
-use super::engine::{Engine, Named, Session, failed};
+use super::engine::{Engine, Named, Session, failed, given};
 use crate::error::BenchError;
 use crate::realtime::Realtime;
 
@@ -80,10 +80,7 @@ impl Session for Loaded {
     fn bind(&mut self, inputs: &Named) -> Result<(), BenchError> {
         self.inputs.clear();
         for wanted in &self.input_names {
-            let (_, tensor) = inputs
-                .iter()
-                .find(|(name, _)| name == wanted)
-                .ok_or_else(|| failed(NAME, format!("no value for input {wanted}")))?;
+            let tensor = given(inputs, wanted).map_err(|error| failed(NAME, error))?;
             self.inputs.push(value(tensor));
         }
         Ok(())

@@ -3,7 +3,7 @@
 use tract_onnx::prelude::{Tensor as TractTensor, *};
 
 use super::cut::{self, Data};
-use super::engine::{Engine, Named, Session, failed};
+use super::engine::{Engine, Named, Session, failed, given};
 use crate::error::BenchError;
 
 const NAME: &str = "tract";
@@ -61,10 +61,7 @@ impl Session for Loaded {
     fn bind(&mut self, inputs: &Named) -> Result<(), BenchError> {
         self.inputs.clear();
         for wanted in &self.input_names {
-            let (_, value) = inputs
-                .iter()
-                .find(|(name, _)| name == wanted)
-                .ok_or_else(|| failed(NAME, format!("no value for input {wanted}")))?;
+            let value = given(inputs, wanted).map_err(|error| failed(NAME, error))?;
             self.inputs.push(tensor(value)?.into_tvalue());
         }
         Ok(())

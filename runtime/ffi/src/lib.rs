@@ -45,7 +45,7 @@ mod types;
 use core::ffi::{c_char, c_void};
 use core::ops::Range;
 
-use lads_core::{Decision, Instruction, Intervention, Policy, Tick};
+use lads_core::{Contract, Decision, Element, Instruction, Intervention, Policy, Tick};
 
 use crate::handle::Handle;
 use crate::memory::{addresses, apart, check, get, give, read, zeroed};
@@ -111,6 +111,24 @@ pub unsafe extern "C" fn lads_policy_contract(
     status(unsafe { handle::policy(policy).and_then(|p| give(contract, LadsContract::of(p))) })
 }
 
+/// Tells about the element that `find` finds in the contract.
+///
+/// # Safety
+/// As `lads_policy_contract`.
+unsafe fn tell(
+    policy: *const LadsPolicy,
+    element: *mut LadsElement,
+    find: impl FnOnce(Contract<'static>) -> Option<Element<'static>>,
+) -> Status {
+    // SAFETY: the caller guarantees both.
+    status(unsafe {
+        handle::policy(policy).and_then(|policy| {
+            let found = find(policy.contract()).ok_or(Status::NoElement)?;
+            give(element, LadsElement::new(&found))
+        })
+    })
+}
+
 /// Tells about element `index` of an observation: name, unit, joint, limits.
 ///
 /// # Safety
@@ -122,13 +140,11 @@ pub unsafe extern "C" fn lads_policy_observation(
     element: *mut LadsElement,
 ) -> Status {
     // SAFETY: the caller guarantees both.
-    status(unsafe {
-        handle::policy(policy).and_then(|policy| {
-            let mut all = policy.contract().observations();
-            let found = all.nth(index).ok_or(Status::NoElement)?;
-            give(element, LadsElement::new(&found))
+    unsafe {
+        tell(policy, element, |contract| {
+            contract.observations().nth(index)
         })
-    })
+    }
 }
 
 /// Tells about element `index` of an action: name, unit, joint, limits.
@@ -142,13 +158,7 @@ pub unsafe extern "C" fn lads_policy_action(
     element: *mut LadsElement,
 ) -> Status {
     // SAFETY: the caller guarantees both.
-    status(unsafe {
-        handle::policy(policy).and_then(|policy| {
-            let mut all = policy.contract().actions();
-            let found = all.nth(index).ok_or(Status::NoElement)?;
-            give(element, LadsElement::new(&found))
-        })
-    })
+    unsafe { tell(policy, element, |contract| contract.actions().nth(index)) }
 }
 
 /// Tells about an instruction that the policy knows, by its number.

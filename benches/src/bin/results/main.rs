@@ -6,8 +6,10 @@
 mod charts;
 mod cold;
 mod criterion;
+mod files;
 mod growth;
 mod machine;
+mod markdown;
 mod measure;
 mod page;
 mod regression;
@@ -145,7 +147,7 @@ const FOR_TAILS: usize = 2;
 /// An action that is further from the recorded one than this is not rounding.
 const BROKEN: f32 = 0.1;
 
-#[allow(clippy::too_many_lines, reason = "the order of the run, step by step")]
+#[expect(clippy::too_many_lines, reason = "the order of the run, step by step")]
 fn run(arguments: &Arguments) -> Result<(), BenchError> {
     let started = Instant::now();
     let effort = if arguments.quick {
@@ -237,7 +239,7 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
         Err(error) => (vec![], Some(error.to_string())),
     };
 
-    let measured = page::Measured {
+    let measured = files::Measured {
         machine: machine::describe(),
         field,
         preparation,
@@ -259,7 +261,7 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
     for warning in &changes.warnings {
         say(&format!("warning: {warning}"));
     }
-    page::write(&arguments.output, &measured, &rows, &changes)?;
+    files::write(&arguments.output, &measured, &rows, &changes)?;
     say(&format!(
         "{} in {:.0} s",
         arguments.output.join("RESULTS.md").display(),

@@ -1,170 +1,19 @@
-//! Writes RESULTS.md, results.json and the charts; every file as a whole or not at all.
+//! RESULTS.md: what was measured, in tables with a word on what each means.
 
 use std::fmt::Write as _;
-use std::path::Path;
 
-use lads_benches::BenchError;
-use lads_benches::contender::Kind;
 use lads_benches::stats::{Ratio, exponent};
-use serde_json::{Value, json};
+use serde_json::Value;
 
-use crate::charts::{Line, lines, tail};
-use crate::growth::{Point, Series};
-use crate::measure::{CONTEXT, RATE, Run};
+use crate::files::Measured;
+use crate::growth::Point;
+use crate::markdown::{list, number, plain, table, text};
+use crate::measure::CONTEXT;
 use crate::regression::Changes;
 use crate::rows::Row;
 
-/// Everything that was measured.
-pub struct Measured {
-    pub machine: Value,
-    pub field: Value,
-    pub preparation: Value,
-    pub cold: Value,
-    pub hot: Run,
-    pub paced_all: Run,
-    pub paced: Run,
-    pub loaded: Run,
-    pub contexts: Vec<Line>,
-    pub growth: Vec<Series>,
-    pub not_grown: Option<String>,
-    pub criterion: Vec<Value>,
-    pub quick: bool,
-    pub seconds: f64,
-}
-
-/// Writes all files.
-pub fn write(
-    folder: &Path,
-    measured: &Measured,
-    rows: &[Row],
-    changes: &Changes,
-) -> Result<(), BenchError> {
-    let charts = folder.join("charts");
-    std::fs::create_dir_all(&charts).map_err(|error| {
-        BenchError::new(charts.display(), error, "name a folder that can be written")
-    })?;
-    for (name, svg) in draw(measured) {
-        save(&charts.join(name), svg.as_bytes())?;
-    }
-    save(
-        &folder.join("results.json"),
-        format!("{:#}\n", as_json(measured, rows)).as_bytes(),
-    )?;
-    save(
-        &folder.join("RESULTS.md"),
-        page(measured, rows, changes).as_bytes(),
-    )
-}
-
-/// Beside the target first, then renamed.
-fn save(path: &Path, bytes: &[u8]) -> Result<(), BenchError> {
-    let temporary = path.with_extension("tmp");
-    std::fs::write(&temporary, bytes)
-        .and_then(|()| std::fs::rename(&temporary, path))
-        .map_err(|error| {
-            BenchError::new(path.display(), error, "name a folder that can be written")
-        })
-}
-
-fn as_json(measured: &Measured, rows: &[Row]) -> Value {
-    json!({
-        "machine": measured.machine,
-        "quick": measured.quick,
-        "seconds": measured.seconds,
-        "context_tokens": CONTEXT,
-        "rate_hz": RATE,
-        "rows": rows,
-        "contenders": measured.field,
-        "preparation": measured.preparation,
-        "first_steps": measured.cold,
-        "latency_us": {
-            "hot": measured.hot.rows(),
-            "paced_all": measured.paced_all.rows(),
-            "paced": measured.paced.rows(),
-            "paced_loaded": measured.loaded.rows(),
-        },
-        "context_growth_us": measured.contexts,
-        "network_growth": measured.growth,
-        "criterion": measured.criterion,
-    })
-}
-
-/// The charts by file name.
-fn draw(measured: &Measured) -> Vec<(&'static str, String)> {
-    let mut drawn = vec![];
-    for (file, kind, title) in [
-        ("paced-act.svg", Kind::Act, "low_level/act at 50 Hz"),
-        (
-            "paced-step.svg",
-            Kind::Ordinary,
-            "Ordinary control step at 50 Hz, 300 tokens",
-        ),
-    ] {
-        let run = &measured.paced;
-        let tails: Vec<Line> = run
-            .names
-            .iter()
-            .zip(&run.rounds)
-            .map(|(name, rounds)| {
-                let mut took: Vec<_> = rounds
-                    .of(kind)
-                    .map(|sample| sample.took as f64 / 1e3)
-                    .collect();
-                (name.clone(), tail(&mut took))
-            })
-            .collect();
-        drawn.push((
-            file,
-            lines(
-                title,
-                "latency [us]",
-                "share of calls that took longer",
-                &tails,
-                true,
-            ),
-        ));
-    }
-    let title = "Ordinary control step against the context, hot";
-    drawn.push((
-        "context.svg",
-        lines(
-            title,
-            "tokens in the context",
-            "p50 [us]",
-            &measured.contexts,
-            false,
-        ),
-    ));
-    let grown: Vec<Line> = measured
-        .growth
-        .iter()
-        .map(|series| {
-            let first = series
-                .points
-                .first()
-                .map_or((1.0, 1.0), |point| (point.value, point.ordinary[0]));
-            let relative = |point: &Point| (point.value / first.0, point.ordinary[0] / first.1);
-            (
-                series.name.clone(),
-                series.points.iter().map(relative).collect(),
-            )
-        })
-        .collect();
-    let title = "Ordinary control step against the network, hot, f32";
-    drawn.push((
-        "network.svg",
-        lines(
-            title,
-            "size, relative to the smallest",
-            "p50, relative",
-            &grown,
-            true,
-        ),
-    ));
-    drawn
-}
-
-fn page(measured: &Measured, rows: &[Row], changes: &Changes) -> String {
+/// The page.
+pub fn page(measured: &Measured, rows: &[Row], changes: &Changes) -> String {
     let mut page = String::new();
     let parts = [
         head(measured),
@@ -186,47 +35,6 @@ fn page(measured: &Measured, rows: &[Row], changes: &Changes) -> String {
     page.truncate(page.trim_end().len());
     page.push('\n');
     page
-}
-
-/// A table in Markdown; the first column is text, the others are numbers.
-fn table(header: &[&str], rows: impl Iterator<Item = Vec<String>>) -> String {
-    let mut text = format!(
-        "| {} |\n|---|{}\n",
-        header.join(" | "),
-        "---:|".repeat(header.len() - 1)
-    );
-    for row in rows {
-        let _ = writeln!(text, "| {} |", row.join(" | "));
-    }
-    text
-}
-
-fn text(value: &Value) -> String {
-    value.as_str().unwrap_or("?").to_owned()
-}
-
-fn number(value: &Value) -> String {
-    value.as_f64().map_or_else(|| "–".into(), plain)
-}
-
-/// Three significant digits or so.
-fn plain(x: f64) -> String {
-    match x.abs() {
-        size if size >= 100.0 => format!("{x:.0}"),
-        size if size >= 10.0 => format!("{x:.1}"),
-        size if size >= 0.1 => format!("{x:.2}"),
-        _ => format!("{x:.3}"),
-    }
-}
-
-fn list(value: &Value) -> String {
-    value
-        .as_array()
-        .into_iter()
-        .flatten()
-        .map(text)
-        .collect::<Vec<_>>()
-        .join(", ")
 }
 
 fn head(measured: &Measured) -> String {
@@ -355,8 +163,8 @@ fn latencies(measured: &Measured) -> String {
             let mut cells = vec![
                 format!(
                     "{}, {}",
-                    self::text(&row["contender"]),
-                    self::text(&row["kind"])
+                    crate::markdown::text(&row["contender"]),
+                    crate::markdown::text(&row["kind"])
                 ),
                 row["calls"].to_string(),
             ];
@@ -430,7 +238,11 @@ fn starts(measured: &Measured) -> String {
                 .as_f64()
                 .map_or_else(|| "–".into(), |ns| plain(ns / 1e3))
         };
-        vec![self::text(&e["name"]), us("first_ns"), us("again_ns")]
+        vec![
+            crate::markdown::text(&e["name"]),
+            us("first_ns"),
+            us("again_ns"),
+        ]
     };
     text.push_str("The first instruction and control step that a contender computes in the process, and the same again [us]:\n\n");
     text.push_str(&table(&["", "first", "again, p50"], entrants.map(row)));
@@ -442,7 +254,7 @@ fn starts(measured: &Measured) -> String {
     );
     let images = p["images"].as_array().into_iter().flatten().map(|image| {
         vec![
-            self::text(&image["weights"]),
+            crate::markdown::text(&image["weights"]),
             image["image_bytes"].to_string(),
             image["workspace_bytes"].to_string(),
             number(&image["open_ms"]["median"]),
@@ -586,7 +398,7 @@ fn benchmarks(found: &[Value]) -> String {
         "## Criterion\n\nMedians of `cargo bench` [us] with 95 % confidence intervals. *Roofline*: against a bare sweep over the same bytes, measured in the same group.\n\n",
     );
     let rows = found.iter().map(|row| {
-        let name = self::text(&row["name"]);
+        let name = crate::markdown::text(&row["name"]);
         let (us, bytes) = (
             row["median_us"].as_f64().unwrap_or(f64::NAN),
             row["bytes"].as_f64(),
@@ -621,8 +433,8 @@ fn contenders(measured: &Measured) -> String {
     let entrants = measured.field["entrants"].as_array().into_iter().flatten();
     let row = |e: &Value| {
         vec![
-            self::text(&e["name"]),
-            self::text(&e["detail"]),
+            crate::markdown::text(&e["name"]),
+            crate::markdown::text(&e["detail"]),
             e["largest_error"]
                 .as_f64()
                 .map_or_else(|| "–".into(), |x| format!("{x:.1e}")),
@@ -637,7 +449,7 @@ fn contenders(measured: &Measured) -> String {
         entrants.map(row),
     ));
     for absent in measured.field["absent"].as_array().into_iter().flatten() {
-        let _ = writeln!(text, "\nNot run: {}", self::text(absent));
+        let _ = writeln!(text, "\nNot run: {}", crate::markdown::text(absent));
     }
     text
 }

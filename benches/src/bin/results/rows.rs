@@ -5,8 +5,8 @@ use lads_benches::stats::{Ratio, Rounds, quantile};
 use serde::Serialize;
 use serde_json::Value;
 
+use crate::files::Measured;
 use crate::measure::{Run, ratio};
-use crate::page::Measured;
 
 /// One line of the table.
 #[derive(Debug, Clone, Serialize)]
@@ -108,7 +108,7 @@ fn number(id: &str, label: &str, value: &Value, target: Option<f64>, unit: &'sta
 const ORT: &str = "ONNX Runtime";
 
 /// All rows, in the order of the page.
-#[allow(clippy::too_many_lines, reason = "a list: every row of the page, once")]
+#[expect(clippy::too_many_lines, reason = "a list: every row of the page, once")]
 pub fn rows(measured: &Measured) -> Vec<Row> {
     let Measured {
         hot,
