@@ -146,7 +146,10 @@ impl Episode {
             context_steps: contract.context_steps(),
             observations: golden.steps().map(|(seen, _, _)| seen.to_vec()).collect(),
             recorded: recorded.collect(),
-            limits: contract.actions().map(|e| (e.min, e.max)).collect(),
+            limits: contract
+                .actions()
+                .map(|e| (e.limits.min, e.limits.max))
+                .collect(),
         })
     }
 

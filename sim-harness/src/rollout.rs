@@ -156,7 +156,8 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
     /// Joins a controller and an environment that were checked to fit (see [`crate::fit`]).
     pub fn new(controller: Controller<'a, 'm>, environment: &'e mut dyn Environment) -> Self {
         let actions = controller.policy().contract().actions();
-        let limits = actions.map(|element| (f64::from(element.min), f64::from(element.max)));
+        let limits =
+            actions.map(|element| (f64::from(element.limits.min), f64::from(element.limits.max)));
         let limits = limits.collect();
         let (observation_len, action_len) =
             (environment.observation_len(), environment.action_len());

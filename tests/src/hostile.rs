@@ -149,7 +149,7 @@ fn open_and_drive(bytes: &[u8]) {
     let middle = |min: f32, max: f32| min / 2.0 + max / 2.0;
     let observation: Vec<_> = contract
         .observations()
-        .map(|e| middle(e.min, e.max))
+        .map(|e| middle(e.limits.min, e.limits.max))
         .collect();
     let limits: Vec<_> = contract.actions().collect();
     let mut action = vec![0.0; contract.action_len()];
@@ -168,7 +168,7 @@ fn open_and_drive(bytes: &[u8]) {
             let inside = action
                 .iter()
                 .zip(&limits)
-                .all(|(x, e)| x.is_finite() && e.clamp(*x) == *x);
+                .all(|(x, e)| x.is_finite() && e.limits.clamp(*x) == *x);
             assert!(inside, "{action:?}");
             guarded.resume();
         }

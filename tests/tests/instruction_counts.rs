@@ -55,7 +55,7 @@ fn steps() {
         // Limits may be as wide as all numbers; a machine's are not.
         let observation: Vec<f32> = (policy.contract().observations())
             .map(|element| {
-                let (min, max) = (element.min.max(-10.0), element.max.min(10.0));
+                let (min, max) = (element.limits.min.max(-10.0), element.limits.max.min(10.0));
                 min + (max - min) * random()
             })
             .collect();

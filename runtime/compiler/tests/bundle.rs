@@ -121,7 +121,7 @@ fn image_says_what_the_contract_says() {
     }
     for (element, known) in got.observations().zip(&wanted.observation) {
         assert_eq!(
-            (element.name, element.min, element.max),
+            (element.name, element.limits.min, element.limits.max),
             (known.name.as_str(), known.min, known.max)
         );
     }
@@ -139,7 +139,7 @@ fn every_known_instruction_can_be_followed() {
         .contract()
         .observation
         .iter()
-        .map(|element| f32::midpoint(element.min, element.max))
+        .map(|element| f32::midpoint(element.limits.min, element.limits.max))
         .collect();
     let mut action = vec![0.0; bundle.contract().action.len()];
     for id in 0..bundle.contract().instructions.len() as u32 {

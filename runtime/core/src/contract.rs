@@ -32,15 +32,22 @@ pub struct Element<'a> {
     pub unit: &'a str,
     /// Joint that it belongs to; empty for none.
     pub joint: &'a str,
-    /// Smallest value in the contract, in the unit.
+    /// What the contract allows.
+    pub limits: Interval,
+}
+
+/// The smallest and the largest value of one element of an observation or an action, in its unit.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Interval {
+    /// The smallest value.
     pub min: f32,
-    /// Largest value in the contract, in the unit.
+    /// The largest value.
     pub max: f32,
 }
 
-impl Element<'_> {
+impl Interval {
     /// The value, or the limit beyond which it lies. What is not a number stays so.
-    pub fn clamp(&self, value: f32) -> f32 {
+    pub fn clamp(self, value: f32) -> f32 {
         // `f32::clamp` without its panic on limits in the wrong order, which a checked contract does not have; two selections and
         // no branch, so that a control step takes the same instructions whatever the action.
         let raised = if value < self.min { self.min } else { value };
@@ -311,8 +318,10 @@ impl<'a> Contract<'a> {
             name: self.text(record.name),
             unit: self.text(record.unit),
             joint: self.text(record.joint),
-            min: record.min,
-            max: record.max,
+            limits: Interval {
+                min: record.min,
+                max: record.max,
+            },
         })
     }
 
@@ -333,6 +342,16 @@ impl<'a> Contract<'a> {
         self.elements().skip(self.observation_len())
     }
 
+    /// The limits of the observation's elements. Reads no text, so it is what a control step looks at.
+    pub fn observation_limits(&self) -> impl Iterator<Item = Interval> + use<'a> {
+        limits(self.elements).take(self.observation_len())
+    }
+
+    /// The limits of the action's elements, in the same way.
+    pub fn action_limits(&self) -> impl Iterator<Item = Interval> + use<'a> {
+        limits(self.elements).skip(self.observation_len())
+    }
+
     /// Element `i` of the observation.
     pub fn observation(&self, i: usize) -> Option<Element<'a>> {
         self.observations().nth(i)
@@ -341,37 +360,6 @@ impl<'a> Contract<'a> {
     /// Element `i` of the action.
     pub fn action(&self, i: usize) -> Option<Element<'a>> {
         self.actions().nth(i)
-    }
-
-    /// Name of element `i` of the observation.
-    pub fn observation_name(&self, i: usize) -> Option<&'a str> {
-        self.observation(i).map(|element| element.name)
-    }
-
-    /// Unit of element `i` of the observation.
-    pub fn observation_unit(&self, i: usize) -> Option<&'a str> {
-        self.observation(i).map(|element| element.unit)
-    }
-
-    /// Smallest and largest value of element `i` of the observation.
-    pub fn observation_limits(&self, i: usize) -> Option<(f32, f32)> {
-        self.observation(i)
-            .map(|element| (element.min, element.max))
-    }
-
-    /// Name of element `i` of the action.
-    pub fn action_name(&self, i: usize) -> Option<&'a str> {
-        self.action(i).map(|element| element.name)
-    }
-
-    /// Unit of element `i` of the action.
-    pub fn action_unit(&self, i: usize) -> Option<&'a str> {
-        self.action(i).map(|element| element.unit)
-    }
-
-    /// Smallest and largest value of element `i` of the action.
-    pub fn action_limits(&self, i: usize) -> Option<(f32, f32)> {
-        self.action(i).map(|element| (element.min, element.max))
     }
 
     /// How many instructions the policy knows.
@@ -410,6 +398,15 @@ impl<'a> Contract<'a> {
     pub fn instruction_text(&self, i: usize) -> Option<&'a str> {
         self.instruction(i).map(|known| known.text)
     }
+}
+
+/// The limits in records of elements: their last two words.
+fn limits(records: &[u32]) -> impl Iterator<Item = Interval> + use<'_> {
+    let (records, _) = records.as_chunks::<{ ElementRecord::WORDS }>();
+    records.iter().map(|&[.., min, max]| Interval {
+        min: f32::from_bits(min),
+        max: f32::from_bits(max),
+    })
 }
 
 /// Why a contract was refused.

@@ -19,7 +19,7 @@
 
 use lads_kernels::{Isa, assign};
 
-use crate::contract::Decision;
+use crate::contract::{Decision, Interval};
 use crate::decision::{Decider, PlanIndex, margin};
 use crate::errors::{ActError, EncodeError, InstructionError, StepError};
 use crate::exec::{ExecError, Inputs};
@@ -240,7 +240,7 @@ impl<'a, 'm> Controller<'a, 'm> {
             .action
             .iter_mut()
             .zip(action)
-            .zip(contract.actions())
+            .zip(contract.action_limits())
         {
             *to = limits.clamp(from);
         }
@@ -418,13 +418,12 @@ impl<'a, 'm> Controller<'a, 'm> {
                 needed,
             });
         }
-        for (index, (&value, limits)) in observation.iter().zip(contract.observations()).enumerate()
-        {
+        let limits = contract.observation_limits();
+        for (index, (&value, Interval { min, max })) in observation.iter().zip(limits).enumerate() {
             if !value.is_finite() {
                 return Err(StepError::NotFinite { index });
             }
-            if value < limits.min || value > limits.max {
-                let (min, max) = (limits.min, limits.max);
+            if value < min || value > max {
                 return Err(StepError::OutOfLimits {
                     index,
                     value,

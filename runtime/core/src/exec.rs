@@ -134,12 +134,9 @@ impl Machine<'_> {
             match place {
                 Place::Span(span) => {
                     let to = self.arena.get_mut(range(span)).ok_or(ExecError::Span)?;
-                    let from = inputs
-                        .slice(port)
-                        .iter()
-                        .copied()
-                        .chain(core::iter::repeat(0.0));
-                    to.iter_mut().zip(from).for_each(|(to, from)| *to = from);
+                    let from = inputs.slice(port);
+                    kernels::assign(to, from);
+                    to.get_mut(from.len()..).unwrap_or(&mut []).fill(0.0);
                 }
                 Place::Int(slot) => self.set(slot, inputs.int(port)),
             }

@@ -69,7 +69,9 @@ mod self_test;
 mod workspace;
 
 pub use check::Fault;
-pub use contract::{Contract, ContractError, Decision, Element, KnownInstruction, Network};
+pub use contract::{
+    Contract, ContractError, Decision, Element, Interval, KnownInstruction, Network,
+};
 pub use controller::{Controller, Instruction, StepReport};
 pub use decision::PlanIndex;
 pub use errors::{ActError, EncodeError, InstructionError, StepError};

@@ -77,7 +77,8 @@ pub(crate) fn act(
         .run(program, policy.weights(), 0, &inputs)
         .map_err(Fault::Program)?;
     take_finite(machine.output(program, Port::Action), bank.action)?;
-    for (action, limits) in bank.action.iter_mut().zip(policy.contract().actions()) {
+    let limits = policy.contract().action_limits();
+    for (action, limits) in bank.action.iter_mut().zip(limits) {
         *action = limits.clamp(*action);
     }
     Ok(())

@@ -260,7 +260,7 @@ fn refused_input_leaves_the_controller_as_it_was() {
                 refused(&[0.0, 0.0, f32::INFINITY]),
                 StepError::NotFinite { index: 2 }
             );
-            let outside = StepError::OutOfLimits {
+            let outside = StepError::OutOfInterval {
                 index: 2,
                 value: -3.5,
                 min: -3.0,
@@ -655,16 +655,29 @@ fn the_contract_says_what_was_written() {
         (3, 2, 3)
     );
     assert_eq!(contract.control_period_s(), 0.08);
-    assert_eq!(contract.observation_name(2), Some("observation2"));
-    assert_eq!(contract.observation_limits(0), Some((-3.0, 3.0)));
-    assert_eq!(contract.observation_name(3), None);
+    let element = contract.observation(2).expect("there are three");
+    assert_eq!((element.name, element.unit), ("observation2", "rad"));
+    assert_eq!(contract.observation(3), None);
+    let element = contract.action(1).expect("there are two");
+    assert_eq!((element.name, element.unit), ("action1", "rad"));
+    assert_eq!(contract.action(2), None);
+    // The two ways to the limits agree.
+    let limits = |elements: &mut dyn Iterator<Item = Element<'_>>| -> Vec<Interval> {
+        elements.map(|element| element.limits).collect()
+    };
+    let symmetric = |limit: f32| Interval {
+        min: -limit,
+        max: limit,
+    };
+    assert_eq!(limits(&mut contract.observations()), [symmetric(3.0); 3]);
     assert_eq!(
-        (contract.action_name(1), contract.action_unit(1)),
-        (Some("action1"), Some("rad"))
+        contract.observation_limits().collect::<Vec<_>>(),
+        [symmetric(3.0); 3]
     );
+    assert_eq!(limits(&mut contract.actions()), [symmetric(1.0); 2]);
     assert_eq!(
-        (contract.action_limits(0), contract.action_limits(2)),
-        (Some((-1.0, 1.0)), None)
+        contract.action_limits().collect::<Vec<_>>(),
+        [symmetric(1.0); 2]
     );
     assert_eq!(
         (contract.instruction_count(), contract.instruction_id(1)),

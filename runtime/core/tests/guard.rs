@@ -460,7 +460,7 @@ proptest! {
         };
         let mut bounds: Vec<[f32; 2]> = Vec::new();
         for (element, (&low, &high)) in image().policy().contract().actions().zip(min.iter().zip(&max)) {
-            bounds.push([element.min.max(low), element.max.min(high)]);
+            bounds.push([element.limits.min.max(low), element.limits.max.min(high)]);
         }
         let run = |guarded: &mut GuardedController| -> Result<(), TestCaseError> {
             let mut last = [0.0_f32; 2];

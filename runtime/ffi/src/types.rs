@@ -133,8 +133,8 @@ impl LadsElement {
             name: LadsText::new(element.name),
             unit: LadsText::new(element.unit),
             joint: LadsText::new(element.joint),
-            min: element.min,
-            max: element.max,
+            min: element.limits.min,
+            max: element.limits.max,
         }
     }
 }

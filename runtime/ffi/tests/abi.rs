@@ -220,7 +220,7 @@ fn the_contract_is_the_policys() {
                 [a.name, a.unit, a.joint].map(|t| t.as_str()),
                 [b.name, b.unit, b.joint]
             );
-            assert_eq!([a.min, a.max], [b.min, b.max]);
+            assert_eq!([a.min, a.max], [b.limits.min, b.limits.max]);
         };
         for (i, element) in contract.observations().enumerate() {
             same(

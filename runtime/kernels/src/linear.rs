@@ -13,6 +13,7 @@
 //! panel in parts. Each output is one sum in the order of `k`, then the scale, then the bias, whatever the number of rows or parts.
 
 use crate::dispatch::{Isa, Kernel};
+use crate::elementwise::assign;
 use crate::lanes::{Block, LANES};
 use crate::math;
 use crate::simd::Simd;
@@ -65,19 +66,19 @@ pub enum Activation {
 
 impl Activation {
     #[inline(always)]
-    fn apply(self, block: &mut Block) {
-        #[inline(always)]
-        fn each(block: &mut Block, f: impl Fn(f32) -> f32) {
-            for x in block {
-                *x = f(*x);
-            }
-        }
+    fn apply<S: Simd>(self, simd: S, x: S::V) -> S::V {
+        let each = |f: fn(f32) -> f32| {
+            let mut block = [0.0; LANES];
+            simd.store(x, &mut block);
+            block = block.map(f);
+            simd.load(&block)
+        };
         match self {
-            Self::None => {}
-            Self::Relu => each(block, math::relu),
-            Self::LeakyRelu(alpha) => each(block, |x| math::leaky_relu(x, alpha)),
-            Self::Tanh => each(block, math::tanh),
-            Self::Sigmoid => each(block, math::sigmoid),
+            Self::None => x,
+            Self::Relu => simd.where_negative(x, simd.splat(0.0)),
+            Self::LeakyRelu(alpha) => simd.where_negative(x, simd.mul(simd.splat(alpha), x)),
+            Self::Tanh => each(math::tanh),
+            Self::Sigmoid => each(math::sigmoid),
         }
     }
 }
@@ -114,23 +115,39 @@ impl Linear<'_> {
         }
     }
 
-    /// Scale, bias, activation and store of sixteen outputs from `first` on.
+    /// Scale, bias, activation and store of sixteen outputs from `first` on, or of as many as there are.
     #[inline(always)]
-    fn finish(&self, mut sums: Block, first: usize, y: &mut [f32]) {
+    fn finish<S: Simd>(&self, simd: S, sums: &Block, first: usize, y: &mut [f32]) {
+        let mut spare = [0.0; LANES];
+        let mut v = simd.load(sums);
         if let Panels::Int8 { scales, .. } = self.w {
-            for (sum, &scale) in sums.iter_mut().zip(scales.get(first..).unwrap_or(&[])) {
-                *sum *= scale;
-            }
+            v = simd.mul(v, simd.load(block(scales, first, &mut spare)));
         }
-        for (sum, &bias) in sums.iter_mut().zip(self.bias.get(first..).unwrap_or(&[])) {
-            *sum += bias;
+        v = simd.add(v, simd.load(block(self.bias, first, &mut spare)));
+        v = self.activation.apply(simd, v);
+        if self.accumulate {
+            v = simd.add(simd.load(block(y, first, &mut spare)), v);
         }
-        self.activation.apply(&mut sums);
         let y = y.get_mut(first..).unwrap_or(&mut []);
-        for (y, &sum) in y.iter_mut().zip(&sums) {
-            *y = if self.accumulate { *y + sum } else { sum };
+        if let Some(y) = y.first_chunk_mut() {
+            simd.store(v, y);
+        } else {
+            simd.store(v, &mut spare);
+            assign(y, &spare);
         }
     }
+}
+
+/// The sixteen elements from `first` on; what is missing is zero, in `spare`.
+#[inline(always)]
+fn block<'b>(x: &'b [f32], first: usize, spare: &'b mut Block) -> &'b Block {
+    let x = x.get(first..).unwrap_or(&[]);
+    if let Some(block) = x.first_chunk() {
+        return block;
+    }
+    *spare = [0.0; LANES];
+    assign(spare, x);
+    spare
 }
 
 /// A layer at work. `NARROW` is [`Kernel::NARROW`].
@@ -150,25 +167,32 @@ impl<W: Stored, const NARROW: bool> Kernel for Rows<'_, W, NARROW> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let (k, n) = (self.layer.k, self.layer.n);
+        let mut sums = [[[0.0; LANES]; PANEL_BLOCKS]; 2];
         for first in (0..n).step_by(PANEL) {
             let blocks = (n - first).div_ceil(LANES).min(PANEL_BLOCKS);
             let start = first * k;
             let w = self.w.get(start..start + blocks * LANES * k).unwrap_or(&[]);
-            let xs = self.x.chunks((2 * k).max(1));
-            let ys = self.y.chunks_mut((2 * n).max(1));
-            for (x, y) in xs.zip(ys) {
-                let mut sums = [[[0.0; LANES]; PANEL_BLOCKS]; 2];
-                match x.split_at_checked(k) {
-                    Some((x0, x1)) if x1.len() == k => {
-                        panel::<S, W, 2>(simd, w, blocks, [x0, x1], &mut sums);
-                    }
-                    Some((x, _)) => panel::<S, W, 1>(simd, w, blocks, [x], &mut sums),
-                    None => return,
-                }
+            let (mut x, mut y) = (self.x, &mut *self.y);
+            while let Some((x0, rest)) = x.split_at_checked(k)
+                && let Some((y0, others)) = y.split_at_mut_checked(n)
+            {
+                let second = if let Some((x1, rest)) = rest.split_at_checked(k)
+                    && let Some((y1, others)) = others.split_at_mut_checked(n)
+                {
+                    panel::<S, W, 2>(simd, w, blocks, [x0, x1], &mut sums);
+                    (x, y) = (rest, others);
+                    y1
+                } else {
+                    panel::<S, W, 1>(simd, w, blocks, [x0], &mut sums);
+                    (x, y) = (&[], &mut []);
+                    &mut []
+                };
                 // Written once for all widths and numbers of rows: activations are long.
-                for (y, sums) in y.chunks_exact_mut(n.max(1)).zip(sums) {
-                    for (block, sums) in sums.into_iter().take(blocks).enumerate() {
-                        self.layer.finish(sums, first + block * LANES, y);
+                for (y, sums) in [y0, second].into_iter().zip(&sums) {
+                    if !y.is_empty() {
+                        for (block, sums) in sums.iter().enumerate().take(blocks) {
+                            self.layer.finish(simd, sums, first + block * LANES, y);
+                        }
                     }
                 }
             }

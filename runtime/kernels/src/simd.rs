@@ -25,6 +25,10 @@ pub(crate) trait Simd: Copy {
     fn load(self, from: &Block) -> Self::V;
     /// Back to memory.
     fn store(self, v: Self::V, to: &mut Block);
+    /// `a + b`
+    fn add(self, a: Self::V, b: Self::V) -> Self::V;
+    /// `other` in the lanes where `x < 0`, else `x`.
+    fn where_negative(self, x: Self::V, other: Self::V) -> Self::V;
     /// `a * b`
     fn mul(self, a: Self::V, b: Self::V) -> Self::V;
     /// `sum + a * b`, rounded twice: never fused.
@@ -62,6 +66,22 @@ impl Simd for Portable {
     }
 
     #[inline(always)]
+    fn add(self, mut a: Block, b: Block) -> Block {
+        for (a, b) in a.iter_mut().zip(b) {
+            *a += b;
+        }
+        a
+    }
+
+    #[inline(always)]
+    fn where_negative(self, mut x: Block, other: Block) -> Block {
+        for (x, other) in x.iter_mut().zip(other) {
+            *x = if *x < 0.0 { other } else { *x };
+        }
+        x
+    }
+
+    #[inline(always)]
     fn mul(self, mut a: Block, b: Block) -> Block {
         for (a, b) in a.iter_mut().zip(b) {
             *a *= b;
@@ -96,12 +116,14 @@ impl Simd for Portable {
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod x86_64 {
     use core::arch::x86_64::{
-        __m256, __m512, _mm_loadl_epi64, _mm_loadu_si128, _mm256_add_ps, _mm256_castsi256_ps,
-        _mm256_cvtepi8_epi32, _mm256_cvtepi32_ps, _mm256_cvtepu16_epi32, _mm256_cvtph_ps,
-        _mm256_loadu_ps, _mm256_loadu_si256, _mm256_mul_ps, _mm256_set1_ps, _mm256_slli_epi32,
-        _mm256_storeu_ps, _mm512_add_ps, _mm512_castsi512_ps, _mm512_cvtepi8_epi32,
-        _mm512_cvtepi32_ps, _mm512_cvtepu16_epi32, _mm512_cvtph_ps, _mm512_loadu_ps, _mm512_mul_ps,
-        _mm512_set1_ps, _mm512_slli_epi32, _mm512_storeu_ps,
+        __m256, __m512, _CMP_LT_OQ, _mm_loadl_epi64, _mm_loadu_si128, _mm256_add_ps,
+        _mm256_blendv_ps, _mm256_castsi256_ps, _mm256_cmp_ps, _mm256_cvtepi8_epi32,
+        _mm256_cvtepi32_ps, _mm256_cvtepu16_epi32, _mm256_cvtph_ps, _mm256_loadu_ps,
+        _mm256_loadu_si256, _mm256_mul_ps, _mm256_set1_ps, _mm256_setzero_ps, _mm256_slli_epi32,
+        _mm256_storeu_ps, _mm512_add_ps, _mm512_castsi512_ps, _mm512_cmp_ps_mask,
+        _mm512_cvtepi8_epi32, _mm512_cvtepi32_ps, _mm512_cvtepu16_epi32, _mm512_cvtph_ps,
+        _mm512_loadu_ps, _mm512_mask_blend_ps, _mm512_mul_ps, _mm512_set1_ps, _mm512_setzero_ps,
+        _mm512_slli_epi32, _mm512_storeu_ps,
     };
 
     use super::Simd;
@@ -166,6 +188,25 @@ pub(crate) mod x86_64 {
         }
 
         #[inline(always)]
+        fn add(self, a: Self::V, b: Self::V) -> Self::V {
+            // SAFETY: whoever made `self` has AVX2.
+            unsafe { [_mm256_add_ps(a[0], b[0]), _mm256_add_ps(a[1], b[1])] }
+        }
+
+        #[inline(always)]
+        fn where_negative(self, [low, high]: Self::V, other: Self::V) -> Self::V {
+            // SAFETY: whoever made `self` has AVX2.
+            unsafe {
+                let zero = _mm256_setzero_ps();
+                let negative = |x| _mm256_cmp_ps::<_CMP_LT_OQ>(x, zero);
+                [
+                    _mm256_blendv_ps(low, other[0], negative(low)),
+                    _mm256_blendv_ps(high, other[1], negative(high)),
+                ]
+            }
+        }
+
+        #[inline(always)]
         fn mul(self, a: Self::V, b: Self::V) -> Self::V {
             // SAFETY: whoever made `self` has AVX2.
             unsafe { [_mm256_mul_ps(a[0], b[0]), _mm256_mul_ps(a[1], b[1])] }
@@ -173,9 +214,7 @@ pub(crate) mod x86_64 {
 
         #[inline(always)]
         fn add_product(self, sum: Self::V, a: Self::V, b: Self::V) -> Self::V {
-            let [low, high] = self.mul(a, b);
-            // SAFETY: whoever made `self` has AVX2.
-            unsafe { [_mm256_add_ps(sum[0], low), _mm256_add_ps(sum[1], high)] }
+            self.add(sum, self.mul(a, b))
         }
 
         #[inline(always)]
@@ -238,6 +277,21 @@ pub(crate) mod x86_64 {
         }
 
         #[inline(always)]
+        fn add(self, a: Self::V, b: Self::V) -> Self::V {
+            // SAFETY: whoever made `self` has AVX-512.
+            unsafe { _mm512_add_ps(a, b) }
+        }
+
+        #[inline(always)]
+        fn where_negative(self, x: Self::V, other: Self::V) -> Self::V {
+            // SAFETY: whoever made `self` has AVX-512.
+            unsafe {
+                let negative = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(x, _mm512_setzero_ps());
+                _mm512_mask_blend_ps(negative, x, other)
+            }
+        }
+
+        #[inline(always)]
         fn mul(self, a: Self::V, b: Self::V) -> Self::V {
             // SAFETY: whoever made `self` has AVX-512.
             unsafe { _mm512_mul_ps(a, b) }
@@ -245,8 +299,7 @@ pub(crate) mod x86_64 {
 
         #[inline(always)]
         fn add_product(self, sum: Self::V, a: Self::V, b: Self::V) -> Self::V {
-            // SAFETY: whoever made `self` has AVX-512.
-            unsafe { _mm512_add_ps(sum, _mm512_mul_ps(a, b)) }
+            self.add(sum, self.mul(a, b))
         }
 
         #[inline(always)]

@@ -6,7 +6,7 @@
 use lads_kernels::assign;
 
 use super::GuardError;
-use crate::contract::{Contract, Element};
+use crate::contract::{Contract, Interval};
 
 /// What a guard keeps an action inside of; each list has one value per element of the action.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -50,7 +50,7 @@ pub(super) struct Limiter<'m> {
 }
 
 impl<'m> Limiter<'m> {
-    /// Elements of memory for actions of `action_len` elements.
+    /// Intervals of memory for actions of `action_len` elements.
     pub const fn memory_len(action_len: usize) -> usize {
         action_len.saturating_mul(5)
     }
@@ -98,13 +98,13 @@ impl<'m> Limiter<'m> {
             .zip(self.max.iter_mut())
             .zip(self.max_step.iter_mut())
             .zip(self.safe.iter_mut());
-        for ((index, element), (((to_min, to_max), to_step), to_safe)) in
-            contract.actions().enumerate().zip(places)
+        for ((index, allowed), (((to_min, to_max), to_step), to_safe)) in
+            contract.action_limits().enumerate().zip(places)
         {
             let [min, max] = [at(limits.min, index), at(limits.max, index)];
             let given = [min, max].into_iter().flatten().all(f32::is_finite);
-            let min = min.map_or(element.min, |min| min.max(element.min));
-            let max = max.map_or(element.max, |max| max.min(element.max));
+            let min = min.map_or(allowed.min, |min| min.max(allowed.min));
+            let max = max.map_or(allowed.max, |max| max.min(allowed.max));
             if !given || min > max {
                 return Err(GuardError::Limits { index });
             }
@@ -112,11 +112,7 @@ impl<'m> Limiter<'m> {
             if rate.is_some_and(|rate| !rate.is_finite() || rate <= 0.0) {
                 return Err(GuardError::Rate { index });
             }
-            let inside = Element {
-                min,
-                max,
-                ..element
-            };
+            let inside = Interval { min, max };
             let safe = at(limits.safe_action, index).unwrap_or_else(|| inside.clamp(0.0));
             if !safe.is_finite() || inside.clamp(safe) != safe {
                 return Err(GuardError::SafeAction { index });

@@ -52,7 +52,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         .actions()
         .map(|action| limits.iter().position(|state| state.joint == action.joint))
         .collect();
-    let mut observation: Vec<f32> = limits.iter().map(|limit| limit.clamp(0.0)).collect();
+    let mut observation: Vec<f32> = limits.iter().map(|limit| limit.limits.clamp(0.0)).collect();
     let mut action = vec![0.0; contract.action_len()];
 
     let period = Duration::from_secs_f32(contract.control_period_s());
@@ -75,7 +75,9 @@ fn main() -> Result<(), Box<dyn Error>> {
             let joint =
                 index.and_then(|index| Some((observation.get_mut(index)?, limits.get(index)?)));
             if let Some((position, limit)) = joint {
-                *position = limit.clamp(*position + velocity * contract.control_period_s());
+                *position = limit
+                    .limits
+                    .clamp(*position + velocity * contract.control_period_s());
             }
         }
     }
