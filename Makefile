@@ -9,11 +9,13 @@ ARGS   ?=
 ENV    ?= kitchen
 COLLECT_kitchen := --episodes-per-instruction 50
 COLLECT_lorel   := --episodes 50000
+# What lints and tests cover; one set, because each set is a build of its own.
+FEATURES := lads-sim/report,lads-sim/record
 RUNTIME := -p lads-core -p lads-kernels -p lads-compiler -p lads-ffi -p lads-cli
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report verify test setup lint test-runtime test-sim test-exporter collect train export reference install bench clean help
+.PHONY: run report record verify test setup lint test-runtime test-sim test-exporter collect train export reference install bench clean help
 
 ## run: the shipped policy over the paper's seen and unseen instructions
 run: setup
@@ -21,7 +23,11 @@ run: setup
 
 ## report: the same with charts, as one HTML page
 report: setup
-	cargo run --release -p lads-sim --features report --bin lads-run -- --model $(MODEL) --report report.html $(ARGS)
+	cargo run --release -p lads-sim --features report,record --bin lads-run -- --model $(MODEL) --report report.html $(ARGS)
+
+## record: the first episode of an instruction as episode.gif; ARGS="--instruction kbls"
+record: setup
+	cargo run --release -p lads-sim --features report,record --bin lads-run -- --model $(MODEL) --episodes 1 --record episode.gif $(ARGS)
 
 ## test: format, lints, documentation, all Rust tests, the exporter's tests
 test: setup lint test-runtime test-sim test-exporter
@@ -32,15 +38,15 @@ setup:
 
 lint: setup
 	cargo fmt --all --check
-	cargo clippy --workspace --all-targets --features lads-sim/report -- -D warnings
-	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --features lads-sim/report --no-deps --quiet
+	cargo clippy --workspace --all-targets --features $(FEATURES) -- -D warnings
+	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --features $(FEATURES) --no-deps --quiet
 
 ## test-runtime: the runtime alone; needs neither MuJoCo nor Python
 test-runtime:
 	cargo test $(RUNTIME)
 
 test-sim: setup
-	cargo test --features lads-sim/report -p lads-sim -p lads-tests -p lads-benches
+	cargo test --features $(FEATURES) -p lads-sim -p lads-tests -p lads-benches
 
 # The stamp makes the environment anew whenever the package's pins change.
 $(VENV)/stamp: exporter/pyproject.toml

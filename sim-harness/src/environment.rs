@@ -3,7 +3,36 @@
 //! Invariants of every implementation: the same [`EpisodeSeed`] and actions give the same observations, bit for bit, on one machine;
 //! completions are latched (a sub-task that is undone later still counts) and chronological; an action that is refused changes nothing.
 
+use std::sync::Arc;
+
+use mujoco_rs::wrappers::{MjData, MjModel};
 use thiserror::Error;
+
+/// What there is to look at, for pictures.
+pub struct Stage<'e> {
+    /// The simulator's state; drawing it changes nothing that the next control step depends on.
+    pub data: &'e mut MjData<Arc<MjModel>>,
+    /// From where.
+    pub view: View,
+}
+
+/// Where a camera stands.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum View {
+    /// A camera of the scene, by its name.
+    Camera(&'static str),
+    /// A free camera.
+    Free {
+        /// The point that it looks at, in metres in the world's frame.
+        look_at: [f64; 3],
+        /// Its distance from there, in metres.
+        distance: f64,
+        /// Degrees around the vertical.
+        azimuth: f64,
+        /// Degrees above the horizon.
+        elevation: f64,
+    },
+}
 
 /// Names one episode's random stream: the run's seed, the index of the instruction, the number of the episode.
 ///
@@ -97,6 +126,11 @@ pub trait Environment: Send {
 
     /// Where the gripper is, in metres in the world's frame, for pictures; `None` in an environment without one.
     fn gripper(&self) -> Option<[f64; 3]> {
+        None
+    }
+
+    /// What there is to look at; `None` in an environment without a simulator.
+    fn stage(&mut self) -> Option<Stage<'_>> {
         None
     }
 

@@ -11,6 +11,8 @@ pub mod environment;
 pub mod evaluate;
 pub mod expert;
 pub mod faults;
+#[cfg(feature = "record")]
+pub mod film;
 pub mod fit;
 pub mod instructions;
 pub mod kitchen;

@@ -14,7 +14,9 @@ use mujoco_rs::wrappers::{MjData, MjModel};
 use thiserror::Error;
 
 use crate::assets::{MissingAssets, asset};
-use crate::environment::{ActionError, Completion, Environment, EpisodeSeed, check_action};
+use crate::environment::{
+    ActionError, Completion, Environment, EpisodeSeed, Stage, View, check_action,
+};
 use crate::random::Stream;
 pub use spec::Noise;
 use spec::{
@@ -30,6 +32,14 @@ pub const VERSION: &str = "1";
 
 /// The site that stands for the gripper in pictures.
 const GRIPPER: &str = "end_effector";
+
+/// FrankaKitchen-v1's own camera.
+const VIEW: View = View::Free {
+    look_at: [-0.2, 0.5, 2.0],
+    distance: 2.2,
+    azimuth: 70.0,
+    elevation: -35.0,
+};
 
 const SCENE: &str = "assets/kitchen_franka/kitchen_assets/kitchen_env_model.xml";
 
@@ -216,6 +226,13 @@ impl Environment for Kitchen {
 
     fn gripper(&self) -> Option<[f64; 3]> {
         self.data.site_xpos().get(self.gripper).copied()
+    }
+
+    fn stage(&mut self) -> Option<Stage<'_>> {
+        Some(Stage {
+            data: &mut self.data,
+            view: VIEW,
+        })
     }
 }
 

@@ -19,7 +19,9 @@ use mujoco_rs::wrappers::{MjData, MjModel, MjSpec};
 use thiserror::Error;
 
 use crate::assets::{MissingAssets, asset};
-use crate::environment::{ActionError, Completion, Environment, EpisodeSeed, check_action};
+use crate::environment::{
+    ActionError, Completion, Environment, EpisodeSeed, Stage, View, check_action,
+};
 use crate::random::Stream;
 use spec::{
     ACTION_LEN, ACTION_NAMES, ACTION_SCALE, BLACK_MUG, COMPOSITE, CONTROL_PERIOD_S, DRAWER,
@@ -41,6 +43,8 @@ pub const POSTURES: usize = 256;
 
 /// The body that stands for the gripper in pictures.
 const HAND: &str = "hand";
+/// The camera of LOReL's images.
+const VIEW: View = View::Camera("cam0");
 const SCENE: &str = include_str!("scene.xml");
 /// Folder of the scene's assets in the vendor folder, and one file of it.
 const ASSETS: &str = "assets/metaworld";
@@ -319,6 +323,13 @@ impl Environment for Lorel {
 
     fn gripper(&self) -> Option<[f64; 3]> {
         self.data.xpos().get(self.hand).copied()
+    }
+
+    fn stage(&mut self) -> Option<Stage<'_>> {
+        Some(Stage {
+            data: &mut self.data,
+            view: VIEW,
+        })
     }
 
     fn succeeded(&self, commanded: &[usize]) -> bool {

@@ -31,7 +31,7 @@ pub struct Arguments {
     #[arg(long)]
     pub sample: bool,
     /// Draw uniform random actions instead of asking the policy: the floor that it is measured against
-    #[arg(long, conflicts_with_all = ["sample", "log", "plans", "monitor", "report", "sweep"])]
+    #[arg(long, conflicts_with_all = ["sample", "log", "plans", "monitor", "report", "record", "sweep"])]
     pub uniform: bool,
     /// Write the results to this file as JSON (its form: sim-harness/results.schema.json); of --encode, the plans
     #[arg(long)]
@@ -41,7 +41,7 @@ pub struct Arguments {
     pub isa: Option<IsaName>,
     /// Run the episodes of a reference and say whether the policy is the reference's: exit code 0 EQUIVALENT, 1 DIFFERENT, 3 INCONCLUSIVE.
     /// Left out, REFERENCE is the file beside the model that ends in .reference.json
-    #[arg(long, value_name = "REFERENCE", num_args = 0..=1, conflicts_with_all = ["seed", "noise", "sample", "uniform", "json", "report", "log", "replay", "encode", "plans", "monitor", "sweep", "delay_steps", "drop_rate", "noise_scale", "action_lag"])]
+    #[arg(long, value_name = "REFERENCE", num_args = 0..=1, conflicts_with_all = ["seed", "noise", "sample", "uniform", "json", "report", "record", "log", "replay", "encode", "plans", "monitor", "sweep", "delay_steps", "drop_rate", "noise_scale", "action_lag"])]
     #[expect(
         clippy::option_option,
         reason = "clap's form of an option whose value may be left out"
@@ -75,11 +75,18 @@ pub struct RecordingArguments {
     /// Record every control step into this MCAP file, which Foxglove opens
     #[arg(long)]
     pub log: Option<PathBuf>,
+    /// Film an episode of the first instruction that runs into this file: .gif, .mp4 (by ffmpeg), or with a slash at its end a folder of
+    /// PNG; needs the cargo feature `record`, and EGL, which needs no display
+    #[arg(long, value_name = "OUT")]
+    pub record: Option<PathBuf>,
+    /// Which of its episodes, from 0
+    #[arg(long, value_name = "NUMBER", default_value_t = 0, requires = "record")]
+    pub record_episode: u32,
     /// Run nothing: compute the actions of a log again and name the first step that differs (exit code 1)
-    #[arg(long, value_name = "LOG", conflicts_with_all = ["log", "encode", "plans", "monitor", "json", "instruction", "report", "sweep"])]
+    #[arg(long, value_name = "LOG", conflicts_with_all = ["log", "encode", "plans", "monitor", "json", "instruction", "report", "record", "sweep"])]
     pub replay: Option<PathBuf>,
     /// Run nothing: print the plans that the trajectory encoder sees in a log, in the form that --plans takes
-    #[arg(long, value_name = "LOG", conflicts_with_all = ["log", "plans", "monitor", "instruction", "report", "sweep"])]
+    #[arg(long, value_name = "LOG", conflicts_with_all = ["log", "plans", "monitor", "instruction", "report", "record", "sweep"])]
     pub encode: Option<PathBuf>,
     /// Run the low level alone on the plans in this file; an episode ends with its plans
     #[arg(long, value_name = "FILE")]
@@ -106,7 +113,7 @@ pub struct FaultArguments {
     #[arg(long, value_name = "STEPS", default_value_t = 0.0)]
     pub action_lag: f64,
     /// Run the benchmark once for each of several levels of each fault and print N-rate against them
-    #[arg(long, conflicts_with_all = ["log", "report", "plans", "monitor", "delay_steps", "drop_rate", "noise_scale", "action_lag"])]
+    #[arg(long, conflicts_with_all = ["log", "report", "record", "plans", "monitor", "delay_steps", "drop_rate", "noise_scale", "action_lag"])]
     pub sweep: bool,
 }
 

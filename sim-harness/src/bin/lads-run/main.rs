@@ -8,6 +8,7 @@
 
 mod arguments;
 mod end;
+mod record;
 mod recordings;
 mod report;
 mod sweep;
@@ -119,11 +120,7 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
         setup: Setup {
             faults: arguments.faults.faults(),
             plans: book.as_ref(),
-            traced: if files.log.is_some() || files.monitor || arguments.report.is_some() {
-                u32::MAX
-            } else {
-                0
-            },
+            traced: traced(arguments),
         },
     };
     if let Some(reference) = reference {
@@ -139,6 +136,7 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
             &stop,
         );
     }
+    let recording = record::prepare(files, &evaluation, &open)?;
     let bench = Bench {
         evaluation,
         open: &open,
@@ -149,7 +147,19 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
     if arguments.faults.sweep {
         return bench.sweep(arguments.json.as_deref());
     }
-    bench.rollouts(arguments)
+    bench.rollouts(arguments, recording)
+}
+
+/// How many episodes of each instruction keep their control steps.
+fn traced(arguments: &Arguments) -> u32 {
+    let files = &arguments.recordings;
+    if files.log.is_some() || files.monitor || arguments.report.is_some() {
+        u32::MAX
+    } else if files.record.is_some() {
+        files.record_episode.saturating_add(1)
+    } else {
+        0
+    }
 }
 
 /// Everything that was checked, ready to run.
@@ -191,7 +201,11 @@ impl Bench<'_> {
     }
 
     /// The benchmark, and all files about it that were asked for.
-    fn rollouts(&self, arguments: &Arguments) -> Result<ExitCode, End> {
+    fn rollouts(
+        &self,
+        arguments: &Arguments,
+        recording: Option<record::Recording>,
+    ) -> Result<ExitCode, End> {
         let (files, policy) = (&arguments.recordings, &self.evaluation.policy);
         let (mut results, evaluated) = self.run(self.evaluation.setup, "")?;
         if files.monitor {
@@ -199,6 +213,11 @@ impl Bench<'_> {
             results.plan_agreement = Some(
                 agreement.map_err(|error| refused(format!("--monitor: {error}; leave it out")))?,
             );
+        }
+        // Filming takes time and may be interrupted: nothing is written before.
+        let film = recording.map(|it| it.film(&self.evaluation, &evaluated.traces, self.stop));
+        if let Some(film) = film.transpose()? {
+            film.write()?;
         }
         if let Some(path) = &arguments.json {
             output::write_json(&results, path)
@@ -298,6 +317,7 @@ fn stop_on_interrupt() -> Result<Arc<AtomicBool>, End> {
 fn check_outputs(arguments: &Arguments) -> Result<(), End> {
     check_writable("--json", arguments.json.as_deref())?;
     report::check(arguments.report.as_deref())?;
+    record::check(&arguments.recordings)?;
     check_writable("--log", arguments.recordings.log.as_deref())?;
     for path in &arguments.certificate {
         check_writable("--certificate", Some(path))?;
@@ -367,10 +387,15 @@ fn decision(policy: &Policy<'_>, sample: bool) -> Decision {
 
 /// A progress bar over episodes; indicatif hides it where stderr is no terminal.
 fn progress(episodes: usize) -> ProgressBar {
-    let bar = ProgressBar::new(episodes as u64);
-    let style = ProgressStyle::with_template(
-        "{bar:40} {pos}/{len} episodes, {elapsed} elapsed, {eta} left {msg}",
-    );
+    progress_over(episodes, "episodes")
+}
+
+/// A progress bar over other things.
+fn progress_over(count: usize, things: &str) -> ProgressBar {
+    let bar = ProgressBar::new(count as u64);
+    let style = ProgressStyle::with_template(&format!(
+        "{{bar:40}} {{pos}}/{{len}} {things}, {{elapsed}} elapsed, {{eta}} left {{msg}}"
+    ));
     bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
     bar.enable_steady_tick(Duration::from_millis(200));
     bar

@@ -1,0 +1,188 @@
+//! `--record`.
+//!
+//! The place, ffmpeg and EGL are looked at before the first episode; filming follows after the last, and is renamed to its place at the end.
+
+#[cfg(feature = "record")]
+pub use with::{Recording, check, prepare};
+#[cfg(not(feature = "record"))]
+pub use without::{Recording, check, prepare};
+
+#[cfg(feature = "record")]
+mod with {
+    use std::fmt::Display;
+    use std::path::{Path, PathBuf};
+    use std::sync::atomic::AtomicBool;
+
+    use lads_sim::environment::Environment;
+    use lads_sim::evaluate::Evaluation;
+    use lads_sim::film::camera::Camera;
+    use lads_sim::film::file::{Finished, Form};
+    use lads_sim::film::{FilmError, PICTURE, Scene};
+    use lads_sim::registry::Opener;
+    use lads_sim::trace::Trace;
+
+    use crate::arguments::RecordingArguments;
+    use crate::end::{End, refused};
+    use crate::progress_over;
+
+    /// Ready to film.
+    pub struct Recording {
+        form: Form,
+        path: PathBuf,
+        episode: u32,
+        environment: Box<dyn Environment>,
+        camera: Camera,
+    }
+
+    /// Complete, but for its name.
+    pub struct Film {
+        finished: Finished,
+        path: PathBuf,
+    }
+
+    fn about(path: &Path, wrong: impl Display) -> End {
+        refused(format!("--record {}: {wrong}", path.display()))
+    }
+
+    fn failed(path: &Path, error: FilmError) -> End {
+        match error {
+            FilmError::Interrupted => End::Interrupted,
+            error => about(path, error),
+        }
+    }
+
+    /// Whether pictures could be written, before any work.
+    pub fn check(files: &RecordingArguments) -> Result<(), End> {
+        let Some(path) = &files.record else {
+            return Ok(());
+        };
+        Form::of(path).map(drop).map_err(|error| about(path, error))
+    }
+
+    /// Opens an environment and a camera in it; `None` without `--record`.
+    pub fn prepare(
+        files: &RecordingArguments,
+        evaluation: &Evaluation<'_>,
+        open: &Opener,
+    ) -> Result<Option<Recording>, End> {
+        let Some(path) = &files.record else {
+            return Ok(None);
+        };
+        let (episode, episodes) = (files.record_episode, evaluation.episodes);
+        if episode >= episodes {
+            return Err(refused(format!(
+                "--record-episode {episode}: there are {episodes} episodes, counted from 0; give more --episodes"
+            )));
+        }
+        let form = Form::of(path).map_err(|error| about(path, error))?;
+        let mut environment = open();
+        let camera = Camera::new(environment.as_mut(), PICTURE);
+        Ok(Some(Recording {
+            form,
+            path: path.clone(),
+            episode,
+            camera: camera.map_err(|error| failed(path, error))?,
+            environment,
+        }))
+    }
+
+    impl Recording {
+        /// Films the episode of the first instruction that ran.
+        pub fn film(
+            mut self,
+            evaluation: &Evaluation<'_>,
+            traces: &[Trace],
+            stop: &AtomicBool,
+        ) -> Result<Film, End> {
+            let filmed = evaluation.assignments.first().and_then(|assignment| {
+                let mut traces = traces.iter();
+                let trace = traces.find(|trace| {
+                    trace.instruction == assignment.instruction && trace.episode == self.episode
+                });
+                Some((assignment, trace?))
+            });
+            let Some((assignment, trace)) = filmed else {
+                return Err(about(&self.path, "no episode ran"));
+            };
+            let contract = evaluation.policy.contract();
+            let known = contract.instruction(assignment.instruction as usize);
+            let scene = Scene {
+                trace,
+                instruction: known.map_or("", |known| known.text),
+                commanded: &assignment.commanded,
+                seed: evaluation.seed,
+            };
+            let bar = progress_over(trace.steps.len() + 1, "pictures");
+            let finished = scene.film(
+                self.environment.as_mut(),
+                &mut self.camera,
+                (self.form, &self.path),
+                stop,
+                &|| bar.inc(1),
+            );
+            bar.finish_and_clear();
+            Ok(Film {
+                finished: finished.map_err(|error| failed(&self.path, error))?,
+                path: self.path,
+            })
+        }
+    }
+
+    impl Film {
+        /// Moves it to its place.
+        pub fn write(self) -> Result<(), End> {
+            let written = self.finished.persist(&self.path);
+            written.map_err(|error| failed(&self.path, error))
+        }
+    }
+}
+
+/// This program was built without pictures.
+#[cfg(not(feature = "record"))]
+mod without {
+    use std::sync::atomic::AtomicBool;
+
+    use lads_sim::evaluate::Evaluation;
+    use lads_sim::registry::Opener;
+    use lads_sim::trace::Trace;
+
+    use crate::arguments::RecordingArguments;
+    use crate::end::{End, refused};
+
+    /// There is none.
+    pub enum Recording {}
+
+    /// There is none.
+    pub enum Film {}
+
+    /// Refuses.
+    pub fn check(files: &RecordingArguments) -> Result<(), End> {
+        match &files.record {
+            None => Ok(()),
+            Some(_) => Err(refused(
+                "--record: this lads-run was built without pictures; build it with \"cargo build --release -p lads-sim --features record\"",
+            )),
+        }
+    }
+
+    /// None: [`check`] has refused.
+    pub fn prepare(
+        _: &RecordingArguments,
+        _: &Evaluation<'_>,
+        _: &Opener,
+    ) -> Result<Option<Recording>, End> {
+        Ok(None)
+    }
+
+    impl Recording {
+        pub fn film(self, _: &Evaluation<'_>, _: &[Trace], _: &AtomicBool) -> Result<Film, End> {
+            match self {}
+        }
+    }
+
+    impl Film {
+        pub fn write(self) -> Result<(), End> {
+            match self {}
+        }
+    }
+}

@@ -1,0 +1,188 @@
+//! Pictures of an episode, drawn after it ran.
+//!
+//! A film runs the executed actions of a [`Trace`] once more, in an environment of its own, and looks at every state on the way. So
+//! filming cannot change or slow down the rollout, and what is shown is what happened: a second run that ends elsewhere is refused.
+//! [`camera`] draws a state without a display, [`caption`] writes around it, [`file`](mod@file) makes it a GIF, a film or a folder of pictures.
+//! What can fail: a machine without EGL, an environment without a simulator, a file that cannot be written.
+
+pub mod camera;
+pub mod canvas;
+pub mod caption;
+pub mod file;
+mod gif;
+mod mp4;
+
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use thiserror::Error;
+
+use self::camera::Camera;
+use self::canvas::Canvas;
+use self::caption::Caption;
+use self::file::{Finished, Form, Sink, shown_s};
+use crate::environment::{ActionError, Environment, EpisodeSeed};
+use crate::trace::{Step, Trace};
+
+/// Why there are no pictures.
+#[derive(Debug, Error)]
+pub enum FilmError {
+    /// The environment has nothing to look at.
+    #[error("environment {0} has no simulator to look into")]
+    NoStage(&'static str),
+    /// The scene lacks the camera that its environment names.
+    #[error("the scene has no camera '{0}' (run \"make setup\" to restore the assets)")]
+    NoCamera(&'static str),
+    /// OpenGL without a display cannot be had.
+    #[error(
+        "pictures need OpenGL without a display, by EGL: {0}; install it (Debian: apt-get install libegl1 libgl1-mesa-dri)"
+    )]
+    NoEgl(String),
+    /// Drawing failed later on.
+    #[error("a picture cannot be drawn: {0}")]
+    Draw(String),
+    /// The environment refuses what it once executed.
+    #[error("control step {step} cannot be run again: {error}")]
+    Action {
+        /// Control step, from 0.
+        step: usize,
+        /// The environment's reason.
+        error: ActionError,
+    },
+    /// The second run is another episode.
+    #[error(
+        "the episode ended elsewhere when it was run again: it is not the one that was recorded"
+    )]
+    OtherEpisode,
+    /// The file cannot be written.
+    #[error("cannot be written ({0}); name a file in an existing, writable folder with room")]
+    Write(#[from] std::io::Error),
+    /// The program that compresses films failed.
+    #[error("ffmpeg cannot make it: {0}")]
+    Ffmpeg(String),
+    /// It was told to stop.
+    #[error("interrupted")]
+    Interrupted,
+}
+
+/// A state on the way: before control step `number`, or, with `step` none, after the last.
+#[derive(Debug, Clone, Copy)]
+pub struct Moment<'t> {
+    /// Control steps executed so far.
+    pub number: usize,
+    /// What the policy does next.
+    pub step: Option<&'t Step>,
+}
+
+/// What is done at every moment.
+pub type Look<'l> = dyn FnMut(Moment<'_>, &mut dyn Environment) -> Result<(), FilmError> + 'l;
+
+/// Runs the executed actions of `trace` again and calls `look` at every state, the first and the last included. `commanded` are the
+/// sub-tasks that its instruction commands, `seed` is the run's.
+pub fn play(
+    trace: &Trace,
+    commanded: &[usize],
+    seed: u64,
+    environment: &mut dyn Environment,
+    look: &mut Look<'_>,
+) -> Result<(), FilmError> {
+    let seed = EpisodeSeed {
+        seed,
+        instruction: u64::from(trace.instruction),
+        episode: u64::from(trace.episode),
+    };
+    environment.reset(seed, commanded);
+    let mut command = vec![0.0; environment.action_len()];
+    for (number, step) in trace.steps.iter().enumerate() {
+        let moment = Moment {
+            number,
+            step: Some(step),
+        };
+        look(moment, environment)?;
+        for (command, &executed) in command.iter_mut().zip(&step.executed) {
+            *command = f64::from(executed);
+        }
+        let done = environment.step(&command);
+        done.map_err(|error| FilmError::Action {
+            step: number,
+            error,
+        })?;
+    }
+    let moment = Moment {
+        number: trace.steps.len(),
+        step: None,
+    };
+    look(moment, environment)?;
+    let outcome = &trace.outcome;
+    let same = environment.state() == outcome.final_state
+        && environment.completions() == outcome.completions;
+    same.then_some(()).ok_or(FilmError::OtherEpisode)
+}
+
+/// Width and height of the simulator's pictures in a film, in pixels.
+pub const PICTURE: [u32; 2] = [640, 480];
+
+/// Pictures that a GIF's palette is got from.
+const SAMPLES: usize = 8;
+
+/// An episode to be filmed.
+pub struct Scene<'s> {
+    /// What happened.
+    pub trace: &'s Trace,
+    /// Text of its instruction.
+    pub instruction: &'s str,
+    /// The environment's indices of the sub-tasks that it commands.
+    pub commanded: &'s [usize],
+    /// Seed of the run.
+    pub seed: u64,
+}
+
+impl Scene<'_> {
+    /// Films the episode in `environment`, every control step, with captions; `camera` takes pictures of size [`PICTURE`]. What comes back is
+    /// complete and beside `path`. `taken` is called after each picture, `stop` ends the work early.
+    pub fn film(
+        &self,
+        environment: &mut dyn Environment,
+        camera: &mut Camera,
+        (form, path): (Form, &Path),
+        stop: &AtomicBool,
+        taken: &dyn Fn(),
+    ) -> Result<Finished, FilmError> {
+        let period_s = environment.control_period_s();
+        let caption = Caption {
+            instruction: self.instruction,
+            sub_tasks: environment.sub_tasks(),
+            commanded: self.commanded,
+            trace: self.trace,
+            period_s,
+            speed: period_s / shown_s(period_s),
+        };
+        let [width, height] = PICTURE;
+        let mut canvas = Canvas::new(width, caption::HEAD + height + caption::FOOT);
+        let mut sink = Sink::new(form, path, canvas.size(), period_s)?;
+        let episode = |environment: &mut dyn Environment, look: &mut Look<'_>| {
+            play(self.trace, self.commanded, self.seed, environment, look)
+        };
+        if sink.learns() {
+            let every = self.trace.steps.len().div_ceil(SAMPLES).max(1);
+            episode(environment, &mut |moment, environment| {
+                if moment.number.is_multiple_of(every) || moment.step.is_none() {
+                    canvas.paste(camera.shoot(environment)?, width, 0, caption::HEAD);
+                    sink.learn(&canvas);
+                }
+                Ok(())
+            })?;
+        }
+        episode(environment, &mut |moment, environment| {
+            if stop.load(Ordering::Relaxed) {
+                return Err(FilmError::Interrupted);
+            }
+            canvas.paste(camera.shoot(environment)?, width, 0, caption::HEAD);
+            caption.draw(moment, &mut canvas);
+            sink.add(&canvas, moment.step.is_none())?;
+            taken();
+            Ok(())
+        })?;
+        sink.finish()
+    }
+}
