@@ -6,7 +6,7 @@ use std::fmt::{self, Display, Formatter};
 
 use lads_core::image::{Beyond, PolicyKind, ProgramKind};
 use lads_core::op::Port;
-use lads_core::{Contract, Decision, Element, GuardedController, Policy, Program};
+use lads_core::{Contract, Decision, Element, GuardedController, Interval, Policy, Program};
 use serde_json::{Value, json};
 
 use crate::model::Model;
@@ -231,8 +231,7 @@ fn elements<'c>(
             name,
             unit,
             joint,
-            min,
-            max,
+            limits: Interval { min, max },
         },
     ) in elements.iter().enumerate()
     {
@@ -315,8 +314,7 @@ fn element_json(element: Element<'_>) -> Value {
         name,
         unit,
         joint,
-        min,
-        max,
+        limits: Interval { min, max },
     } = element;
     // Through the shortest decimal form: 0.16_f32 is 0.16 in the JSON too.
     json!({ "name": name, "unit": unit, "joint": joint, "min": decimal(min), "max": decimal(max) })

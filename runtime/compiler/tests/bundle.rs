@@ -139,7 +139,7 @@ fn every_known_instruction_can_be_followed() {
         .contract()
         .observation
         .iter()
-        .map(|element| f32::midpoint(element.limits.min, element.limits.max))
+        .map(|element| f32::midpoint(element.min, element.max))
         .collect();
     let mut action = vec![0.0; bundle.contract().action.len()];
     for id in 0..bundle.contract().instructions.len() as u32 {

@@ -4,8 +4,8 @@ mod support;
 
 use lads_core::image::{Beyond, DecisionRule, ProgramKind};
 use lads_core::{
-    ActError, Controller, Decision, EncodeError, Instruction, InstructionError, Isa, PlanIndex,
-    Policy, StepError, Workspace,
+    ActError, Controller, Decision, Element, EncodeError, Instruction, InstructionError, Interval,
+    Isa, PlanIndex, Policy, StepError, Workspace,
 };
 use support::assemble::{parts, with_golden};
 use support::{Image, Memory, Model, Random, Spec};
@@ -260,7 +260,7 @@ fn refused_input_leaves_the_controller_as_it_was() {
                 refused(&[0.0, 0.0, f32::INFINITY]),
                 StepError::NotFinite { index: 2 }
             );
-            let outside = StepError::OutOfInterval {
+            let outside = StepError::OutOfLimits {
                 index: 2,
                 value: -3.5,
                 min: -3.0,
