@@ -24,7 +24,7 @@ use crate::tensor::{Data, Tensor};
 
 #[cfg(test)]
 pub(crate) use eval::apply;
-pub(crate) use eval::evaluate;
+pub(crate) use eval::{MAX_FOLDING, cost, evaluate};
 pub(crate) use rewrite::{Rewriter, topological};
 
 /// Length of an axis: `fixed`, or `P + fixed`.
@@ -199,6 +199,8 @@ pub(crate) struct Graph {
     origins: Vec<(String, String)>,
     /// The origin of the nodes that are built now.
     current: usize,
+    /// What constant folding has cost so far, see [`cost`](eval::cost).
+    folded: usize,
 }
 
 impl Graph {

@@ -1,6 +1,7 @@
 //! Tests of the stages against oracles: tract for what a graph means, a plain interpreter for what ops do.
 
 mod attention;
+mod bombs;
 mod layers;
 mod machine;
 mod models;

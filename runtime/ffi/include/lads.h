@@ -705,6 +705,15 @@ lads_status lads_executed(struct lads_controller *controller,
 lads_status lads_reset(struct lads_controller *controller);
 
 /**
+ * Brings code, weights and KV cache into the processor's caches, so that the next step is as fast as the ones after it: for right
+ * before the first step, or after a pause. Costs about two control steps and changes nothing.
+ *
+ * # Safety
+ * As `lads_self_test`.
+ */
+lads_status lads_warm(struct lads_controller *controller);
+
+/**
  * Stops as `LADS_FALLBACK_STOP` does, from the next step on.
  *
  * # Safety

@@ -160,6 +160,7 @@ public:
         return lads_executed(controller_, action.data(), action.size());
     }
     Status reset() noexcept { return lads_reset(controller_); }
+    Status warm() noexcept { return lads_warm(controller_); }
     Status stop() noexcept { return lads_stop(controller_); }
     Status resume() noexcept { return lads_resume(controller_); }
     Status counters(lads_counters_t &counters) noexcept { return lads_counters(controller_, &counters); }

@@ -455,6 +455,17 @@ pub unsafe extern "C" fn lads_reset(controller: *mut LadsController) -> Status {
     status(unsafe { handle::handle(controller) }.map(|handle| handle.guarded.reset()))
 }
 
+/// Brings code, weights and KV cache into the processor's caches, so that the next step is as fast as the ones after it: for right
+/// before the first step, or after a pause. Costs about two control steps and changes nothing.
+///
+/// # Safety
+/// As `lads_self_test`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn lads_warm(controller: *mut LadsController) -> Status {
+    // SAFETY: the caller guarantees the controller.
+    status(unsafe { handle::handle(controller) }.map(|handle| handle.guarded.warm()))
+}
+
 /// Stops as `LADS_FALLBACK_STOP` does, from the next step on.
 ///
 /// # Safety

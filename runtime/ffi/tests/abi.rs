@@ -366,6 +366,7 @@ fn policies_and_controllers_that_were_moved_or_never_set_up_are_refused() {
         let mut counters = LadsCounters::default();
         for status in [
             lads_reset(null_mut()),
+            lads_warm(null_mut()),
             lads_stop(null_mut()),
             lads_resume(null_mut()),
             lads_set_instruction(null_mut(), 0),
@@ -604,6 +605,28 @@ fn a_wrong_call_does_nothing() {
     assert_eq!((action, counters(c).periods), ([7.0; 2], 0));
     assert_eq!(step(c, &observation, &mut action).0, Status::Ok);
     assert_ne!(action, [7.0; 2]);
+}
+
+#[test]
+fn warming_up_changes_nothing() {
+    let run = |warm: bool| {
+        let mut host = Host::new(image());
+        let c = host.controller();
+        instruct(c, 0);
+        let mut bits = vec![];
+        for number in 0..12 {
+            if warm {
+                // SAFETY: the controller is alive.
+                assert_eq!(unsafe { lads_warm(c) }, Status::Ok);
+            }
+            let mut action = [7.0_f32; 2];
+            let (status, report) = step(c, &[0.1 * number as f32; 3], &mut action);
+            assert_eq!(status, Status::Ok);
+            bits.push((action.map(f32::to_bits), report.plan));
+        }
+        (bits, counters(c).periods)
+    };
+    assert_eq!(run(true), run(false));
 }
 
 #[test]

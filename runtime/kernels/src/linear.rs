@@ -12,6 +12,8 @@
 //! through a panel in pairs: the two tokens of a control step read each weight once. A target with few registers takes a
 //! panel in parts. Each output is one sum in the order of `k`, then the scale, then the bias, whatever the number of rows or parts.
 
+use core::hint::black_box;
+
 use crate::dispatch::{Isa, Kernel};
 use crate::elementwise::assign;
 use crate::lanes::{Block, LANES};
@@ -67,18 +69,21 @@ pub enum Activation {
 impl Activation {
     #[inline(always)]
     fn apply<S: Simd>(self, simd: S, x: S::V) -> S::V {
-        let each = |f: fn(f32) -> f32| {
+        #[inline(always)]
+        fn each<S: Simd>(simd: S, x: S::V, f: impl Fn(f32) -> f32) -> S::V {
             let mut block = [0.0; LANES];
             simd.store(x, &mut block);
-            block = block.map(f);
+            for x in &mut block {
+                *x = f(*x);
+            }
             simd.load(&block)
-        };
+        }
         match self {
             Self::None => x,
             Self::Relu => simd.where_negative(x, simd.splat(0.0)),
             Self::LeakyRelu(alpha) => simd.where_negative(x, simd.mul(simd.splat(alpha), x)),
-            Self::Tanh => each(math::tanh),
-            Self::Sigmoid => each(math::sigmoid),
+            Self::Tanh => each(simd, x, math::tanh),
+            Self::Sigmoid => each(simd, x, math::sigmoid),
         }
     }
 }
@@ -108,10 +113,40 @@ impl Linear<'_> {
         }
         let layer = self;
         match self.w {
-            Panels::F32(w) => isa.run(Rows::<F32, false> { layer, w, x, y }),
-            Panels::F16(w) => isa.run(Rows::<F16, true> { layer, w, x, y }),
-            Panels::Bf16(w) => isa.run(Rows::<Bf16, true> { layer, w, x, y }),
-            Panels::Int8 { panels: w, .. } => isa.run(Rows::<Int8, true> { layer, w, x, y }),
+            Panels::F32(_) => isa.run(Rows::<false> { layer, x, y }),
+            _ => isa.run(Rows::<true> { layer, x, y }),
+        }
+    }
+
+    /// The sums of `R` rows with the panel of so many blocks that begins at weight `start`.
+    #[inline(always)]
+    fn panel<S: Simd, const R: usize, const NARROW: bool>(
+        &self,
+        simd: S,
+        (start, blocks): (usize, usize),
+        x: [&[f32]; R],
+        sums: &mut Sums,
+    ) {
+        #[inline(always)]
+        fn part<T>(w: &[T], start: usize, len: usize) -> &[T] {
+            w.get(start..start + len).unwrap_or(&[])
+        }
+        let len = blocks * LANES * self.k;
+        match self.w {
+            Panels::F32(w) if !NARROW => {
+                panel::<S, F32, R>(simd, part(w, start, len), blocks, x, sums);
+            }
+            Panels::F16(w) if NARROW => {
+                panel::<S, F16, R>(simd, part(w, start, len), blocks, x, sums);
+            }
+            Panels::Bf16(w) if NARROW => {
+                panel::<S, Bf16, R>(simd, part(w, start, len), blocks, x, sums);
+            }
+            Panels::Int8 { panels: w, .. } if NARROW => {
+                panel::<S, Int8, R>(simd, part(w, start, len), blocks, x, sums);
+            }
+            // `run` chooses the kernel by the format.
+            _ => {}
         }
     }
 
@@ -150,10 +185,9 @@ fn block<'b>(x: &'b [f32], first: usize, spare: &'b mut Block) -> &'b Block {
     spare
 }
 
-/// A layer at work. `NARROW` is [`Kernel::NARROW`].
-struct Rows<'a, W: Stored, const NARROW: bool> {
+/// A layer at work, of 32-bit weights or `NARROW` ones, see [`Kernel::NARROW`].
+struct Rows<'a, const NARROW: bool> {
     layer: &'a Linear<'a>,
-    w: &'a [W::Bits],
     x: &'a [f32],
     y: &'a mut [f32],
 }
@@ -161,7 +195,7 @@ struct Rows<'a, W: Stored, const NARROW: bool> {
 /// The sums of one panel for two rows.
 type Sums = [[Block; PANEL_BLOCKS]; 2];
 
-impl<W: Stored, const NARROW: bool> Kernel for Rows<'_, W, NARROW> {
+impl<const NARROW: bool> Kernel for Rows<'_, NARROW> {
     const NARROW: bool = NARROW;
 
     #[inline(always)]
@@ -170,29 +204,29 @@ impl<W: Stored, const NARROW: bool> Kernel for Rows<'_, W, NARROW> {
         let mut sums = [[[0.0; LANES]; PANEL_BLOCKS]; 2];
         for first in (0..n).step_by(PANEL) {
             let blocks = (n - first).div_ceil(LANES).min(PANEL_BLOCKS);
-            let start = first * k;
-            let w = self.w.get(start..start + blocks * LANES * k).unwrap_or(&[]);
+            let place = (first * k, blocks);
             let (mut x, mut y) = (self.x, &mut *self.y);
             while let Some((x0, rest)) = x.split_at_checked(k)
                 && let Some((y0, others)) = y.split_at_mut_checked(n)
             {
-                let second = if let Some((x1, rest)) = rest.split_at_checked(k)
+                let (rows, second) = if let Some((x1, rest)) = rest.split_at_checked(k)
                     && let Some((y1, others)) = others.split_at_mut_checked(n)
                 {
-                    panel::<S, W, 2>(simd, w, blocks, [x0, x1], &mut sums);
+                    self.layer
+                        .panel::<S, 2, NARROW>(simd, place, [x0, x1], &mut sums);
                     (x, y) = (rest, others);
-                    y1
+                    (2, y1)
                 } else {
-                    panel::<S, W, 1>(simd, w, blocks, [x0], &mut sums);
+                    self.layer
+                        .panel::<S, 1, NARROW>(simd, place, [x0], &mut sums);
                     (x, y) = (&[], &mut []);
-                    &mut []
+                    (1, Default::default())
                 };
-                // Written once for all widths and numbers of rows: activations are long.
-                for (y, sums) in [y0, second].into_iter().zip(&sums) {
-                    if !y.is_empty() {
-                        for (block, sums) in sums.iter().enumerate().take(blocks) {
-                            self.layer.finish(simd, sums, first + block * LANES, y);
-                        }
+                // Written once for all widths and numbers of rows, and not unrolled by those who know them: activations are long.
+                for (y, sums) in [y0, second].iter_mut().zip(&sums).take(black_box(rows)) {
+                    let sums = black_box(sums.get(..blocks).unwrap_or(&[]));
+                    for (block, sums) in sums.iter().enumerate() {
+                        self.layer.finish(simd, sums, first + block * LANES, y);
                     }
                 }
             }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use lads_core::op::{BinaryKind, ReduceKind};
 
-use super::{Dim, Graph, Id, Kind, Op, Type, Unary, evaluate, show};
+use super::{Dim, Graph, Id, Kind, MAX_FOLDING, Op, Type, Unary, cost, evaluate, show};
 use crate::tensor::{MAX_RANK, Tensor, elements};
 
 /// A node, or why its operands do not fit.
@@ -64,6 +64,12 @@ impl Graph {
         if let (Some(operands), Some(known)) = (operands, known) {
             if elements(&known).is_none() {
                 return Err(format!("the constant {} is too large", show(&shape)));
+            }
+            self.folded = self.folded.saturating_add(cost(&op, &operands, &known));
+            if self.folded > MAX_FOLDING {
+                return Err(format!(
+                    "computes with constants alone, and with the entry's others that takes more than {MAX_FOLDING} operations"
+                ));
             }
             if let Some(tensor) = evaluate(&op, &operands, &known) {
                 return Ok(self.add_const(Arc::new(tensor)));

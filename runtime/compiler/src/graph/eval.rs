@@ -7,6 +7,21 @@ use lads_core::op::{BinaryKind, ReduceKind, UnaryKind};
 use super::{Op, Unary};
 use crate::tensor::{Data, Tensor, strides};
 
+/// The most operations that folding the constants of one entry may take. A policy's take some ten thousands; a small model could
+/// ask for hours and for all memory.
+pub(crate) const MAX_FOLDING: usize = 1 << 26;
+
+/// How many elements are read or made to evaluate a node.
+pub(crate) fn cost(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> usize {
+    let made: usize = shape.iter().product();
+    let each = match op {
+        Op::MatMul => x[0].shape.last().copied().unwrap_or(1),
+        Op::Reduce(_, axis) => x[0].shape.get(*axis).copied().unwrap_or(1),
+        _ => 1,
+    };
+    made.saturating_mul(each)
+}
+
 /// The value of a node whose operands are constants; `shape` is its shape.
 pub(crate) fn evaluate(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> Option<Tensor> {
     match op {

@@ -137,6 +137,11 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         self.controller.reset();
     }
 
+    /// As [`Controller::warm`].
+    pub fn warm(&mut self) {
+        self.controller.warm();
+    }
+
     /// As [`Controller::executed`]; the rate counts from there. What the guard itself has changed it has told the controller.
     pub fn executed(&mut self, action: &[f32]) -> Result<(), StepError> {
         self.controller.executed(action)?;

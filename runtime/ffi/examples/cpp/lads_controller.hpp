@@ -73,13 +73,17 @@ public:
         return CallbackReturn::SUCCESS;
     }
 
-    // Replays the policy's recorded episode on this machine; only then may it move anything. Also the dry run that fills the caches.
+    // Replays the policy's recorded episode on this machine; only then may it move anything.
     CallbackReturn on_activate() {
         if (auto status = controller_.self_test(); !status) {
             return failed("self-test", status);
         }
         if (auto status = controller_.set_instruction(instruction_); !status) {
             return failed(instruction_, status);
+        }
+        // The first update is to take no longer than the others.
+        if (auto status = controller_.warm(); !status) {
+            return failed("warming up", status);
         }
         return CallbackReturn::SUCCESS;
     }
