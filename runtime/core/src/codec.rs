@@ -165,6 +165,7 @@ macro_rules! record {
             fn put(&self, out: &mut $crate::codec::Writer) {
                 $($crate::codec::Field::put(&self.$field, out);)*
             }
+            #[inline(always)]
             fn take(from: &mut $crate::codec::Reader) -> Option<Self> {
                 Some(Self { $($field: $crate::codec::Field::take(from)?,)* })
             }
