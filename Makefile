@@ -9,13 +9,14 @@ ARGS   ?=
 ENV    ?= kitchen
 COLLECT_kitchen := --episodes-per-instruction 50
 COLLECT_lorel   := --episodes 50000
-# What lints and tests cover; one set, because each set is a build of its own.
-FEATURES := lads-sim/report,lads-sim/record
+# What lints and tests cover; one selection, because each is a build of its own, of tract too: the oracle and the language encoder's engine.
+FEATURES := lads-sim/report,lads-sim/record,lads-sim/language
+ALL      := --workspace --features $(FEATURES)
 RUNTIME := -p lads-core -p lads-kernels -p lads-compiler -p lads-ffi -p lads-cli
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report record verify test setup lint test-runtime test-sim test-exporter collect train export reference install bench clean help
+.PHONY: run report record say language verify test setup lint test-rust test-runtime test-exporter collect train export reference install bench clean help
 
 ## run: the shipped policy over the paper's seen and unseen instructions
 run: setup
@@ -29,8 +30,17 @@ report: setup
 record: setup
 	cargo run --release -p lads-sim --features report,record --bin lads-run -- --model $(MODEL) --episodes 1 --record episode.gif $(ARGS)
 
+## language: the language encoder into the user's cache, once, for `make say`; ENCODER=FOLDER for another BERT-family model
+language: $(VENV)/stamp
+	$(PY) -m lads_exporter language $(if $(ENCODER),--encoder $(ENCODER))
+
+## say: any sentence to the policy, SAY="open the microwave"; without SAY, every instruction as the language encoder hears it
+say: setup language
+	cargo run --release -p lads-sim --features language --bin lads-run -- --model $(MODEL) $(if $(SAY),--instruction "$$SAY",--encode-language) $(ARGS)
+export SAY
+
 ## test: format, lints, documentation, all Rust tests, the exporter's tests
-test: setup lint test-runtime test-sim test-exporter
+test: setup lint test-rust test-exporter
 
 ## setup: MuJoCo and the simulator's assets into vendor/ (idempotent)
 setup:
@@ -38,15 +48,17 @@ setup:
 
 lint: setup
 	cargo fmt --all --check
-	cargo clippy --workspace --all-targets --features $(FEATURES) -- -D warnings
-	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --features $(FEATURES) --no-deps --quiet
+	cargo clippy $(ALL) --all-targets -- -D warnings
+	RUSTDOCFLAGS="-D warnings" cargo doc $(ALL) --no-deps --quiet
+	# What `make run` builds, without the features of the tests.
+	cargo check --quiet $(RUNTIME) -p lads-sim
 
 ## test-runtime: the runtime alone; needs neither MuJoCo nor Python
 test-runtime:
-	cargo test $(RUNTIME)
+	cargo test $(RUNTIME) -p lads-language
 
-test-sim: setup
-	cargo test --features $(FEATURES) -p lads-sim -p lads-tests -p lads-benches
+test-rust: setup
+	cargo test $(ALL)
 
 # The stamp makes the environment anew whenever the package's pins change.
 $(VENV)/stamp: exporter/pyproject.toml
@@ -57,7 +69,7 @@ $(VENV)/stamp: exporter/pyproject.toml
 	touch $@
 
 test-exporter: setup $(VENV)/stamp
-	cargo build -p lads-cli -p lads-sim
+	cargo build -p lads-cli -p lads-sim --features $(FEATURES)
 	$(PY) -m pytest exporter/tests tests/parity
 
 ## collect: demonstrations into data/ENV.safetensors; ENV=kitchen (scripted, of the 22 seen instructions) or ENV=lorel (random, labelled)

@@ -112,6 +112,13 @@ def _reference(arguments):
     print(f"{arguments.output}: written; next: lads-run --model {arguments.model} --verify {arguments.output}")
 
 
+def _language(arguments):
+    from . import language_graph
+
+    folder = Path(arguments.output) if arguments.output else language_graph.default_folder(arguments.encoder)
+    print(f"{folder}: {'written' if language_graph.write(arguments.encoder, folder) else 'up to date'}")
+
+
 def _parser():
     parser = argparse.ArgumentParser(prog="python -m lads_exporter", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
@@ -156,6 +163,11 @@ def _parser():
     rollouts.add_argument("--seed", type=int, default=0)
     rollouts.add_argument("--noise", default="v0", help="observation noise: v0, v1 or none")
     rollouts.set_defaults(run_command=_reference)
+
+    spoken = commands.add_parser("language", help="the language encoder as ONNX, so that lads-run takes any sentence")
+    spoken.add_argument("--encoder", default="all-MiniLM-L6-v2", help="as in a config's language.encoder (all-MiniLM-L6-v2)")
+    spoken.add_argument("-o", "--output", help="the folder; left out, language/ENCODER in $LADS_CACHE, else in the user's cache folder")
+    spoken.set_defaults(run_command=_language)
     return parser
 
 

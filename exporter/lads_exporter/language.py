@@ -45,6 +45,11 @@ class Encoded:
         return max(len(row.words) for row in self.instructions)
 
 
+def name(encoder):
+    """What contracts call an encoder."""
+    return Path(encoder).name
+
+
 def _folder(encoder):
     if encoder == DEFAULT:
         spec = importlib.util.find_spec(_PACKAGE)
@@ -80,29 +85,42 @@ def _encode_random(dim, texts, pool):
     return Encoded(rows, f"random-{dim}", hashlib.sha256(f"random-{dim}".encode()).hexdigest())
 
 
-def encode(language, texts):
-    """Encodes the texts one by one (no padding is involved)."""
-    if language.encoder.startswith("random-"):
-        return _encode_random(int(language.encoder.removeprefix("random-")), texts, language.pool)
-    import torch
+def load(encoder):
+    """-> tokenizer, model with its hidden layers, sha256 of the weights."""
+    import torch  # noqa: F401  transformers gives no models without it
     from transformers import AutoModel, AutoTokenizer, logging
 
     logging.set_verbosity_error()
     logging.disable_progress_bar()
-    folder = _folder(language.encoder)
+    folder = _folder(encoder)
     sha256 = _weights_sha256(folder)
     try:
         tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
         model = AutoModel.from_pretrained(folder, local_files_only=True).eval()
     except (OSError, ValueError, KeyError) as error:
         raise UserError(f"{folder}: not a BERT-family model: {str(error).splitlines()[0]}") from error
+    return tokenizer, model, sha256
+
+
+def hidden_layers(tokenizer, model, text):
+    """All hidden layers of one text, [1, tokens, E] each: the embeddings, then every layer's output."""
+    import torch
+
+    ids = tokenizer(text, return_tensors="pt")["input_ids"]
+    with torch.no_grad():
+        return model(input_ids=ids, attention_mask=torch.ones_like(ids), output_hidden_states=True).hidden_states
+
+
+def encode(language, texts):
+    """Encodes the texts one by one (no padding is involved)."""
+    if language.encoder.startswith("random-"):
+        return _encode_random(int(language.encoder.removeprefix("random-")), texts, language.pool)
+    tokenizer, model, sha256 = load(language.encoder)
     rows = []
     for text in texts:
-        ids = tokenizer(text, return_tensors="pt")["input_ids"]
-        with torch.no_grad():
-            hidden = model(input_ids=ids, attention_mask=torch.ones_like(ids), output_hidden_states=True).hidden_states
+        hidden = hidden_layers(tokenizer, model, text)
         if not -len(hidden) <= language.layer < len(hidden):
             raise UserError(f"language.layer = {language.layer}: the encoder has layers 0 to {len(hidden) - 1}")
         sentence = hidden[-1][0].mean(0).numpy().copy()
         rows.append(_embedded(hidden[language.layer][0, 1:].numpy().copy(), sentence, language.pool))
-    return Encoded(rows, Path(language.encoder).name, sha256)
+    return Encoded(rows, name(language.encoder), sha256)

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 
 use lads_compiler::Memory;
-use lads_core::{Decision, Isa, Policy, WorkspaceTooSmall};
+use lads_core::{Decision, Isa, KnownInstruction, Policy, WorkspaceTooSmall};
 use thiserror::Error;
 
 use crate::environment::{Environment, EpisodeSeed};
@@ -17,6 +17,7 @@ use crate::faults::Faults;
 use crate::plans::PlanBook;
 use crate::random::Stream;
 use crate::rollout::{Actor, Driver, Episode, RolloutError, Task, Timing};
+use crate::spoken::WordBook;
 use crate::trace::Trace;
 
 /// Fourth number of the entropy of the stream that seeds plan sampling; the environment's noise has only the first three.
@@ -25,7 +26,7 @@ const DECISION_STREAM: u64 = 1;
 /// One instruction to run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Assignment {
-    /// Index of the instruction in the policy's table.
+    /// Index of the instruction in the policy's table; beyond it, of a sentence whose words the setup has.
     pub instruction: u32,
     /// The environment's indices of the sub-tasks that it commands.
     pub commanded: Vec<usize>,
@@ -40,6 +41,8 @@ pub struct Setup<'e> {
     pub faults: Faults,
     /// Plans for the low level alone.
     pub plans: Option<&'e PlanBook>,
+    /// Word embeddings that are heard instead of the table's.
+    pub words: Option<&'e WordBook>,
     /// How many of each instruction's episodes, from the first, keep every control step.
     pub traced: u32,
 }
@@ -108,6 +111,13 @@ impl Evaluation<'_> {
     /// Number of episodes in all.
     pub fn len(&self) -> usize {
         self.assignments.len() * self.episodes as usize
+    }
+
+    /// What an instruction is, be it of the policy's table or a sentence outside it.
+    pub fn instruction(&self, instruction: u32) -> Option<KnownInstruction<'_>> {
+        let contract = self.policy.contract();
+        let known = contract.instruction(instruction as usize);
+        known.or_else(|| Some(self.setup.words?.sentence.as_ref()?.known()))
     }
 
     /// Whether there is nothing to run.
@@ -236,6 +246,10 @@ impl Evaluation<'_> {
         };
         Task {
             instruction: assignment.instruction,
+            words: self
+                .setup
+                .words
+                .and_then(|book| book.of(assignment.instruction)),
             commanded: &assignment.commanded,
             max_steps: assignment.max_steps,
             seed,

@@ -28,6 +28,7 @@ pub mod replay;
 pub mod report;
 pub mod results;
 pub mod rollout;
+pub mod spoken;
 pub mod table;
 pub mod trace;
 pub mod verify;

@@ -137,6 +137,17 @@ impl Score {
     }
 }
 
+impl Score {
+    /// Of episodes that nothing was asked of: no rates.
+    pub fn unasked(episodes: usize, completions: usize) -> Self {
+        Self {
+            episodes,
+            un_instructed: completions,
+            ..Self::of([])
+        }
+    }
+}
+
 fn share(count: usize, episodes: usize) -> Option<f64> {
     (episodes > 0).then(|| count as f64 / episodes as f64)
 }

@@ -96,7 +96,10 @@ pub fn replay(
     let mut replayed = Replayed::default();
     let mut action = vec![0.0; policy.contract().action_len()];
     for flight in &log.flights {
-        let instruction = find(&policy.contract(), flight)?;
+        let instruction = match &flight.words {
+            Some(words) => Instruction::Words(words),
+            None => Instruction::Id(find(&policy.contract(), flight)?),
+        };
         controller.set_decision(match flight.trace.sampling_seed {
             None => Decision::Argmax,
             Some(seed) => Decision::Sample {
@@ -105,7 +108,7 @@ pub fn replay(
             },
         });
         controller
-            .set_instruction(Instruction::Id(instruction))
+            .set_instruction(instruction)
             .map_err(ReplayError::Instruct)?;
         let episode = || format!("{} episode {}", flight.instruction_id, flight.trace.episode);
         let mut first = None;

@@ -39,8 +39,8 @@ pub struct Run {
     pub episode: usize,
     /// Control steps executed.
     pub steps: usize,
-    /// Whether the instruction was carried out.
-    pub success: bool,
+    /// Whether the instruction was carried out; `None` for a sentence that commands no sub-tasks.
+    pub success: Option<bool>,
     /// Completed sub-tasks in the order of their completion.
     pub completions: Vec<Completion>,
     /// Latent plan indices in the order in which they were decided, one per horizon.
@@ -111,7 +111,7 @@ impl InstructionResult {
             id: instruction.id.to_owned(),
             text: instruction.text.to_owned(),
             split: instruction.split.to_owned(),
-            score: Score::of(runs.iter().map(outcome)),
+            score: score(runs.iter()),
             completions: commanded.iter().map(|&name| rate(name)).collect(),
             un_instructed_completions: others.collect(),
             runs,
@@ -132,19 +132,32 @@ fn run(number: usize, episode: &Episode, watched: &[&'static str], commanded: &[
     Run {
         episode: number,
         steps: episode.steps,
-        success: episode.success,
+        success: (!commanded.is_empty()).then_some(episode.success),
         completions: episode.completions.iter().filter_map(named).collect(),
         plans: episode.plans.clone(),
     }
 }
 
-fn outcome(run: &Run) -> Outcome {
+/// The score of episodes that all command sub-tasks, or none of them.
+fn score<'r>(runs: impl Iterator<Item = &'r Run> + Clone) -> Score {
+    let outcomes: Option<Vec<_>> = runs.clone().map(outcome).collect();
+    outcomes.map_or_else(
+        || {
+            let completions = runs.clone().map(|run| run.completions.len()).sum();
+            Score::unasked(runs.count(), completions)
+        },
+        Score::of,
+    )
+}
+
+/// `None` where nothing was commanded.
+fn outcome(run: &Run) -> Option<Outcome> {
     let completed = run.completions.iter().filter(|c| c.commanded).count();
-    Outcome {
+    Some(Outcome {
         completed,
         un_instructed: run.completions.len() - completed,
-        success: run.success,
-    }
+        success: run.success?,
+    })
 }
 
 /// All instructions of one split together.
@@ -204,9 +217,6 @@ pub fn split_names(contract: &Contract<'_>) -> Vec<String> {
 
 impl SplitResult {
     fn of(instructions: &[&InstructionResult], watched: &[&'static str]) -> Self {
-        let outcomes = instructions
-            .iter()
-            .flat_map(|result| result.runs.iter().map(outcome));
         let rate = |sub_task: &'static str, commanded: bool| {
             let commands = |result: &&InstructionResult| {
                 result.completions.iter().any(|c| c.sub_task == sub_task) == commanded
@@ -225,7 +235,7 @@ impl SplitResult {
         };
         let rates = |commanded| watched.iter().map(move |&name| rate(name, commanded));
         Self {
-            score: Score::of(outcomes),
+            score: score(instructions.iter().flat_map(|result| &result.runs)),
             completions: rates(true).filter(|of| of.rate.episodes > 0).collect(),
             un_instructed_completions: rates(false).filter(|of| of.rate.count > 0).collect(),
         }
@@ -352,6 +362,17 @@ impl EnvironmentUsed {
     }
 }
 
+/// Who made the word embeddings, where they are not the bundle's own.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct HeardBy {
+    /// Name of the language encoder.
+    pub encoder: String,
+    /// SHA-256 of its weights, in hexadecimal digits.
+    pub sha256: String,
+    /// Largest difference of an element from the bundle's table; `None` for a sentence outside it.
+    pub largest_difference: Option<f32>,
+}
+
 /// The whole report of one `lads-run`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Results {
@@ -371,6 +392,9 @@ pub struct Results {
     pub decision: DecisionUsed,
     /// Episodes asked for per instruction.
     pub episodes_per_instruction: u32,
+    /// Who made the word embeddings; left out where they are the bundle's own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub heard_by: Option<HeardBy>,
     /// What was wrong between policy and environment; left out without faults.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub faults: Option<Faults>,

@@ -66,7 +66,10 @@ const UNIFORM_STREAM: u64 = 3;
 pub struct Task<'t> {
     /// Index of the instruction in the policy's table.
     pub instruction: u32,
-    /// Indices, in the environment's list, of the sub-tasks that the instruction commands.
+    /// Word embeddings `[n, E]` that are heard instead of that instruction's.
+    pub words: Option<&'t [f32]>,
+    /// Indices, in the environment's list, of the sub-tasks that the instruction commands; with none there is nothing to carry out, and the
+    /// episode lasts its full time.
     pub commanded: &'t [usize],
     /// Control steps after which the episode ends.
     pub max_steps: usize,
@@ -208,7 +211,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         let mut plans = Vec::with_capacity(most.div_ceil(horizon));
         let mut uniform = task.actor.stream(task.seed);
         let mut step = 0;
-        while step < most && !self.environment.succeeded(task.commanded) {
+        while step < most && !self.succeeded(task) {
             match &mut uniform {
                 None => {
                     let (report, elapsed_ns) = self.decide(step, horizon, task.plans)?;
@@ -229,16 +232,22 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         self.timing.episodes_cpu += cpu_since(episode_cpu);
         Ok(Episode {
             steps: self.environment.steps(),
-            success: self.environment.succeeded(task.commanded),
+            success: self.succeeded(task),
             completions: self.environment.completions().to_vec(),
             plans,
             final_state: self.environment.state().to_vec(),
         })
     }
 
+    fn succeeded(&self, task: &Task<'_>) -> bool {
+        !task.commanded.is_empty() && self.environment.succeeded(task.commanded)
+    }
+
     fn instruct(&mut self, task: &Task<'_>) -> Result<(), RolloutError> {
         self.controller.set_decision(task.decision);
-        let instruction = Instruction::Id(task.instruction);
+        let instruction = task
+            .words
+            .map_or(Instruction::Id(task.instruction), Instruction::Words);
         let (start, start_cpu) = (Instant::now(), cpu_time());
         let known = self.controller.set_instruction(instruction);
         self.timing.controller_cpu += cpu_since(start_cpu);

@@ -77,7 +77,16 @@ fn instruction_row(result: &InstructionResult, f: &mut Formatter<'_>) -> fmt::Re
     )?;
     list(&result.completions, f)?;
     if !result.un_instructed_completions.is_empty() {
-        write!(f, "; un-instructed: ")?;
+        let asked = !result.completions.is_empty();
+        write!(
+            f,
+            "{}",
+            if asked {
+                "; un-instructed: "
+            } else {
+                "completed: "
+            }
+        )?;
         list(&result.un_instructed_completions, f)?;
     }
     writeln!(f)
@@ -103,6 +112,9 @@ fn split_block(split: &str, result: &SplitResult, f: &mut Formatter<'_>) -> fmt:
         "\n{split}: {} episodes, 95 % intervals in brackets",
         score.episodes
     )?;
+    if result.completions.is_empty() {
+        return completions_alone(result, f);
+    }
     write!(f, "  N-rate             {}", Number(score.n_rate))?;
     match score.n_rate_standard_error {
         Some(error) => writeln!(f, " (standard error {error:.2})")?,
@@ -131,6 +143,22 @@ fn split_block(split: &str, result: &SplitResult, f: &mut Formatter<'_>) -> fmt:
         write!(f, ", {sub_task} {} of {}", rate.count, rate.episodes)?;
     }
     writeln!(f)
+}
+
+/// Of a sentence that commands nothing.
+fn completions_alone(result: &SplitResult, f: &mut Formatter<'_>) -> fmt::Result {
+    for SubTaskRate { sub_task, rate } in &result.un_instructed_completions {
+        writeln!(
+            f,
+            "  {sub_task:<18} {} {}",
+            Number(rate.rate),
+            rate.interval
+        )?;
+    }
+    writeln!(
+        f,
+        "  no success rate: the sentence names no sub-tasks to judge it by (--sub-tasks does)"
+    )
 }
 
 fn latency(results: &Results, f: &mut Formatter<'_>) -> fmt::Result {

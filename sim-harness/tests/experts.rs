@@ -11,7 +11,8 @@ use lads_sim::instructions::Instructions;
 use lads_sim::kitchen::spec::{SUB_TASK_NAMES, SUB_TASKS};
 use lads_sim::kitchen::{Kitchen, Noise, Scene};
 
-static SCENE: LazyLock<Scene> = LazyLock::new(|| Scene::load(&vendor_dir()).unwrap());
+static SCENE: LazyLock<Scene> =
+    LazyLock::new(|| Scene::load(&vendor_dir()).unwrap_or_else(|error| panic!("{error}")));
 
 fn settings(episodes_per_instruction: usize, recovery_noise: f64, threads: usize) -> Settings {
     Settings {

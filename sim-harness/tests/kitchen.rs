@@ -8,7 +8,8 @@ use lads_sim::environment::{ActionError, Environment, EpisodeSeed};
 use lads_sim::kitchen::{Kitchen, Noise, Scene};
 use lads_sim::random::Stream;
 
-static SCENE: LazyLock<Scene> = LazyLock::new(|| Scene::load(&vendor_dir()).unwrap());
+static SCENE: LazyLock<Scene> =
+    LazyLock::new(|| Scene::load(&vendor_dir()).unwrap_or_else(|error| panic!("{error}")));
 
 fn episode(episode: u64) -> EpisodeSeed {
     EpisodeSeed {

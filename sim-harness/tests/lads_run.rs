@@ -28,6 +28,8 @@ fn kitchen_bundle() -> PathBuf {
 fn lads_run(model: &Path, arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_lads-run"));
     command.arg("--model").arg(model).args(arguments);
+    // Whatever the user's own cache has.
+    command.env("LADS_CACHE", "/nonexistent");
     command
 }
 
@@ -174,6 +176,30 @@ fn bad_arguments_are_refused() {
         &["--instruction", &unknown],
         &[&unknown, "the nearest", known],
     );
+}
+
+#[test]
+fn sentences_that_nobody_can_hear_are_refused() {
+    let model = kitchen_bundle();
+    let said = |sentence: &str, rest: &[&str], parts: &[&str]| {
+        let arguments = [&["--instruction", sentence], rest].concat();
+        refused(&model, &arguments, parts);
+    };
+    for empty in ["", " \n\t"] {
+        said(empty, &[], &["--instruction", "empty sentence"]);
+    }
+    let hint = if cfg!(feature = "language") {
+        "make language"
+    } else {
+        "make say"
+    };
+    said("dance", &[], &["dance", "the nearest", hint]);
+    refused(&model, &["--encode-language"], &["--encode-language", hint]);
+    said("mkbs", &["--sub-tasks", "kettle"], &["--sub-tasks", "mkbs"]);
+    refused(&model, &["--sub-tasks", "kettle"], &["--sub-tasks"]);
+    for rest in [&["--verify"][..], &["--plans", "p.json"], &["--sweep"]] {
+        said("dance", rest, &[rest[0], "bundle's table"]);
+    }
 }
 
 #[test]

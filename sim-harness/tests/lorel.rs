@@ -25,7 +25,7 @@ struct Recorded {
 /// Loaded once, so that its settled postures are made once.
 fn scene() -> &'static Scene {
     static SCENE: OnceLock<Scene> = OnceLock::new();
-    SCENE.get_or_init(|| Scene::load(&vendor_dir()).unwrap())
+    SCENE.get_or_init(|| Scene::load(&vendor_dir()).unwrap_or_else(|error| panic!("{error}")))
 }
 
 fn seed([seed, instruction, episode]: [u64; 3]) -> EpisodeSeed {

@@ -74,6 +74,7 @@ fn log(policy: &Policy<'_>, evaluated: &Evaluated) -> Log {
             .enumerate()
             .for_each(|(i, c)| c.sub_task = i);
         Flight {
+            words: None,
             instruction_id: known.id.to_owned(),
             instruction_text: known.text.to_owned(),
             completed,

@@ -121,6 +121,17 @@ pub struct Instruction {
     pub split: String,
 }
 
+/// What becomes of the words of an instruction.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Pooling {
+    /// Each is heard.
+    #[default]
+    None,
+    /// The mean of the encoder's last layer over all tokens is heard, as one word.
+    Mean,
+}
+
 /// The language encoder that made the word embeddings.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 pub struct Language {
@@ -132,6 +143,9 @@ pub struct Language {
     pub dim: usize,
     /// The hidden layer that is read; negative counts from the last.
     pub layer: i32,
+    /// What becomes of the words; left out, nothing.
+    #[serde(default)]
+    pub pooling: Pooling,
 }
 
 /// Sizes of the transformer.

@@ -245,7 +245,10 @@ mod tests {
 
     #[test]
     fn completions_are_latched_with_the_first_step() {
-        let mut kitchen = Kitchen::new(&Scene::load(&vendor_dir()).unwrap(), Noise::None);
+        let mut kitchen = Kitchen::new(
+            &Scene::load(&vendor_dir()).unwrap_or_else(|error| panic!("{error}")),
+            Noise::None,
+        );
         let mut step_at = |slide: f64| {
             kitchen.data.qpos_mut()[SLIDE] = slide;
             kitchen.step(&[0.0; ACTION_LEN]).unwrap();

@@ -71,6 +71,8 @@ pub struct Flight {
     pub instruction_id: String,
     /// Its text.
     pub instruction_text: String,
+    /// Word embeddings `[n, E]` that were heard; `None` where they were the bundle's own.
+    pub words: Option<Vec<f32>>,
     /// Names of the completed sub-tasks, in the order of `trace.outcome.completions`.
     pub completed: Vec<String>,
     /// The control steps and what they came to. Read from a log, a completion's sub-task is its place in `completed`.
@@ -106,6 +108,9 @@ struct EpisodeMessage {
     instruction: u32,
     instruction_id: String,
     instruction_text: String,
+    /// Of an instruction that the language encoder heard.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    words: Option<Vec<f32>>,
     episode: u32,
     /// In decimal digits: a JSON number would lose bits in JavaScript.
     sampling_seed: Option<String>,

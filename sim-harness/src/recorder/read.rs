@@ -190,6 +190,7 @@ fn begun(start: EpisodeMessage) -> Result<Flight, LogError> {
     Ok(Flight {
         instruction_id: start.instruction_id,
         instruction_text: start.instruction_text,
+        words: start.words,
         completed: Vec::new(),
         trace: Trace {
             instruction: start.instruction,

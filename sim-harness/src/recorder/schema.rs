@@ -79,6 +79,11 @@ pub const TOPICS: [Topic; 8] = [
             ("instruction", Kind::Integer, "index in the policy's table"),
             ("instruction_id", Kind::Text, "short name"),
             ("instruction_text", Kind::Text, "what the policy is told"),
+            (
+                "words",
+                Kind::Numbers,
+                "word embeddings by the language encoder; absent where the bundle's own were heard",
+            ),
             ("episode", Kind::Integer, "number within the instruction"),
             (
                 "sampling_seed",

@@ -98,6 +98,7 @@ impl<W: Write + Seek> Recorder<W> {
             instruction: trace.instruction,
             instruction_id: flight.instruction_id.clone(),
             instruction_text: flight.instruction_text.clone(),
+            words: flight.words.clone(),
             episode: trace.episode,
             sampling_seed: trace.sampling_seed.map(|seed| seed.to_string()),
             commanded: trace.commanded,

@@ -12,7 +12,7 @@ pub struct Arguments {
     /// The policy bundle (ONNX)
     #[arg(long)]
     pub model: PathBuf,
-    /// Run only this instruction, by its text or its id
+    /// Run only this instruction, by its text or its id; any other sentence goes through the language encoder
     #[arg(long)]
     pub instruction: Option<String>,
     /// Episodes of each instruction; left out, 2, and with --verify all that the reference has
@@ -55,6 +55,8 @@ pub struct Arguments {
     #[arg(long, value_name = "HTML")]
     pub report: Option<PathBuf>,
     #[command(flatten)]
+    pub language: LanguageArguments,
+    #[command(flatten)]
     pub recordings: RecordingArguments,
     #[command(flatten)]
     pub faults: FaultArguments,
@@ -66,6 +68,22 @@ pub enum IsaName {
     Portable,
     Avx2,
     Avx512,
+}
+
+/// Words that the bundle does not bring.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Language (cargo feature `language`)")]
+pub struct LanguageArguments {
+    /// What a sentence outside the bundle's table asks for, separated by commas: the episodes start, last and are judged as the benchmark's
+    /// episodes of these sub-tasks. Left out, they last their full time and have no success rate
+    #[arg(long, value_name = "SUB-TASKS")]
+    pub sub_tasks: Option<String>,
+    /// Take no word embeddings from the bundle's table: the language encoder hears every instruction
+    #[arg(long, conflicts_with_all = ["verify", "replay", "encode", "uniform"])]
+    pub encode_language: bool,
+    /// Folder of the language encoder; left out, where "make language" puts it
+    #[arg(long, value_name = "FOLDER")]
+    pub encoder: Option<PathBuf>,
 }
 
 /// Episodes on file.

@@ -8,6 +8,7 @@
 
 mod arguments;
 mod end;
+mod language;
 mod record;
 mod recordings;
 mod report;
@@ -34,6 +35,7 @@ use lads_sim::results::{self, DecisionUsed, EnvironmentUsed, InstructionResult, 
 use lads_sim::rollout::Actor;
 use lads_sim::table::Table;
 use lads_sim::{assets, command, fit, output, registry};
+use language::{Chosen, Heard};
 
 /// Exit code after an interrupt, as shells have it: 128 and the signal's number.
 const INTERRUPTED: u8 = 130;
@@ -68,7 +70,8 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
     let image = compile(&bundle).map_err(|error| about(&error))?;
     let policy = Policy::new_checked(image.as_bytes())
         .map_err(|error| about(&format_args!("{error}; export the bundle again")))?;
-    let chosen = choose(&bundle, arguments.instruction.as_deref())?;
+    let chosen = Chosen::of(arguments, &bundle)?;
+    let mut heard = language::hear(arguments, &bundle, &policy, &chosen)?;
     self_test(&policy).map_err(|wrong| about(&wrong))?;
     let files = &arguments.recordings;
     if let Some(log) = &files.replay {
@@ -93,15 +96,23 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
             "{misfit}; use a bundle made for this environment"
         ))
     })?;
+    heard.words.sentence = chosen.sentence(arguments, environment.as_ref())?;
     let assignments: Vec<_> = (0..)
         .zip(contract.instructions().zip(commanded))
-        .filter(|(instruction, _)| chosen.as_ref().is_none_or(|all| all.contains(instruction)))
+        .filter(|(instruction, _)| chosen.has(*instruction))
         .filter(|(instruction, _)| book.as_ref().is_none_or(|book| book.knows(*instruction)))
         .map(|(instruction, (known, commanded))| Assignment {
             instruction,
             commanded,
             max_steps: environment.max_steps(known.split),
         })
+        .chain(
+            heard
+                .words
+                .sentence
+                .iter()
+                .map(|sentence| sentence.assignment(&contract, environment.as_ref())),
+        )
         .collect();
     check_plans(arguments, book.as_ref(), &assignments, &contract)?;
     let mut evaluation = Evaluation {
@@ -121,6 +132,7 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
             faults: arguments.faults.faults(),
             plans: book.as_ref(),
             traced: traced(arguments),
+            words: Some(&heard.words),
         },
     };
     if let Some(reference) = reference {
@@ -142,6 +154,7 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
         open: &open,
         environment: environment.as_ref(),
         noise,
+        heard: &heard,
         stop: &stop,
     };
     if arguments.faults.sweep {
@@ -168,6 +181,7 @@ struct Bench<'b> {
     open: &'b registry::Opener,
     environment: &'b dyn Environment,
     noise: &'b str,
+    heard: &'b Heard,
     stop: &'b AtomicBool,
 }
 
@@ -180,8 +194,49 @@ impl Bench<'_> {
         let start = Instant::now();
         let evaluated = evaluate(&evaluation, self.open, self.stop, what)?;
         let wall = start.elapsed();
-        let results = sum_up(&evaluation, self.environment, self.noise, &evaluated, wall);
+        let results = self.sum_up(&evaluation, &evaluated, wall);
         Ok((results, evaluated))
+    }
+
+    /// All that was measured, summed up.
+    fn sum_up(
+        &self,
+        evaluation: &Evaluation<'_>,
+        evaluated: &Evaluated,
+        wall: Duration,
+    ) -> Results {
+        let contract = evaluation.policy.contract();
+        let (environment, watched) = (self.environment, self.environment.sub_tasks());
+        let mut splits = results::split_names(&contract);
+        let sentence = self.heard.words.sentence.as_ref();
+        splits.extend(sentence.map(|sentence| sentence.known().split.to_owned()));
+        let of_each = evaluation.assignments.iter().zip(&evaluated.episodes);
+        let instructions: Vec<_> = of_each
+            .filter_map(|(assignment, episodes)| {
+                let known = evaluation.instruction(assignment.instruction)?;
+                Some(InstructionResult::new(&known, watched, episodes))
+            })
+            .collect();
+        let threads = evaluation.threads.min(evaluation.len());
+        Results {
+            format: results::FORMAT,
+            format_version: results::FORMAT_VERSION,
+            environment: EnvironmentUsed::new(environment, &splits),
+            bundle_sha256: contract.bundle_sha256().to_owned(),
+            seed: evaluation.seed,
+            noise: self.noise.to_owned(),
+            decision: DecisionUsed::of(evaluation.decision, evaluation.actor),
+            episodes_per_instruction: evaluation.episodes,
+            heard_by: self.heard.by.clone(),
+            faults: Some(evaluation.setup.faults).filter(|&faults| faults != Faults::default()),
+            plans_commanded: evaluation.setup.plans.is_some(),
+            plan_agreement: None,
+            versions: results::versions(),
+            splits: results::Splits::of(&splits, &instructions, watched),
+            instructions,
+            latency_us: results::LatencyByKind::of(&evaluated.timing),
+            time: results::TimeUse::of(&evaluated.timing, wall, threads),
+        }
     }
 
     /// The benchmark once for each level of each fault.
@@ -242,6 +297,7 @@ impl Bench<'_> {
             )?;
         }
         print(&Table(&results))?;
+        print(&self.heard.note)?;
         if let Some(agreement) = &results.plan_agreement {
             print(&recordings::agreement(agreement))?;
         }
@@ -340,26 +396,6 @@ fn check_numbers(arguments: &Arguments) -> Result<usize, End> {
     }
 }
 
-/// The numbers of the instructions with the id or the text that was asked for; `None` for all.
-fn choose(bundle: &Bundle, instruction: Option<&str>) -> Result<Option<Vec<u32>>, End> {
-    let Some(wanted) = instruction else {
-        return Ok(None);
-    };
-    let found = bundle.instruction_indices(wanted);
-    if !found.is_empty() {
-        return Ok(Some(found.into_iter().map(|index| index as u32).collect()));
-    }
-    let nearest = bundle
-        .nearest_instructions(wanted)
-        .iter()
-        .map(|text| format!("'{text}'"))
-        .collect::<Vec<_>>();
-    Err(refused(format!(
-        "--instruction '{wanted}': the bundle does not know it; the nearest that it knows: {}",
-        nearest.join(", ")
-    )))
-}
-
 /// Replays the bundle's golden episode on this machine; a policy that answers differently is not run.
 fn self_test(policy: &Policy<'_>) -> Result<(), String> {
     let mut memory = Memory::of(policy);
@@ -421,43 +457,5 @@ fn unfinished(error: EvaluationError) -> End {
         error => refused(format!(
             "{error}; run this instruction alone with the same seed to look into it"
         )),
-    }
-}
-
-/// All that was measured, summed up.
-fn sum_up(
-    evaluation: &Evaluation<'_>,
-    environment: &dyn Environment,
-    noise: &str,
-    evaluated: &Evaluated,
-    wall: Duration,
-) -> Results {
-    let (contract, watched) = (evaluation.policy.contract(), environment.sub_tasks());
-    let splits = results::split_names(&contract);
-    let of_each = evaluation.assignments.iter().zip(&evaluated.episodes);
-    let instructions: Vec<_> = of_each
-        .filter_map(|(assignment, episodes)| {
-            let known = contract.instruction(assignment.instruction as usize)?;
-            Some(InstructionResult::new(&known, watched, episodes))
-        })
-        .collect();
-    let threads = evaluation.threads.min(evaluation.len());
-    Results {
-        format: results::FORMAT,
-        format_version: results::FORMAT_VERSION,
-        environment: EnvironmentUsed::new(environment, &splits),
-        bundle_sha256: contract.bundle_sha256().to_owned(),
-        seed: evaluation.seed,
-        noise: noise.to_owned(),
-        decision: DecisionUsed::of(evaluation.decision, evaluation.actor),
-        episodes_per_instruction: evaluation.episodes,
-        faults: Some(evaluation.setup.faults).filter(|&faults| faults != Faults::default()),
-        plans_commanded: evaluation.setup.plans.is_some(),
-        plan_agreement: None,
-        versions: results::versions(),
-        splits: results::Splits::of(&splits, &instructions, watched),
-        instructions,
-        latency_us: results::LatencyByKind::of(&evaluated.timing),
-        time: results::TimeUse::of(&evaluated.timing, wall, threads),
     }
 }

@@ -104,8 +104,7 @@ mod with {
             let Some((assignment, trace)) = filmed else {
                 return Err(about(&self.path, "no episode ran"));
             };
-            let contract = evaluation.policy.contract();
-            let known = contract.instruction(assignment.instruction as usize);
+            let known = evaluation.instruction(assignment.instruction);
             let scene = Scene {
                 trace,
                 instruction: known.map_or("", |known| known.text),

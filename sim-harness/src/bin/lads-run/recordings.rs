@@ -154,13 +154,16 @@ pub fn log(
 ) -> Result<(), End> {
     let contract = evaluation.policy.contract();
     let flight = |trace: &Trace| {
-        let known = contract.instruction(trace.instruction as usize)?;
+        let known = evaluation.instruction(trace.instruction)?;
+        let words = evaluation.setup.words;
+        let words = words.and_then(|book| book.of(trace.instruction));
         let watched = environment.sub_tasks();
         let completed = trace.outcome.completions.iter();
         let completed = completed.filter_map(|done| watched.get(done.sub_task));
         Some(Flight {
             instruction_id: known.id.to_owned(),
             instruction_text: known.text.to_owned(),
+            words: words.map(<[f32]>::to_vec),
             completed: completed.map(|&name| name.to_owned()).collect(),
             trace: trace.clone(),
         })

@@ -1,0 +1,142 @@
+"""The language encoder outside Python: embeddings of `lads-language`, and what `lads-run` makes of them.
+
+The encoder is exported once for all tests here. Skipped where the exporter's environment is missing.
+"""
+
+import json
+import os
+import pathlib
+import re
+import subprocess
+
+import pytest
+
+language = pytest.importorskip("lads_exporter.language")
+from lads_exporter import config, language_graph  # noqa: E402
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
+REFUSED = 2
+# The Makefile's: with another one cargo would build tract once more.
+SELECTION = ("--workspace", "--features", "lads-sim/report,lads-sim/record,lads-sim/language")
+SENTENCES = (
+    "pull the drawer out",
+    "Please, open the DRAWER  a little - and then turn the tap to the left!",
+    "slide it: over there?",
+    "déplace la tasse noire",
+    "把水龙头向左转",
+    "🙂 wash the cup",
+    "antidisestablishmentarianism",
+    "x",
+)
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cache")
+    assert language_graph.write(language.DEFAULT, folder / "language" / language.DEFAULT)
+    return folder
+
+
+def test_embeddings_are_the_exporters(cache):
+    """Of all instructions of the shipped bundles, and of sentences outside their tables, to 1e-4."""
+    folder = cache / "language" / language.DEFAULT
+    cases = []
+    for name in ("kitchen", "lorel"):
+        setting = config.load(ROOT / f"exporter/configs/{name}.toml")
+        for text, embedded in zip(SENTENCES, language.encode(setting.config.language, SENTENCES).instructions, strict=True):
+            cases.append({"bundle": name, "text": text, "words": embedded.words.ravel().tolist()})
+    (folder / "cases.json").write_text(json.dumps(cases))
+    command = ["cargo", "test", *SELECTION, "--test", "exporter", "--", "--nocapture"]
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | {"LADS_LANGUAGE": str(folder)}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    compared = re.findall(r"(\w+): (\d+) sentences, largest difference (\S+)", done.stdout)
+    assert [name for name, *_ in compared] == ["kitchen", "lorel"], done.stdout
+    print(compared)
+
+
+def lads_run(cache, model, *arguments):
+    """-> exit code, stdout, stderr."""
+    program = TARGET / "debug/lads-run"
+    if not program.is_file():
+        pytest.skip("lads-run is not built: run `make test-exporter`")
+    command = [program, "--model", ROOT / f"models/{model}.onnx", *arguments]
+    done = subprocess.run(command, env=os.environ | {"LADS_CACHE": str(cache)}, capture_output=True, text=True, timeout=300)
+    if "built without the language encoder" in done.stderr:
+        pytest.skip("lads-run is built without the feature `language`: run `make test-exporter`")
+    return done.returncode, done.stdout, done.stderr
+
+
+def results(cache, folder, model, *arguments):
+    """-> the table, the JSON."""
+    file = folder / "results.json"
+    code, table, wrong = lads_run(cache, model, "--episodes", "1", "--json", file, *arguments)
+    assert code == 0, wrong
+    return table, json.loads(file.read_text())
+
+
+def refusal(cache, model, *arguments):
+    code, out, wrong = lads_run(cache, model, *arguments)
+    assert code == REFUSED and out == "" and len(wrong.splitlines()) == 1, (code, out, wrong)
+    return wrong
+
+
+@pytest.mark.parametrize(("model", "arguments", "count"), [("lorel", (), 101), ("kitchen", ("--instruction", "mkbs"), 1)])
+def test_table_and_encoder_make_the_same_episodes(cache, tmp_path, model, arguments, count):
+    """All 71 rephrased instructions are among LOReL's."""
+    _, table = results(cache, tmp_path, model, *arguments)
+    text, heard = results(cache, tmp_path, model, *arguments, "--encode-language")
+    assert f"{count} instructions heard by the language encoder" in text
+    assert 0 < heard["heard_by"]["largest_difference"] < 1e-4 and "heard_by" not in table
+    assert len(table["instructions"]) == count
+    assert heard["instructions"] == table["instructions"], "the same steps, plans and completions"
+    if model == "lorel":
+        assert sum(row["split"] == "rephrased" for row in heard["instructions"]) == 71
+
+
+def test_a_sentence_outside_the_table_runs_without_a_success_rate(cache, tmp_path):
+    table, found = results(cache, tmp_path, "lorel", "--instruction", "pull the drawer out")
+    (row,) = found["instructions"]
+    assert (row["id"], row["text"], row["split"]) == ("free", "pull the drawer out", "free")
+    (run,) = row["runs"]
+    assert row["full_success"] is None and row["n_rate"] is None and run["success"] is None
+    assert run["steps"] == 40 and len(run["plans"]) == 8, "the benchmark's longest episode, to its end"
+    assert found["splits"]["free"]["episodes"] == 1 and found["heard_by"]["largest_difference"] is None
+    assert "is heard most like" in table and "no success rate" in table
+
+
+def test_a_sentence_is_judged_by_the_sub_tasks_that_are_named(cache, tmp_path):
+    table, found = results(cache, tmp_path, "lorel", "--instruction", "pull the drawer out", "--sub-tasks", "open drawer")
+    (row,) = found["instructions"]
+    assert [of["sub_task"] for of in row["completions"]] == ["open drawer"]
+    assert row["full_success"] in (0, 1) and row["runs"][0]["success"] in (True, False)
+    assert row["runs"][0]["steps"] <= 20, "as long as the benchmark's episodes of this sub-task"
+    _, other = results(cache, tmp_path, "kitchen", "--instruction", "open the microwave, please", "--sub-tasks", "microwave")
+    assert other["instructions"][0]["runs"][0]["steps"] <= 280
+    assert "no success rate" not in table
+
+
+def test_a_log_of_a_sentence_replays(cache, tmp_path):
+    log = tmp_path / "flight.mcap"
+    results(cache, tmp_path, "lorel", "--instruction", "pull the drawer out", "--log", log)
+    code, out, wrong = lads_run(cache, "lorel", "--replay", log)
+    assert code == 0 and out.startswith("EQUAL: 1 episodes"), out + wrong
+
+
+def test_refusals(cache, tmp_path):
+    long = "and then turn the faucet " * 120
+    assert "hears at most 24" in refusal(cache, "kitchen", "--instruction", "open the microwave, please, " * 5)
+    assert "hears at most 512" in refusal(cache, "lorel", "--instruction", long)
+    assert "empty sentence" in refusal(cache, "lorel", "--instruction", "\u200b")
+    wrong = refusal(tmp_path / "no", "lorel", "--instruction", "open teh drawer")
+    assert "make language" in wrong and "open drawer" in wrong and str(tmp_path / "no") in wrong
+    assert "make language" in refusal(tmp_path / "no", "lorel", "--encode-language")
+    assert "open drawer, close drawer" in refusal(cache, "lorel", "--instruction", "shut it", "--sub-tasks", "shut it")
+    other = tmp_path / "other"
+    other.mkdir()
+    for file in ("encoder.onnx", "tokenizer.json"):
+        (other / file).symlink_to(cache / "language" / language.DEFAULT / file)
+    manifest = json.loads((cache / "language" / language.DEFAULT / "manifest.json").read_text())
+    (other / "manifest.json").write_text(json.dumps(manifest | {"sha256": "0123456789abcdef" * 4}))
+    wrong = refusal(cache, "lorel", "--instruction", "shut it", "--encoder", other)
+    assert "0123456789ab" in wrong and manifest["sha256"][:12] in wrong
