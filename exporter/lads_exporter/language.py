@@ -85,6 +85,11 @@ def _encode_random(dim, texts, pool):
     return Encoded(rows, f"random-{dim}", hashlib.sha256(f"random-{dim}".encode()).hexdigest())
 
 
+def weights_sha256(encoder):
+    """What contracts know an encoder by."""
+    return _weights_sha256(_folder(encoder))
+
+
 def load(encoder):
     """-> tokenizer, model with its hidden layers, sha256 of the weights."""
     import torch  # noqa: F401  transformers gives no models without it

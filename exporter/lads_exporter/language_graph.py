@@ -174,9 +174,9 @@ def write(encoder, folder):
     folder = Path(folder)
     if folder.exists() and not (folder / MANIFEST).is_file() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"{folder} is something else than a language encoder; name another folder")
-    tokenizer, model, sha256 = language.load(encoder)
-    if is_whole(folder, sha256):
+    if is_whole(folder, language.weights_sha256(encoder)):
         return False
+    tokenizer, model, sha256 = language.load(encoder)
     _check_form(encoder, model)
     data = _Bert(model).build().SerializeToString(deterministic=True)
     difference = _compare(data, tokenizer, model)
