@@ -81,7 +81,7 @@ impl Encoder {
 
     /// The word embeddings `[n, E]`, row by row, of a sentence.
     ///
-    /// They are those of the exporter to 1e-4: hidden layer `language.layer` without the leading [CLS] and with the trailing [SEP], or the mean
+    /// They are those of the exporter to 1e-4: hidden layer `language.layer` without the leading `[CLS]` and with the trailing `[SEP]`, or the mean
     /// of the last layer over all tokens, as the contract says.
     pub fn words(&self, text: &str) -> Result<Vec<f32>, LanguageError> {
         let failed = |problem: String| LanguageError::Run {
