@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -36,53 +37,90 @@ def default_folder(encoder):
     return cache_folder() / "language" / language.name(encoder)
 
 
-class _Bert:
-    """BertModel of transformers, node by node, for one sentence without padding."""
+@dataclass(frozen=True)
+class _Block:
+    """The modules of one layer, whatever the model calls them."""
 
-    def __init__(self, model):
-        self.config = model.config
+    query: object
+    key: object
+    value: object
+    out: object
+    norm1: object
+    up: object
+    down: object
+    norm2: object
+
+
+def _bert_block(layer):
+    attention, inner = layer.attention, layer.attention.self
+    mixing = (inner.query, inner.key, inner.value, attention.output.dense, attention.output.LayerNorm)
+    return _Block(*mixing, layer.intermediate.dense, layer.output.dense, layer.output.LayerNorm)
+
+
+def _distilbert_block(layer):
+    attention = layer.attention
+    mixing = (attention.q_lin, attention.k_lin, attention.v_lin, attention.out_lin, layer.sa_layer_norm)
+    return _Block(*mixing, layer.ffn.lin1, layer.ffn.lin2, layer.output_layer_norm)
+
+
+def _blocks(encoder, model):
+    config = model.config
+    kind = config.model_type
+    activation = getattr(config, "activation" if kind == "distilbert" else "hidden_act", None)
+    positions = getattr(config, "position_embedding_type", None) or "absolute"
+    if kind not in ("bert", "distilbert") or activation != "gelu" or positions != "absolute":
+        form = f"{kind} model with activation {activation} and {positions} positions"
+        raise UserError(f"{encoder}: a {form}; only BERT and DistilBERT with gelu and absolute ones are exported, use one of these")
+    if kind == "bert":
+        return [_bert_block(layer) for layer in model.encoder.layer]
+    return [_distilbert_block(layer) for layer in model.transformer.layer]
+
+
+class _Network:
+    """BERT or DistilBERT node by node, for one sentence without padding."""
+
+    def __init__(self, model, blocks):
+        self.model, self.blocks = model, blocks
+        self.heads_len, self.hidden = model.config.num_attention_heads, model.config.hidden_size
         self.graph = Graph()
         self.entry = Entry(self.graph, "encoder")
-        self.embeddings, self.blocks = model.embeddings, model.encoder.layer
         self.ids = self.entry.input("ids", ["N"], TensorProto.INT64)
 
     def layer_norm(self, x, name, module, out):
         entry = self.entry
         scale, bias = entry.weight(name + ".scale", module.weight), entry.weight(name + ".bias", module.bias)
-        return entry.op("LayerNormalization", [x, scale, bias], out, axis=-1, epsilon=self.config.layer_norm_eps)
+        return entry.op("LayerNormalization", [x, scale, bias], out, axis=-1, epsilon=module.eps)
 
     def embed(self):
-        """Word, position and the first sentence's type, normalised."""
-        entry, tables = self.entry, self.embeddings
+        """Words and positions (BERT: of the first sentence's type), normalised."""
+        entry, tables = self.entry, self.model.embeddings
         words = entry.op("Gather", [entry.weight("words", tables.word_embeddings.weight), self.ids], "words", axis=0)
-        places = to_numpy(tables.position_embeddings.weight) + to_numpy(tables.token_type_embeddings.weight)[0]
+        places = to_numpy(tables.position_embeddings.weight)
+        if hasattr(tables, "token_type_embeddings"):
+            places = places + to_numpy(tables.token_type_embeddings.weight)[0]
         tokens = entry.op("Shape", [self.ids], "tokens")
         bounds = [entry.integers("first", [0]), tokens, entry.integers("rows", [0])]
         places = entry.op("Slice", [entry.weight("positions", places), *bounds], "positions")
         summed = entry.op("Add", [words, places], "embedded")
         return self.layer_norm(summed, "norm", tables.LayerNorm, "layer.0")
 
-    def heads(self, x, name, module, out):
+    def heads(self, x, name, module):
         """[n, E] -> [heads, n, E / heads]."""
-        entry, heads = self.entry, self.config.num_attention_heads
-        rows = entry.linear(x, name, module, out + ".rows")
-        shape = entry.integers("split_heads", [0, heads, self.config.hidden_size // heads])
-        split = entry.op("Reshape", [rows, shape], out + ".split")
-        return entry.op("Transpose", [split], out, perm=[1, 0, 2])
+        entry = self.entry
+        rows = entry.linear(x, name, module, name + ".rows")
+        shape = entry.integers("split_heads", [0, self.heads_len, self.hidden // self.heads_len])
+        return entry.op("Transpose", [entry.op("Reshape", [rows, shape], name + ".split")], name, perm=[1, 0, 2])
 
-    def attend(self, x, name, attention):
-        entry, inner = self.entry, attention.self
-        head_dim = self.config.hidden_size // self.config.num_attention_heads
-        query, key, value = (
-            self.heads(x, f"{name}.{part}", getattr(inner, part), f"{name}.{part}") for part in ("query", "key", "value")
-        )
+    def attend(self, x, name, block):
+        entry = self.entry
+        query, key, value = (self.heads(x, f"{name}.{part}", getattr(block, part)) for part in ("query", "key", "value"))
         turned = entry.op("Transpose", [key], name + ".keys", perm=[0, 2, 1])
         product = entry.op("MatMul", [query, turned], name + ".product")
-        scale = entry.graph.constant("constants/attention_scale", np.float32(head_dim**-0.5))
+        scale = entry.graph.constant("constants/attention_scale", np.float32((self.hidden // self.heads_len) ** -0.5))
         shares = entry.op("Softmax", [entry.op("Mul", [product, scale], name + ".scores")], name + ".attention", axis=-1)
         mixed = entry.op("Transpose", [entry.op("MatMul", [shares, value], name + ".mixed_heads")], name + ".turned", perm=[1, 0, 2])
-        mixed = entry.op("Reshape", [mixed, entry.integers("join_heads", [0, self.config.hidden_size])], name + ".mixed")
-        return entry.linear(mixed, name + ".out", attention.output.dense, name + ".attended")
+        mixed = entry.op("Reshape", [mixed, entry.integers("join_heads", [0, self.hidden])], name + ".mixed")
+        return entry.linear(mixed, name + ".out", block.out, name + ".attended")
 
     def gelu(self, x, name):
         """x/2 (1 + erf(x / sqrt 2))."""
@@ -91,31 +129,24 @@ class _Bert:
         part = entry.op("Add", [part, constant("one", 1.0)], name + ".raised")
         return entry.op("Mul", [entry.op("Mul", [x, part], name + ".twice"), constant("half", 0.5)], name)
 
-    def block(self, x, number):
-        entry, block, name = self.entry, self.blocks[number], f"block.{number}"
-        mixed = entry.op("Add", [x, self.attend(x, name, block.attention)], name + ".joined")
-        x = self.layer_norm(mixed, name + ".norm1", block.attention.output.LayerNorm, name + ".normed")
-        up = self.gelu(entry.linear(x, name + ".up", block.intermediate.dense, name + ".up"), name + ".gelu")
-        down = entry.linear(up, name + ".down", block.output.dense, name + ".down")
-        return self.layer_norm(entry.op("Add", [x, down], name + ".sum"), name + ".norm2", block.output.LayerNorm, f"layer.{number + 1}")
+    def block(self, x, number, block):
+        entry, name = self.entry, f"block.{number}"
+        mixed = entry.op("Add", [x, self.attend(x, name, block)], name + ".joined")
+        x = self.layer_norm(mixed, name + ".norm1", block.norm1, name + ".normed")
+        up = self.gelu(entry.linear(x, name + ".up", block.up, name + ".up"), name + ".gelu")
+        down = entry.linear(up, name + ".down", block.down, name + ".down")
+        return self.layer_norm(entry.op("Add", [x, down], name + ".sum"), name + ".norm2", block.norm2, f"layer.{number + 1}")
 
     def build(self):
         layers = [self.embed()]
-        for number in range(len(self.blocks)):
-            layers.append(self.block(layers[-1], number))
+        for number, block in enumerate(self.blocks):
+            layers.append(self.block(layers[-1], number, block))
         rows = [self.entry.op("Unsqueeze", [x, self.entry.integers("axis_zero", [0])], f"{x.split('/')[1]}.row") for x in layers]
         self.entry.op("Concat", rows, "hidden", axis=0)
-        self.entry.output("hidden", [len(layers), "N", self.config.hidden_size])
+        self.entry.output("hidden", [len(layers), "N", self.hidden])
         model = self.graph.model("language-encoder")
         onnx.checker.check_model(model, full_check=True)
         return model
-
-
-def _check_form(encoder, model):
-    config = model.config
-    form = (config.model_type, getattr(config, "hidden_act", None), getattr(config, "position_embedding_type", None) or "absolute")
-    if form != ("bert", "gelu", "absolute"):
-        raise UserError(f"{encoder}: a {'/'.join(map(str, form))} model; only bert/gelu/absolute is exported, use such an encoder")
 
 
 def _compare(data, tokenizer, model):
@@ -177,8 +208,7 @@ def write(encoder, folder):
     if is_whole(folder, language.weights_sha256(encoder)):
         return False
     tokenizer, model, sha256 = language.load(encoder)
-    _check_form(encoder, model)
-    data = _Bert(model).build().SerializeToString(deterministic=True)
+    data = _Network(model, _blocks(encoder, model)).build().SerializeToString(deterministic=True)
     difference = _compare(data, tokenizer, model)
     if not difference <= TOLERANCE:
         raise UserError(f"{encoder}: the exported graph differs from PyTorch by {difference:.1e}; nothing was written")

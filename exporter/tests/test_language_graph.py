@@ -7,7 +7,6 @@ import onnxruntime
 import pytest
 import tiny_encoder
 from tokenizers import Tokenizer
-from transformers import DistilBertConfig, DistilBertModel
 
 from lads_exporter import language, language_graph
 from lads_exporter.config import UserError
@@ -20,7 +19,10 @@ def source(tmp_path_factory):
     return str(folder)
 
 
-def test_graph_and_tokeniser_alone_give_pytorchs_layers(source, tmp_path):
+@pytest.mark.parametrize("make", [tiny_encoder.bert, tiny_encoder.distilbert])
+def test_graph_and_tokeniser_alone_give_pytorchs_layers(make, tmp_path):
+    source = str(tmp_path / "tiny-encoder")
+    tiny_encoder.save(source, make)
     assert language_graph.write(source, tmp_path / "out")
     tokenizer, model, sha256 = language.load(source)
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
@@ -71,11 +73,9 @@ def test_refusals_name_what_is_wrong(source, tmp_path):
         language_graph.write("random-8", tmp_path / "out")
     with pytest.raises(UserError, match="no folder with a config.json"):
         language_graph.write(str(tmp_path / "none"), tmp_path / "out")
-    other = tmp_path / "distilbert"
-    tiny_encoder.save(other)
-    sizes = {"dim": 8, "n_layers": 1, "n_heads": 2, "hidden_dim": 12, "max_position_embeddings": 16}
-    DistilBertModel(DistilBertConfig(vocab_size=len(tiny_encoder.WORDS), **sizes)).save_pretrained(other)
-    with pytest.raises(UserError, match="a distilbert/"):
+    other = tmp_path / "other"
+    tiny_encoder.save(other, lambda: tiny_encoder.bert(hidden_act="relu"))
+    with pytest.raises(UserError, match="a bert model with activation relu"):
         language_graph.write(str(other), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

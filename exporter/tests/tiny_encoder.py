@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, processors
-from transformers import BertConfig, BertModel, PreTrainedTokenizerFast
+from transformers import BertConfig, BertModel, DistilBertConfig, DistilBertModel, PreTrainedTokenizerFast
 
 from lads_exporter import language, language_graph
 
@@ -18,11 +18,20 @@ WORDS = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "open", "close", "the", "draw", "##
 SENTENCES = ("open the drawer", "Close THE cupboard, slowly!", "open")
 
 
-def save(folder):
+def bert(**changes):
+    sizes = {"hidden_size": 8, "num_hidden_layers": 2, "num_attention_heads": 2, "intermediate_size": 12, "max_position_embeddings": 16}
+    return BertModel(BertConfig(vocab_size=len(WORDS), initializer_range=0.5, **sizes, **changes), add_pooling_layer=False)
+
+
+def distilbert():
+    sizes = {"dim": 8, "n_layers": 2, "n_heads": 2, "hidden_dim": 12, "max_position_embeddings": 16}
+    return DistilBertModel(DistilBertConfig(vocab_size=len(WORDS), initializer_range=0.5, **sizes))
+
+
+def save(folder, make=bert):
     """The model and its tokeniser as transformers keeps them."""
     torch.manual_seed(0)
-    sizes = {"hidden_size": 8, "num_hidden_layers": 2, "num_attention_heads": 2, "intermediate_size": 12, "max_position_embeddings": 16}
-    BertModel(BertConfig(vocab_size=len(WORDS), initializer_range=0.5, **sizes), add_pooling_layer=False).save_pretrained(folder)
+    make().save_pretrained(folder)
     tokenizer = Tokenizer(models.WordPiece({word: i for i, word in enumerate(WORDS)}, unk_token="[UNK]"))
     tokenizer.normalizer = normalizers.BertNormalizer()
     tokenizer.pre_tokenizer = pre_tokenizers.BertPreTokenizer()

@@ -7,6 +7,7 @@ import json
 import os
 import pathlib
 import re
+import shutil
 import subprocess
 
 import pytest
@@ -35,7 +36,8 @@ SENTENCES = (
 def cache(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cache")
     assert language_graph.write(language.DEFAULT, folder / "language" / language.DEFAULT)
-    return folder
+    yield folder
+    shutil.rmtree(folder)
 
 
 def test_embeddings_are_the_exporters(cache):
