@@ -140,6 +140,38 @@ fn the_archive_exports_lads_functions_and_asks_for_nothing_else() {
     }
 }
 
+/// The archive is optimised on its own, so its loops could fall back to one element at a time unseen. What the C program executes
+/// under `callgrind`, opening, self-test and 100 control steps, is counted: 270 million instructions with AVX2, 348 million
+/// where the softmax was not vectorised.
+#[cfg(target_arch = "x86_64")]
+#[test]
+fn the_archive_is_vectorised() {
+    const MOST: u64 = 300_000_000;
+    if !is_x86_feature_detected!("avx2") || !is_x86_feature_detected!("f16c") {
+        println!("skipped: this processor has no AVX2");
+        return;
+    }
+    let program = build("cc", "c/main.c", "user_counted", &["-std=c99", "-O2"]);
+    let counted = Command::new("valgrind")
+        .args(["--tool=callgrind", "--callgrind-out-file=/dev/null"])
+        .arg(&program)
+        .arg(kitchen())
+        .output();
+    let Ok(counted) = counted else {
+        println!("skipped: valgrind is not installed");
+        return;
+    };
+    assert!(counted.status.success(), "{counted:?}");
+    let said = String::from_utf8_lossy(&counted.stderr);
+    let executed: u64 = said
+        .lines()
+        .find_map(|line| line.split_once("refs:"))
+        .and_then(|(_, number)| number.trim().replace(',', "").parse().ok())
+        .expect("callgrind says how many instructions were read");
+    println!("instructions of the C program: {executed}");
+    assert!(executed <= MOST, "{executed} instructions, at most {MOST}");
+}
+
 #[test]
 fn a_c_program_links_without_panics_and_stays_small() {
     let program = build("cc", "c/main.c", "user_c", &["-std=c99", "-O2"]);
