@@ -43,6 +43,9 @@ pub struct Setup<'e> {
     pub plans: Option<&'e PlanBook>,
     /// Word embeddings that are heard instead of the table's.
     pub words: Option<&'e WordBook>,
+    /// Whether an episode in which the controller refuses an observation ends there and counts as it stands, as a machine would stop;
+    /// otherwise it ends everything.
+    pub stop_where_refused: bool,
     /// How many of each instruction's episodes, from the first, keep every control step.
     pub traced: u32,
 }
@@ -97,6 +100,9 @@ pub struct Evaluated {
     pub episodes: Vec<Vec<Episode>>,
     /// Every control step, in the same order, where the setup asked for it; empty otherwise.
     pub traces: Vec<Trace>,
+    /// The control steps, from 0, at which episodes ended because the controller refused an observation; empty unless the setup lets
+    /// episodes end so.
+    pub refused_at: Vec<usize>,
     /// Durations, summed over the threads.
     pub timing: Timing,
 }
@@ -104,6 +110,7 @@ pub struct Evaluated {
 /// What one thread did: its episodes with their places in the queue.
 struct Share {
     episodes: Vec<(usize, Episode, Option<Trace>)>,
+    refused_at: Vec<usize>,
     timing: Timing,
 }
 
@@ -156,14 +163,17 @@ impl Evaluation<'_> {
 
         let mut timing = Timing::default();
         let mut all = Vec::with_capacity(self.len());
+        let mut refused_at = Vec::new();
         for outcome in outcomes {
             let share = outcome?;
             all.extend(share.episodes);
+            refused_at.extend(share.refused_at);
             timing.absorb(share.timing);
         }
         if all.len() < self.len() {
             return Err(EvaluationError::Interrupted);
         }
+        refused_at.sort_unstable();
         all.sort_unstable_by_key(|&(place, ..)| place);
         let mut traces = Vec::new();
         let mut ordered = all.into_iter().map(|(_, episode, trace)| {
@@ -178,6 +188,7 @@ impl Evaluation<'_> {
         Ok(Evaluated {
             episodes,
             traces,
+            refused_at,
             timing,
         })
     }
@@ -197,20 +208,24 @@ impl Evaluation<'_> {
         if self.setup.traced > 0 {
             driver.record();
         }
-        let mut episodes = Vec::new();
+        let (mut episodes, mut refused_at) = (Vec::new(), Vec::new());
         while let Some(place) = next() {
             let episode = (place % self.episodes as usize) as u32;
             let Some(assignment) = self.assignments.get(place / self.episodes as usize) else {
                 break;
             };
             let task = self.task(assignment, episode);
-            let run = driver
-                .run(&task)
-                .map_err(|source| EvaluationError::Rollout {
+            let run = match driver.run(&task) {
+                Err(RolloutError::Step { step, .. }) if self.setup.stop_where_refused => {
+                    refused_at.push(step);
+                    driver.outcome(&task)
+                }
+                other => other.map_err(|source| EvaluationError::Rollout {
                     instruction: assignment.instruction,
                     episode,
                     source,
-                })?;
+                })?,
+            };
             let trace = (episode < self.setup.traced).then(|| Trace {
                 instruction: assignment.instruction,
                 episode,
@@ -227,6 +242,7 @@ impl Evaluation<'_> {
         }
         Ok(Share {
             episodes,
+            refused_at,
             timing: driver.timing,
         })
     }

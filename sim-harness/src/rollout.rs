@@ -149,6 +149,8 @@ pub struct Driver<'a, 'm, 'e> {
     executed: Vec<f32>,
     command: Vec<f64>,
     limits: Vec<(f64, f64)>,
+    /// Plans decided in the episode.
+    plans: Vec<u32>,
     /// Control steps of the episode, where they are kept.
     recording: Option<Vec<Step>>,
     /// What was measured so far.
@@ -172,6 +174,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             executed: vec![0.0; action_len],
             command: vec![0.0; action_len],
             limits,
+            plans: Vec::new(),
             recording: None,
             timing: Timing::default(),
         }
@@ -188,6 +191,17 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             .as_mut()
             .map(std::mem::take)
             .unwrap_or_default()
+    }
+
+    /// What the last episode came to as far as it got, also where [`run`](Self::run) has failed.
+    pub fn outcome(&self, task: &Task<'_>) -> Episode {
+        Episode {
+            steps: self.environment.steps(),
+            success: self.succeeded(task),
+            completions: self.environment.completions().to_vec(),
+            plans: self.plans.clone(),
+            final_state: self.environment.state().to_vec(),
+        }
     }
 
     /// Runs one episode to its end: the instruction is carried out, or the steps or the commanded plans are used up.
@@ -208,7 +222,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         let most = task.plans.map_or(task.max_steps, |plans| {
             task.max_steps.min(plans.len() * horizon)
         });
-        let mut plans = Vec::with_capacity(most.div_ceil(horizon));
+        self.plans.clear();
         let mut uniform = task.actor.stream(task.seed);
         let mut step = 0;
         while step < most && !self.succeeded(task) {
@@ -216,7 +230,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
                 None => {
                     let (report, elapsed_ns) = self.decide(step, horizon, task.plans)?;
                     if report.decided {
-                        plans.push(report.plan.0);
+                        self.plans.push(report.plan.0);
                     }
                     let before_cpu = cpu_time();
                     link.actuate(&self.action, &mut self.executed);
@@ -230,13 +244,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             step += 1;
         }
         self.timing.episodes_cpu += cpu_since(episode_cpu);
-        Ok(Episode {
-            steps: self.environment.steps(),
-            success: self.succeeded(task),
-            completions: self.environment.completions().to_vec(),
-            plans,
-            final_state: self.environment.state().to_vec(),
-        })
+        Ok(self.outcome(task))
     }
 
     fn succeeded(&self, task: &Task<'_>) -> bool {

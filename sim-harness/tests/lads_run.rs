@@ -376,3 +376,41 @@ fn a_log_replays_and_its_plans_run() {
         &["--drop-rate 2", "from 0 to 1"],
     );
 }
+
+#[test]
+fn a_sweep_runs_every_level_of_every_fault() {
+    let folder = tempfile::tempdir().unwrap();
+    let arguments = ["--sweep", "--episodes", "1", "--instruction", "kbls"];
+    let (table, sweep) = results(&arguments, &folder.path().join("s.json"));
+    let levels = sweep["levels"].as_array().unwrap();
+    assert_eq!(levels.len(), 20);
+    let of = |fault: &str| -> Vec<&Value> {
+        levels
+            .iter()
+            .filter(|level| level["fault"] == fault)
+            .collect()
+    };
+    let rate = |level: &Value| level["splits"]["seen"]["n_rate"].as_f64().unwrap();
+    for fault in ["delay-steps", "drop-rate", "noise-scale", "action-lag"] {
+        assert!(table.contains(fault), "{table}");
+        let levels = of(fault);
+        assert_eq!(levels.len(), 5);
+        // The first level of each is none of it.
+        assert_eq!(levels[0]["splits"], of("delay-steps")[0]["splits"]);
+        assert!(
+            levels
+                .iter()
+                .all(|level| (0.0..=4.0).contains(&rate(level)))
+        );
+        assert!(
+            levels
+                .iter()
+                .all(|level| level["refused_episodes"] == 0 && level["episodes"] == 1)
+        );
+    }
+    // The last levels of these are more than this policy bears.
+    for fault in ["delay-steps", "noise-scale", "action-lag"] {
+        let rates: Vec<_> = of(fault).into_iter().map(rate).collect();
+        assert!(rates[4] < rates[0], "{fault}: {rates:?}");
+    }
+}

@@ -1,11 +1,14 @@
 //! `lads-run --verify`: the certificate of the shipped policy, its form, its exit codes, and every reference that is refused.
 
+#[path = "common/interrupt.rs"]
+mod interrupt;
 #[path = "common/schema.rs"]
 mod schema;
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
+use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
@@ -14,14 +17,18 @@ fn project_file(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
 }
 
-fn verify(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_lads-run"))
+fn command(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_lads-run"));
+    command
         .arg("--model")
         .arg(project_file("models/kitchen.onnx"))
         .arg("--verify")
-        .args(arguments)
-        .output()
-        .unwrap()
+        .args(arguments);
+    command
+}
+
+fn verify(arguments: &[&str]) -> Output {
+    command(arguments).output().unwrap()
 }
 
 fn certificate(arguments: &[&str], folder: &Path) -> (Option<i32>, Value) {
@@ -168,4 +175,25 @@ fn references_of_something_else_are_refused_by_name() {
         &["--episodes", "1", "--certificate", "no/such/folder/c.json"],
         &["--certificate", "no/such/folder"],
     );
+}
+
+#[cfg(unix)]
+#[test]
+fn one_interrupt_ends_any_part_of_it_and_leaves_no_certificate() {
+    // Early in the policy's open loop, and later; all of it takes minutes.
+    for seconds in [1, 8] {
+        let folder = tempfile::tempdir().unwrap();
+        let certificates = ["c.json", "c.html"].map(|name| folder.path().join(name));
+        let mut command = command(&["--threads", "1"]);
+        for path in &certificates {
+            command.arg("--certificate").arg(path);
+        }
+        let start = Instant::now();
+        let wait = || start.elapsed() > Duration::from_secs(seconds);
+        let ended = interrupt::when(&mut command, &wait);
+        let (code, errors) = ended.expect("it is still at work");
+        assert_eq!(code, Some(130), "{errors}");
+        assert_eq!(errors, "interrupted: nothing was written\n");
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
 }

@@ -9,7 +9,7 @@ use std::sync::atomic::AtomicBool;
 use bench::{Bench, Says, tiny_image};
 use lads_core::{Decision, Isa, Policy};
 use lads_sim::environment::Environment;
-use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, Setup};
+use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Setup};
 use lads_sim::faults::Faults;
 use lads_sim::fit;
 use lads_sim::plans::{self, PlanFile, PlanSequence};
@@ -28,6 +28,15 @@ fn evaluate(
     threads: usize,
     setup: Setup<'_>,
 ) -> Evaluated {
+    try_evaluate(policy, decision, threads, setup).unwrap()
+}
+
+fn try_evaluate(
+    policy: &Policy<'_>,
+    decision: Decision,
+    threads: usize,
+    setup: Setup<'_>,
+) -> Result<Evaluated, EvaluationError> {
     let commanded = fit::check(&policy.contract(), &Bench::new(Says::default())).unwrap();
     let assignments: Vec<_> = (0..)
         .zip(commanded)
@@ -52,9 +61,7 @@ fn evaluate(
         },
     };
     let open = || -> Box<dyn Environment> { Box::new(Bench::new(Says::default())) };
-    evaluation
-        .run(&open, &AtomicBool::new(false), &|| {})
-        .unwrap()
+    evaluation.run(&open, &AtomicBool::new(false), &|| {})
 }
 
 fn log(policy: &Policy<'_>, evaluated: &Evaluated) -> Log {
@@ -286,4 +293,41 @@ fn commanded_plans_are_followed_and_encoded() {
     assert!(refused(&|file| file.episodes[0].plans.clear()).contains("has no plans"));
     assert!(refused(&|file| file.episodes[1] = file.episodes[0].clone()).contains("twice"));
     assert!(refused(&|file| file.episodes[0].instruction.push('?')).contains("does not know"));
+}
+
+#[test]
+fn a_refused_observation_ends_its_episode_or_everything() {
+    let image = tiny_image();
+    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    // Noise of up to 0.05, 20 times: beyond the contract's limits sooner or later.
+    let mut setup = Setup {
+        faults: Faults {
+            noise_scale: 20.0,
+            ..Faults::default()
+        },
+        ..Setup::default()
+    };
+    let refused = try_evaluate(&policy, Decision::Argmax, 2, setup).unwrap_err();
+    assert!(
+        refused.to_string().contains("refuses the observation"),
+        "{refused}"
+    );
+    setup.stop_where_refused = true;
+    let evaluated = evaluate(&policy, Decision::Argmax, 2, setup);
+    let episodes: Vec<_> = evaluated.episodes.iter().flatten().collect();
+    let all = policy.contract().instructions().count() * 3;
+    assert_eq!(episodes.len(), all);
+    assert!(!evaluated.refused_at.is_empty());
+    assert!(evaluated.refused_at.is_sorted());
+    // An episode that was refused has the steps before it, and no success.
+    let short = episodes
+        .iter()
+        .filter(|episode| !episode.success && episode.steps < 40);
+    let mut steps: Vec<_> = short.map(|episode| episode.steps).collect();
+    steps.sort_unstable();
+    assert_eq!(steps, evaluated.refused_at);
+    assert_eq!(
+        evaluated.refused_at,
+        evaluate(&policy, Decision::Argmax, 1, setup).refused_at
+    );
 }

@@ -11,6 +11,8 @@ pub mod caption;
 pub mod file;
 mod gif;
 mod mp4;
+#[cfg(feature = "report")]
+pub mod strip;
 
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,10 +1,10 @@
-//! The charts, each a list of SVG texts; an empty list where there is nothing to show.
+//! The charts, each a list of pictures; an empty list where there is nothing to show.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use kuva::plot::scatter3d::Scatter3DPlot;
 use kuva::plot::{BarPlot, ColorMap, Heatmap, Histogram, LegendPosition, LinePlot};
-use kuva::render::annotations::ReferenceLine;
+use kuva::render::annotations::{ReferenceLine, TextAnnotation};
 use kuva::render::layout::Layout;
 use kuva::render::plots::Plot;
 
@@ -18,14 +18,35 @@ const COLORS: [&str; 6] = [
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9",
 ];
 
-/// At most so many episodes are drawn as timelines.
-const TIMELINES: usize = 6;
+/// Width of a character of a label in a timeline, in pixels, margins of the chart allowed for.
+const LABEL_CHARACTER: f64 = 7.5;
 
 /// Bars of the latency histogram.
 const BINS: usize = 40;
 
-fn svg(plots: Vec<Plot>, layout: Layout) -> String {
-    kuva::render_to_svg(plots, layout)
+/// Width of a chart that shares its row with another, in pixels.
+const HALF: f64 = 560.0;
+
+/// Width of a chart that has a row to itself.
+const WHOLE: f64 = 900.0;
+
+/// A picture.
+pub struct Chart {
+    /// Its SVG text.
+    pub svg: String,
+    /// Whether it wants a row to itself.
+    pub wide: bool,
+}
+
+fn chart(plots: Vec<Plot>, layout: Layout) -> Chart {
+    let (width, height) = (layout.width.unwrap_or(HALF), layout.height.unwrap_or(HALF));
+    let svg = kuva::render_to_svg(plots, layout);
+    // With it, the page may show the picture in any size.
+    let scalable = format!("<svg viewBox=\"0 0 {width} {height}\" ");
+    Chart {
+        svg: svg.replacen("<svg ", &scalable, 1),
+        wide: width > HALF,
+    }
 }
 
 fn sized(plots: &[Plot], title: &str, width: f64, height: f64) -> Layout {
@@ -39,23 +60,27 @@ fn sized(plots: &[Plot], title: &str, width: f64, height: f64) -> Layout {
 }
 
 /// Figure 3 of the paper.
-pub fn k_rates(results: &Results) -> Vec<String> {
+pub fn k_rates(results: &Results) -> Vec<Chart> {
     let splits = results.splits.0.iter();
     let splits = splits.filter(|(_, result)| result.score.episodes > 0);
     let plots: Vec<Plot> = splits
         .zip(COLORS)
-        .map(|((name, result), color)| {
+        .enumerate()
+        .map(|(place, ((name, result), color))| {
             let score = &result.score;
-            let points = (1..).zip(score.k_rate);
-            let points = points.filter_map(|(k, rate)| Some((f64::from(k), rate?)));
-            let bounds = score.k_rate_interval;
+            // Intervals of splits stand side by side.
+            let aside = 0.04 * place as f64;
+            let points: Vec<(f64, f64, Interval)> = (1..)
+                .zip(score.k_rate.into_iter().zip(score.k_rate_interval))
+                .filter_map(|(k, (rate, bounds))| Some((f64::from(k) + aside, rate?, bounds)))
+                .collect();
+            let ends = points.iter().map(|&(_, rate, Interval(low, high))| {
+                ((rate - low).max(0.0), (high - rate).max(0.0))
+            });
             LinePlot::new()
-                .with_data(points)
-                .with_band(
-                    bounds.map(|Interval(low, _)| low),
-                    bounds.map(|Interval(_, high)| high),
-                )
                 .with_color(color)
+                .with_data(points.iter().map(|&(k, rate, _)| (k, rate)))
+                .with_y_err_asymmetric(ends)
                 .with_stroke_width(2.5)
                 .with_legend(name.clone())
                 .into()
@@ -64,31 +89,24 @@ pub fn k_rates(results: &Results) -> Vec<String> {
     if plots.is_empty() {
         return Vec::new();
     }
-    let layout = sized(&plots, "", 560.0, 340.0)
+    let layout = sized(&plots, "", WHOLE, 360.0)
         .with_x_label("K")
         .with_y_label("K-rate")
         .with_x_tick_step(1.0)
         .with_y_axis_min(0.0)
-        .with_y_axis_max(1.0);
-    vec![svg(plots, layout)]
+        .with_x_axis_min(0.8)
+        .with_x_axis_max(4.4)
+        .with_y_axis_max(1.02);
+    vec![chart(plots, layout)]
 }
 
 /// The plan in force over control steps, with completions.
-pub fn timelines(report: &Report<'_>) -> Vec<String> {
-    let mut traces: Vec<&Trace> = report
-        .traces
-        .iter()
-        .filter(|t| !t.steps.is_empty())
-        .collect();
-    traces.sort_by_key(|trace| trace.outcome.success);
-    // One per instruction.
-    let mut seen = BTreeSet::new();
-    traces.retain(|trace| seen.insert(trace.instruction));
-    let chosen = traces.into_iter().take(TIMELINES);
+pub fn timelines(report: &Report<'_>) -> Vec<Chart> {
+    let chosen = super::chosen(report.traces).into_iter();
     chosen.map(|trace| timeline(report, trace)).collect()
 }
 
-fn timeline(report: &Report<'_>, trace: &Trace) -> String {
+fn timeline(report: &Report<'_>, trace: &Trace) -> Chart {
     let steps = (0..).zip(&trace.steps);
     let points = steps.map(|(number, step)| (f64::from(number), f64::from(step.plan)));
     let plots: Vec<Plot> = vec![
@@ -99,31 +117,37 @@ fn timeline(report: &Report<'_>, trace: &Trace) -> String {
             .with_stroke_width(2.0)
             .into(),
     ];
-    let known = report.contract.instruction(trace.instruction as usize);
-    let title = format!(
-        "{}, episode {}: {}",
-        known.map_or("?", |known| known.id),
-        trace.episode,
-        if trace.outcome.success {
-            "carried out"
-        } else {
-            "failed"
-        }
-    );
-    let mut layout = sized(&plots, &title, 620.0, 280.0)
+    let title = super::title(&report.contract, trace);
+    let steps = trace.steps.len() as f64;
+    let completions = &trace.outcome.completions;
+    let names: Vec<&str> = completions
+        .iter()
+        .map(|done| report.sub_tasks.get(done.sub_task).copied().unwrap_or("?"))
+        .collect();
+    // Labels have rows of their own above the plans, so that close completions stay readable.
+    let plans = report.contract.codebook_len() as f64;
+    let row = 0.1 * plans;
+    let mut layout = sized(&plots, &title, HALF, 300.0)
         .with_x_label("control step")
         .with_y_label("plan")
+        .with_x_axis_max(steps)
         .with_y_axis_min(0.0)
-        .with_y_axis_max(report.contract.codebook_len() as f64);
-    for done in &trace.outcome.completions {
-        let name = report.sub_tasks.get(done.sub_task).copied().unwrap_or("?");
-        layout = layout.with_reference_line(
-            ReferenceLine::vertical(done.step as f64)
-                .with_color(COLORS[1])
-                .with_label(name),
-        );
+        .with_y_axis_max(plans + row * (names.len() + 1) as f64);
+    for (place, (done, name)) in completions.iter().zip(names).enumerate() {
+        let at = done.step as f64;
+        // A label is centred; it goes to the side of its line where there is room.
+        let half = 0.5 * (name.len() as f64 + 2.0) * steps * LABEL_CHARACTER / HALF;
+        let x = if at + 2.0 * half < steps {
+            at + half
+        } else {
+            at - half
+        };
+        let label = TextAnnotation::new(name, x, plans + row * (place as f64 + 0.2));
+        layout = layout
+            .with_annotation(label.with_font_size(11))
+            .with_reference_line(ReferenceLine::vertical(at).with_color(COLORS[1]));
     }
-    svg(plots, layout)
+    chart(plots, layout)
 }
 
 /// Mean softmax of the first decision's logits, by instruction.
@@ -155,7 +179,7 @@ fn starts(report: &Report<'_>) -> BTreeMap<u32, Vec<f64>> {
 }
 
 /// Figure 4 of the paper, and the same for all instructions as a heat map.
-pub fn start_distributions(report: &Report<'_>) -> Vec<String> {
+pub fn start_distributions(report: &Report<'_>) -> Vec<Chart> {
     let starts = starts(report);
     let id = |i: u32| {
         report
@@ -168,7 +192,7 @@ pub fn start_distributions(report: &Report<'_>) -> Vec<String> {
         .iter()
         .map(|(&i, row)| (id(i), row.clone()))
         .collect();
-    let mut svgs = heat_map("first decision", rows, report.contract.codebook_len());
+    let mut charts = heat_map("first decision", rows, report.contract.codebook_len());
     let words = |i: u32| -> Vec<&str> {
         let known = report.contract.instruction(i as usize);
         known.map_or(Vec::new(), |known| {
@@ -184,20 +208,20 @@ pub fn start_distributions(report: &Report<'_>) -> Vec<String> {
             .filter(|&atom| words(atom).iter().all(|part| whole.contains(part)))
             .collect();
         if let [a, b, ..] = atoms[..] {
-            svgs.push(parts(
+            charts.push(parts(
                 &id(composite),
                 line,
                 [(&id(a), &starts[&a]), (&id(b), &starts[&b])],
             ));
         }
-        if svgs.len() > 3 {
+        if charts.len() > 4 {
             break;
         }
     }
-    svgs
+    charts
 }
 
-fn parts(composite: &str, line: &[f64], atoms: [(&String, &Vec<f64>); 2]) -> String {
+fn parts(composite: &str, line: &[f64], atoms: [(&String, &Vec<f64>); 2]) -> Chart {
     let [(a, of_a), (b, of_b)] = atoms;
     let mut bars = BarPlot::new().with_legend(vec![a.as_str(), b.as_str()]);
     for (plan, (&a, &b)) in of_a.iter().zip(of_b).enumerate() {
@@ -209,14 +233,14 @@ fn parts(composite: &str, line: &[f64], atoms: [(&String, &Vec<f64>); 2]) -> Str
         .with_color(COLORS[0])
         .with_legend(composite.to_owned());
     let plots = vec![bars.into(), line.into()];
-    let layout = sized(&plots, composite, 620.0, 300.0)
+    let layout = sized(&plots, composite, HALF, 300.0)
         .with_x_label("plan")
         .with_y_label("probability");
-    svg(plots, layout)
+    chart(plots, layout)
 }
 
 /// Rows of shares over the plans; plans that no row has are left out.
-fn heat_map(title: &str, rows: Vec<(String, Vec<f64>)>, plans: usize) -> Vec<String> {
+fn heat_map(title: &str, rows: Vec<(String, Vec<f64>)>, plans: usize) -> Vec<Chart> {
     let share = |row: &[f64], plan: usize| row.get(plan).copied().unwrap_or(0.0);
     let used = |&plan: &usize| rows.iter().any(|(_, row)| share(row, plan) >= 0.005);
     let used: Vec<usize> = (0..plans).filter(used).collect();
@@ -242,11 +266,11 @@ fn heat_map(title: &str, rows: Vec<(String, Vec<f64>)>, plans: usize) -> Vec<Str
         .with_x_label("plan")
         .with_x_categories(used.iter().map(ToString::to_string).collect())
         .with_y_categories(rows.into_iter().map(|(name, _)| name).collect());
-    vec![svg(plots, layout)]
+    vec![chart(plots, layout)]
 }
 
 /// Figures 5 and 10 of the paper: the gripper's way while a plan is in force.
-pub fn gripper(report: &Report<'_>) -> Vec<String> {
+pub fn gripper(report: &Report<'_>) -> Vec<Chart> {
     let horizon = report.contract.horizon();
     let mut ways: BTreeMap<u32, Vec<[f64; 3]>> = BTreeMap::new();
     let mut uses: BTreeMap<u32, usize> = BTreeMap::new();
@@ -285,12 +309,12 @@ pub fn gripper(report: &Report<'_>) -> Vec<String> {
         return Vec::new();
     }
     let layout =
-        sized(&plots, "", 620.0, 480.0).with_legend_position(LegendPosition::OutsideRightTop);
-    vec![svg(plots, layout)]
+        sized(&plots, "", WHOLE, 520.0).with_legend_position(LegendPosition::OutsideRightTop);
+    vec![chart(plots, layout)]
 }
 
 /// Figure 9 of the paper.
-pub fn heat_maps(report: &Report<'_>) -> Vec<String> {
+pub fn heat_maps(report: &Report<'_>) -> Vec<Chart> {
     let size = report.contract.codebook_len();
     let mut by_word: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     let mut by_task: BTreeMap<String, Vec<f64>> = BTreeMap::new();
@@ -331,13 +355,13 @@ pub fn heat_maps(report: &Report<'_>) -> Vec<String> {
             .map(|(name, row)| (name, share(row)))
             .collect()
     };
-    let mut svgs = heat_map("plan by word", shares(by_word), size);
-    svgs.extend(heat_map(
+    let mut charts = heat_map("plan by word", shares(by_word), size);
+    charts.extend(heat_map(
         "plan by completed sub-task",
         shares(by_task),
         size,
     ));
-    svgs
+    charts
 }
 
 fn count(rows: &mut BTreeMap<String, Vec<f64>>, name: &str, plan: u32, size: usize) {
@@ -350,7 +374,7 @@ fn count(rows: &mut BTreeMap<String, Vec<f64>>, name: &str, plan: u32, size: usi
 }
 
 /// All control steps by duration.
-pub fn latency(report: &Report<'_>) -> Vec<String> {
+pub fn latency(report: &Report<'_>) -> Vec<Chart> {
     let steps = report.traces.iter().flat_map(|trace| &trace.steps);
     let mut all: Vec<f64> = steps
         .clone()
@@ -375,8 +399,8 @@ pub fn latency(report: &Report<'_>) -> Vec<String> {
         of_kind(false, "ordinary step", COLORS[5]),
         of_kind(true, "decision step", COLORS[1]),
     ];
-    let layout = sized(&plots, "", 620.0, 320.0)
+    let layout = sized(&plots, "", WHOLE, 340.0)
         .with_x_label("µs")
         .with_y_label("control steps");
-    vec![svg(plots, layout)]
+    vec![chart(plots, layout)]
 }

@@ -1,13 +1,18 @@
 //! `--report`: one HTML file that says and shows what a policy did, with nothing to fetch.
 //!
-//! The charts are SVG inside the page. Everything comes from the results and the traces; an episode's trace is needed for all but the success
+//! The charts are SVG inside the page, film strips are JPEG inside it. Everything comes from the results and the traces; an episode's trace is needed for all but the success
 //! table and the K-rates. What can fail: the template, which is compiled in.
 
 mod charts;
 
+use std::collections::BTreeSet;
+
 use askama::Template;
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use lads_core::Contract;
 
+use self::charts::Chart;
 use crate::metrics::{Interval, Score};
 use crate::results::Results;
 use crate::trace::Trace;
@@ -22,6 +27,52 @@ pub struct Report<'r> {
     pub contract: Contract<'r>,
     /// Names of the sub-tasks that the environment watches.
     pub sub_tasks: &'r [&'static str],
+    /// Pictures of the [`chosen`] episodes, or why there are none.
+    pub strips: Result<Vec<Strip>, String>,
+}
+
+/// A moment of an episode.
+pub struct Still {
+    /// What it shows.
+    pub caption: String,
+    /// The picture, as JPEG.
+    pub jpeg: Vec<u8>,
+}
+
+/// An episode in a few pictures.
+pub struct Strip {
+    /// Which.
+    pub title: String,
+    /// From its start to its end.
+    pub stills: Vec<Still>,
+}
+
+/// At most so many episodes are drawn as timelines and film strips.
+const CHOSEN: usize = 6;
+
+/// The episodes that are shown one by one: failed ones first, one of each instruction.
+pub fn chosen(traces: &[Trace]) -> Vec<&Trace> {
+    let mut chosen: Vec<&Trace> = traces.iter().filter(|t| !t.steps.is_empty()).collect();
+    chosen.sort_by_key(|trace| trace.outcome.success);
+    let mut seen = BTreeSet::new();
+    chosen.retain(|trace| seen.insert(trace.instruction));
+    chosen.truncate(CHOSEN);
+    chosen
+}
+
+/// Instruction, number and end of an episode.
+pub fn title(contract: &Contract<'_>, trace: &Trace) -> String {
+    let known = contract.instruction(trace.instruction as usize);
+    format!(
+        "{}, episode {}: {}",
+        known.map_or("?", |known| known.id),
+        trace.episode,
+        if trace.outcome.success {
+            "carried out"
+        } else {
+            "failed"
+        }
+    )
 }
 
 /// A row of the success table.
@@ -30,14 +81,26 @@ struct Row {
     text: String,
     split: String,
     strong: bool,
-    numbers: Vec<String>,
+    numbers: Vec<Number>,
+}
+
+/// A number of the table, and how sure it is.
+struct Number {
+    value: String,
+    within: String,
 }
 
 /// A chart with what it shows.
 struct Figure {
     title: String,
     about: String,
-    svgs: Vec<String>,
+    charts: Vec<Chart>,
+}
+
+/// A film strip, its pictures as text.
+struct Film<'r> {
+    title: &'r str,
+    stills: Vec<(&'r str, String)>,
 }
 
 #[derive(Template)]
@@ -46,7 +109,10 @@ struct Page<'r> {
     results: &'r Results,
     decision: String,
     rows: Vec<Row>,
+    k_rates: Vec<Chart>,
     figures: Vec<Figure>,
+    films: Vec<Film<'r>>,
+    no_films: &'r str,
 }
 
 impl Report<'_> {
@@ -61,7 +127,10 @@ impl Report<'_> {
             results,
             decision,
             rows: self.rows(),
+            k_rates: charts::k_rates(results),
             figures: self.figures(),
+            films: self.films(),
+            no_films: self.strips.as_ref().err().map_or("", String::as_str),
         };
         page.render()
     }
@@ -86,21 +155,27 @@ impl Report<'_> {
         splits.chain(each).collect()
     }
 
+    fn films(&self) -> Vec<Film<'_>> {
+        let strips = self.strips.as_deref().unwrap_or_default().iter();
+        strips
+            .map(|strip| Film {
+                title: &strip.title,
+                stills: strip
+                    .stills
+                    .iter()
+                    .map(|it| (it.caption.as_str(), STANDARD.encode(&it.jpeg)))
+                    .collect(),
+            })
+            .collect()
+    }
+
     fn figures(&self) -> Vec<Figure> {
-        let figure = |title: &str, about: &str, svgs: Vec<String>| Figure {
+        let figure = |title: &str, about: &str, charts: Vec<Chart>| Figure {
             title: title.to_owned(),
             about: about.to_owned(),
-            svgs,
+            charts,
         };
-        let mut figures = vec![figure(
-            "K-rates",
-            "Share of episodes that completed at least K of the commanded sub-tasks, with Wilson 95 % intervals.",
-            charts::k_rates(self.results),
-        )];
-        if self.traces.is_empty() {
-            return figures;
-        }
-        figures.extend([
+        let mut figures = vec![
             figure(
                 "Latent plans over an episode",
                 "The plan in force at every control step; vertical lines are completions. Episodes that failed come first.",
@@ -119,7 +194,7 @@ impl Report<'_> {
             ),
             figure(
                 "Plans by word and by sub-task",
-                "Left: how often each plan was decided under instructions that contain a word, as a share of the word's decisions. Right: which plan was in \
+                "First: how often each plan was decided under instructions that contain a word, as a share of the word's decisions. Second: which plan was in \
                  force when a sub-task was completed, as a share of its completions.",
                 charts::heat_maps(self),
             ),
@@ -128,27 +203,34 @@ impl Report<'_> {
                 "All control steps, in microseconds, measured while all threads ran. The slowest 1 % are beyond the right edge.",
                 charts::latency(self),
             ),
-        ]);
-        figures.retain(|figure| !figure.svgs.is_empty());
+        ];
+        figures.retain(|figure| !figure.charts.is_empty());
         figures
     }
 }
 
-fn numbers(score: &Score) -> Vec<String> {
+fn numbers(score: &Score) -> Vec<Number> {
     let number = |x: Option<f64>| x.map_or("–".to_owned(), |x| format!("{x:.2}"));
-    let with = |rate: Option<f64>, Interval(low, high): Interval| {
-        format!("{} [{low:.2}, {high:.2}]", number(rate))
+    let plain = |value: String| Number {
+        value,
+        within: String::new(),
     };
-    let n_rate = match score.n_rate_standard_error {
-        Some(error) => format!("{} ± {error:.2}", number(score.n_rate)),
-        None => number(score.n_rate),
+    let with = |rate: Option<f64>, Interval(low, high): Interval| Number {
+        value: number(rate),
+        within: format!("{low:.2}–{high:.2}"),
+    };
+    let n_rate = Number {
+        value: number(score.n_rate),
+        within: score
+            .n_rate_standard_error
+            .map_or(String::new(), |error| format!("± {error:.2}")),
     };
     let k_rates = score.k_rate.iter().zip(score.k_rate_interval);
     let k_rates = k_rates.map(|(&rate, interval)| with(rate, interval));
     let full = with(score.full_success, score.full_success_interval);
-    [score.episodes.to_string(), n_rate]
+    [plain(score.episodes.to_string()), n_rate]
         .into_iter()
         .chain(k_rates)
-        .chain([full, score.un_instructed.to_string()])
+        .chain([full, plain(score.un_instructed.to_string())])
         .collect()
 }

@@ -22,8 +22,13 @@ use crate::registry::Opener;
 use certificate::{Certificate, ReferenceUsed, Setting};
 use reference::Reference;
 
+/// How often [`run`] calls `finished`: both open-loop comparisons replay the traced episodes, then all run in closed loop.
+pub fn work(evaluation: &Evaluation<'_>) -> usize {
+    2 * evaluation.assignments.len() * evaluation.setup.traced as usize + evaluation.len()
+}
+
 /// Runs everything that the reference holds for `evaluation`'s instructions and episodes. `evaluation` has the reference's seed and traces
-/// as many episodes as the reference does; `finished` is called after each episode.
+/// as many episodes as the reference does; `finished` is called after each episode of each comparison, see [`work`].
 pub fn run(
     evaluation: &Evaluation<'_>,
     reference: &Reference,
@@ -40,15 +45,18 @@ pub fn run(
         reference,
         evaluation.assignments,
         traced,
-    )
-    .map_err(EvaluationError::Workspace)?;
+        stop,
+        finished,
+    )?;
     let mut environment = open();
     let physics = physics::replay(
         environment.as_mut(),
         reference,
         evaluation.assignments,
         traced,
-    );
+        stop,
+        finished,
+    )?;
     let evaluated = evaluation.run(open, stop, finished)?;
     let rollouts = pairs::Paired::new(
         reference,

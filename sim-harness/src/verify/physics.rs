@@ -1,14 +1,17 @@
 //! Is it the same environment? The reference's actions must lead through the reference's states.
 //!
 //! Open loop over the traced episodes: reset, then the recorded actions, whatever a policy would do. One machine and one version of MuJoCo
-//! give the same bits; another CPU's libm moves them by less than the tolerance. What can fail: an action that the environment refuses.
+//! give the same bits; another CPU's libm moves them by less than the tolerance. What can fail: an action that the environment refuses; it can
+//! be told to stop.
+
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
 
 use super::policy::Answer;
 use super::reference::Reference;
 use crate::environment::{Environment, EpisodeSeed};
-use crate::evaluate::Assignment;
+use crate::evaluate::{Assignment, EvaluationError};
 
 /// Largest difference of a state element (rad or m) that counts as the same: thousand times the 2e-9 that another libm makes of
 /// the first two seconds, far below what a policy could notice.
@@ -31,13 +34,15 @@ pub struct Physics {
     pub first_difference: Option<Answer>,
 }
 
-/// Replays the first `episodes` traced episodes of each instruction.
+/// Replays the first `episodes` traced episodes of each instruction. `finished` is called after each, `stop` ends the work early.
 pub fn replay(
     environment: &mut dyn Environment,
     reference: &Reference,
     assignments: &[Assignment],
     episodes: u32,
-) -> Physics {
+    stop: &AtomicBool,
+    finished: &dyn Fn(),
+) -> Result<Physics, EvaluationError> {
     let mut physics = Physics {
         identical_bits: true,
         state_tolerance: STATE_TOLERANCE,
@@ -54,6 +59,9 @@ pub fn replay(
             .take(episodes as usize)
             .enumerate()
         {
+            if stop.load(Ordering::Relaxed) {
+                return Err(EvaluationError::Interrupted);
+            }
             let Some(trace) = &episode.trace else {
                 continue;
             };
@@ -86,9 +94,10 @@ pub fn replay(
                     break;
                 }
             }
+            finished();
         }
     }
-    physics
+    Ok(physics)
 }
 
 impl Physics {

@@ -4,16 +4,17 @@
 //! holds the actions that the reference executed. So a difference is the policy's own, however chaotic the physics. Where two plans are
 //! equally likely, rounding may pick either: a decision whose margin in the reference is at most [`CLOSE_CALL`] may fall out otherwise,
 //! and actions are compared while the same plan is in force. A refused
-//! observation is a difference too. What can fail: a workspace that is too small for the policy.
+//! observation is a difference too. What can fail: a workspace that is too small for the policy; it can be told to stop.
 
 use std::fmt;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use lads_compiler::Memory;
-use lads_core::{Controller, Decision, Instruction, Isa, Policy, WorkspaceTooSmall};
+use lads_core::{Controller, Decision, Instruction, Isa, Policy};
 use serde::Serialize;
 
 use super::reference::{Episode, Reference};
-use crate::evaluate::Assignment;
+use crate::evaluate::{Assignment, EvaluationError};
 
 /// Difference of two logits that rounding may reverse. Logits of the shipped policies agree with PyTorch's to 1e-4.
 pub const CLOSE_CALL: f64 = 1e-3;
@@ -73,13 +74,16 @@ pub struct Answers {
 }
 
 /// Asks `policy`, on the instruction set `isa`, about the first `episodes` traced episodes of each assigned instruction.
+/// `finished` is called after each episode, `stop` ends the work early.
 pub fn ask(
     policy: &Policy<'_>,
     isa: Isa,
     reference: &Reference,
     assignments: &[Assignment],
     episodes: u32,
-) -> Result<Answers, WorkspaceTooSmall> {
+    stop: &AtomicBool,
+    finished: &dyn Fn(),
+) -> Result<Answers, EvaluationError> {
     let mut answers = Answers {
         action_tolerance: policy
             .golden()
@@ -88,7 +92,9 @@ pub fn ask(
         ..Answers::default()
     };
     let mut memory = Memory::of(policy);
-    let mut controller = memory.controller_with(policy, isa)?;
+    let mut controller = memory
+        .controller_with(policy, isa)
+        .map_err(EvaluationError::Workspace)?;
     controller.set_decision(Decision::Argmax);
     for &Assignment {
         instruction: index, ..
@@ -99,13 +105,18 @@ pub fn ask(
         };
         let asked = instruction.episodes.iter().take(episodes as usize);
         for (episode, recorded) in asked.enumerate() {
-            let Some((step, what)) = replay(
+            if stop.load(Ordering::Relaxed) {
+                return Err(EvaluationError::Interrupted);
+            }
+            let difference = replay(
                 &mut controller,
                 index,
                 recorded,
                 reference.horizon,
                 &mut answers,
-            ) else {
+            );
+            finished();
+            let Some((step, what)) = difference else {
                 continue;
             };
             answers.differing_episodes += 1;

@@ -131,6 +131,7 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
         setup: Setup {
             faults: arguments.faults.faults(),
             plans: book.as_ref(),
+            stop_where_refused: false,
             traced: traced(arguments),
             words: Some(&heard.words),
         },
@@ -244,9 +245,11 @@ impl Bench<'_> {
         let sweep = sweep::sweep(|faults, what| {
             let setup = Setup {
                 faults,
+                stop_where_refused: true,
                 ..self.evaluation.setup
             };
-            self.run(setup, what).map(|(results, _)| results)
+            let (results, evaluated) = self.run(setup, what)?;
+            Ok((results, evaluated.refused_at))
         })?;
         if let Some(path) = json {
             output::write_json(&sweep, path).map_err(|error| unwritable("--json", path, &error))?;
@@ -271,7 +274,15 @@ impl Bench<'_> {
         }
         // Filming takes time and may be interrupted: nothing is written before.
         let film = recording.map(|it| it.film(&self.evaluation, &evaluated.traces, self.stop));
-        if let Some(film) = film.transpose()? {
+        let film = film.transpose()?;
+        let page = arguments.report.as_deref().map(|path| {
+            let traces = &evaluated.traces;
+            let about = (self.stop, path);
+            let page = report::page(&results, traces, &self.evaluation, self.open, about);
+            page.map(|page| (page, path))
+        });
+        let page = page.transpose()?;
+        if let Some(film) = film {
             film.write()?;
         }
         if let Some(path) = &arguments.json {
@@ -287,14 +298,8 @@ impl Bench<'_> {
                 path,
             )?;
         }
-        if let Some(path) = &arguments.report {
-            report::write(
-                &results,
-                &evaluated.traces,
-                policy,
-                self.environment.sub_tasks(),
-                path,
-            )?;
+        if let Some((page, path)) = page {
+            report::write(&page, path)?;
         }
         print(&Table(&results))?;
         print(&self.heard.note)?;

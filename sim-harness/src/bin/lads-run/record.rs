@@ -3,7 +3,7 @@
 //! The place, ffmpeg and EGL are looked at before the first episode; filming follows after the last, and is renamed to its place at the end.
 
 #[cfg(feature = "record")]
-pub use with::{Recording, check, prepare};
+pub use with::{Recording, check, prepare, scene};
 #[cfg(not(feature = "record"))]
 pub use without::{Recording, check, prepare};
 
@@ -86,6 +86,19 @@ mod with {
         }))
     }
 
+    /// A recorded episode, as something to be filmed; `None` if it is no episode of this evaluation.
+    pub fn scene<'s>(evaluation: &'s Evaluation<'_>, trace: &'s Trace) -> Option<Scene<'s>> {
+        let mut assignments = evaluation.assignments.iter();
+        let assignment = assignments.find(|it| it.instruction == trace.instruction)?;
+        let known = evaluation.instruction(assignment.instruction)?;
+        Some(Scene {
+            trace,
+            instruction: known.text,
+            commanded: &assignment.commanded,
+            seed: evaluation.seed,
+        })
+    }
+
     impl Recording {
         /// Films the episode of the first instruction that ran.
         pub fn film(
@@ -94,24 +107,13 @@ mod with {
             traces: &[Trace],
             stop: &AtomicBool,
         ) -> Result<Film, End> {
-            let filmed = evaluation.assignments.first().and_then(|assignment| {
-                let mut traces = traces.iter();
-                let trace = traces.find(|trace| {
-                    trace.instruction == assignment.instruction && trace.episode == self.episode
-                });
-                Some((assignment, trace?))
-            });
-            let Some((assignment, trace)) = filmed else {
+            // Traces are in the order of the assignments.
+            let mut traces = traces.iter();
+            let trace = traces.find(|trace| trace.episode == self.episode);
+            let Some(scene) = trace.and_then(|trace| scene(evaluation, trace)) else {
                 return Err(about(&self.path, "no episode ran"));
             };
-            let known = evaluation.instruction(assignment.instruction);
-            let scene = Scene {
-                trace,
-                instruction: known.map_or("", |known| known.text),
-                commanded: &assignment.commanded,
-                seed: evaluation.seed,
-            };
-            let bar = progress_over(trace.steps.len() + 1, "pictures");
+            let bar = progress_over(scene.trace.steps.len() + 1, "pictures");
             let finished = scene.film(
                 self.environment.as_mut(),
                 &mut self.camera,

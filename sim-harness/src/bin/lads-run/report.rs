@@ -1,61 +1,145 @@
-//! `--report`.
+//! `--report`. Film strips need the cargo feature `record`, and EGL when it runs; without either the page says so.
 
-use std::path::Path;
-
-use lads_core::Policy;
-use lads_sim::results::Results;
-use lads_sim::trace::Trace;
-
-use crate::end::End;
 #[cfg(feature = "report")]
-use crate::end::{check_writable, unwritable};
-
-/// Whether a report could be written, before any work.
-#[cfg(feature = "report")]
-pub fn check(path: Option<&Path>) -> Result<(), End> {
-    check_writable("--report", path)
-}
-
-/// Refuses: this program was built without reports.
+pub use with::{check, page, write};
 #[cfg(not(feature = "report"))]
-pub fn check(path: Option<&Path>) -> Result<(), End> {
-    match path {
-        None => Ok(()),
-        Some(_) => Err(crate::end::refused(
-            "--report: this lads-run was built without reports; build it with \"cargo build --release -p lads-sim --features report\"",
-        )),
+pub use without::{check, page, write};
+
+#[cfg(feature = "report")]
+mod with {
+    use std::path::Path;
+    use std::sync::atomic::AtomicBool;
+
+    use lads_sim::evaluate::Evaluation;
+    use lads_sim::registry::Opener;
+    use lads_sim::report::{Report, Strip};
+    use lads_sim::results::Results;
+    use lads_sim::trace::Trace;
+
+    use crate::end::{End, check_writable, unwritable};
+
+    /// Whether a report could be written, before any work.
+    pub fn check(path: Option<&Path>) -> Result<(), End> {
+        check_writable("--report", path)
+    }
+
+    /// The page, film strips included.
+    pub fn page(
+        results: &Results,
+        traces: &[Trace],
+        evaluation: &Evaluation<'_>,
+        open: &Opener,
+        (stop, path): (&AtomicBool, &Path),
+    ) -> Result<String, End> {
+        let report = Report {
+            results,
+            traces,
+            contract: evaluation.policy.contract(),
+            sub_tasks: open().sub_tasks(),
+            strips: strips(traces, evaluation, open, stop)?,
+        };
+        let html = report.html();
+        html.map_err(|error| unwritable("--report", path, &error))
+    }
+
+    /// Writes the page.
+    pub fn write(page: &str, path: &Path) -> Result<(), End> {
+        lads_sim::output::write(page.as_bytes(), path)
+            .map_err(|error| unwritable("--report", path, &error))
+    }
+
+    /// Film strips of the chosen episodes, or why there are none.
+    #[cfg(feature = "record")]
+    fn strips(
+        traces: &[Trace],
+        evaluation: &Evaluation<'_>,
+        open: &Opener,
+        stop: &AtomicBool,
+    ) -> Result<Result<Vec<Strip>, String>, End> {
+        use lads_sim::film::FilmError;
+        use lads_sim::film::camera::Camera;
+        use lads_sim::film::strip::STILL;
+
+        let chosen = lads_sim::report::chosen(traces);
+        let mut environment = open();
+        let mut camera = match Camera::new(environment.as_mut(), STILL) {
+            Ok(camera) => camera,
+            Err(error) => return Ok(Err(error.to_string())),
+        };
+        let bar = crate::progress_over(chosen.len(), "film strips");
+        let mut strips = Vec::new();
+        for trace in chosen {
+            let Some(scene) = crate::record::scene(evaluation, trace) else {
+                continue;
+            };
+            match scene.strip(environment.as_mut(), &mut camera, stop) {
+                Ok(stills) => strips.push(Strip {
+                    title: lads_sim::report::title(&evaluation.policy.contract(), trace),
+                    stills,
+                }),
+                Err(FilmError::Interrupted) => return Err(End::Interrupted),
+                Err(error) => return Ok(Err(error.to_string())),
+            }
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+        Ok(Ok(strips))
+    }
+
+    /// Why there are none.
+    #[cfg(not(feature = "record"))]
+    #[expect(
+        clippy::unnecessary_wraps,
+        reason = "with pictures it can be interrupted"
+    )]
+    fn strips(
+        _: &[Trace],
+        _: &Evaluation<'_>,
+        _: &Opener,
+        _: &AtomicBool,
+    ) -> Result<Result<Vec<Strip>, String>, End> {
+        Ok(Err(
+            "this lads-run was built without pictures (cargo feature record)".to_owned(),
+        ))
     }
 }
 
-/// Writes the page.
-#[cfg(feature = "report")]
-pub fn write(
-    results: &Results,
-    traces: &[Trace],
-    policy: &Policy<'_>,
-    sub_tasks: &[&'static str],
-    path: &Path,
-) -> Result<(), End> {
-    let report = lads_sim::report::Report {
-        results,
-        traces,
-        contract: policy.contract(),
-        sub_tasks,
-    };
-    let html = report.html();
-    let html = html.map_err(|error| unwritable("--report", path, &error))?;
-    lads_sim::output::write(html.as_bytes(), path)
-        .map_err(|error| unwritable("--report", path, &error))
-}
-
-/// Never reached: [`check`] refuses.
+/// This program was built without reports.
 #[cfg(not(feature = "report"))]
-pub fn write(
-    _: &Results,
-    _: &[Trace],
-    _: &Policy<'_>,
-    _: &[&'static str],
-    path: &Path,
-) -> Result<(), End> {
-    check(Some(path))
+mod without {
+    use std::path::Path;
+    use std::sync::atomic::AtomicBool;
+
+    use lads_sim::evaluate::Evaluation;
+    use lads_sim::registry::Opener;
+    use lads_sim::results::Results;
+    use lads_sim::trace::Trace;
+
+    use crate::end::{End, refused};
+
+    /// Refuses.
+    pub fn check(path: Option<&Path>) -> Result<(), End> {
+        match path {
+            None => Ok(()),
+            Some(_) => Err(refused(
+                "--report: this lads-run was built without reports; build it with \"cargo build --release -p lads-sim --features report\"",
+            )),
+        }
+    }
+
+    /// Never reached: [`check`] refuses.
+    pub fn page(
+        _: &Results,
+        _: &[Trace],
+        _: &Evaluation<'_>,
+        _: &Opener,
+        (_, path): (&AtomicBool, &Path),
+    ) -> Result<String, End> {
+        check(Some(path)).map(|()| String::new())
+    }
+
+    /// Never reached: [`check`] refuses.
+    pub fn write(_: &str, path: &Path) -> Result<(), End> {
+        check(Some(path))
+    }
 }

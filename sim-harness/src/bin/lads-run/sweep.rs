@@ -1,4 +1,7 @@
 //! `--sweep`: the benchmark at several levels of each fault, one fault at a time, on the same episodes.
+//!
+//! A fault may lead to observations outside the contract, which the controller refuses. Such an episode ends there, as the machine would
+//! stop, and counts as it stands; how many did is told with each level.
 
 use std::fmt::Write as _;
 
@@ -23,6 +26,12 @@ pub struct Level {
     value: f64,
     /// Scores by split.
     splits: Splits,
+    /// Episodes of all splits.
+    episodes: usize,
+    /// Those that ended because the controller refused an observation.
+    refused_episodes: usize,
+    /// The earliest control step, from 0, at which one did.
+    first_refused_step: Option<usize>,
 }
 
 /// A sweep.
@@ -64,23 +73,38 @@ const FAULTS: [(&str, Set, [f64; 5]); 4] = [
 ];
 
 /// Runs all levels: `run` runs the benchmark with given faults and says what it came to.
-pub fn sweep(run: impl Fn(Faults, &str) -> Result<Results, End>) -> Result<Sweep, End> {
+/// Results come with the control steps at which episodes were refused, in rising order.
+pub fn sweep(
+    run: impl Fn(Faults, &str) -> Result<(Results, Vec<usize>), End>,
+) -> Result<Sweep, End> {
     // Without faults all four are the same run.
-    let plain = run(Faults::default(), "no fault")?;
+    let runs = 1 + FAULTS
+        .iter()
+        .map(|(_, _, levels)| levels.len() - 1)
+        .sum::<usize>();
+    let mut done = 1;
+    let (plain, plain_refused) = run(Faults::default(), &format!("no fault, run 1 of {runs}"))?;
     let mut levels = Vec::new();
     for (fault, set, of_fault) in FAULTS {
         for (number, level) in of_fault.into_iter().enumerate() {
             let mut faults = Faults::default();
             set(&mut faults, level);
-            let splits = if number == 0 {
-                plain.splits.clone()
+            let (splits, refused) = if number == 0 {
+                (plain.splits.clone(), plain_refused.clone())
             } else {
-                run(faults, &format!("{fault} {level}"))?.splits
+                done += 1;
+                let what = format!("{fault} {level}, run {done} of {runs}");
+                let (results, refused) = run(faults, &what)?;
+                (results.splits, refused)
             };
+            let scores = splits.0.iter();
             levels.push(Level {
                 fault,
                 value: level,
+                episodes: scores.map(|(_, result)| result.score.episodes).sum(),
                 splits,
+                refused_episodes: refused.len(),
+                first_refused_step: refused.first().copied(),
             });
         }
     }
@@ -98,7 +122,9 @@ pub fn sweep(run: impl Fn(Faults, &str) -> Result<Results, End>) -> Result<Sweep
 impl Sweep {
     /// N-rate with its standard error, by fault and level.
     pub fn table(&self) -> String {
-        let mut text = String::from("N-rate with its standard error, one fault at a time\n");
+        let mut text = String::from(
+            "N-rate with its standard error, one fault at a time; an episode whose observation the controller refuses ends there\n",
+        );
         let mut last = "";
         for level in &self.levels {
             let filled = level.splits.0.iter().filter(|(_, s)| s.score.episodes > 0);
@@ -107,6 +133,7 @@ impl Sweep {
                 for (split, _) in filled.clone() {
                     let _ = write!(text, "  {split:>14}");
                 }
+                text.push_str("  refused");
                 text.push('\n');
                 last = level.fault;
             }
@@ -118,8 +145,44 @@ impl Sweep {
                 let error = error.map_or(String::new(), |error| format!(" ±{error:.3}"));
                 let _ = write!(text, "  {:>14}", format!("{rate:.3}{error}"));
             }
+            let (refused, all) = (level.refused_episodes, level.episodes);
+            let _ = match level.first_refused_step {
+                None => write!(text, "  none"),
+                Some(step) => write!(text, "  {refused} of {all} episodes, from step {step}"),
+            };
             text.push('\n');
         }
         text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_table_says_where_observations_were_refused() {
+        let level = |value, refused_episodes, first_refused_step| Level {
+            fault: "noise-scale",
+            value,
+            splits: Splits(Vec::new().into_iter().collect()),
+            episodes: 50,
+            refused_episodes,
+            first_refused_step,
+        };
+        let sweep = Sweep {
+            format: FORMAT,
+            format_version: FORMAT_VERSION,
+            bundle_sha256: String::new(),
+            seed: 0,
+            noise: "v0".to_owned(),
+            episodes_per_instruction: 2,
+            levels: vec![level(1.0, 0, None), level(8.0, 12, Some(3))],
+        };
+        let table = sweep.table();
+        let lines: Vec<&str> = table.lines().skip(2).collect();
+        assert!(lines[0].ends_with("refused"));
+        assert!(lines[1].ends_with("1  none"));
+        assert!(lines[2].ends_with("8  12 of 50 episodes, from step 3"));
     }
 }

@@ -58,7 +58,7 @@ pub fn run(
     certificates: &[PathBuf],
     stop: &AtomicBool,
 ) -> Result<ExitCode, End> {
-    let bar = progress(evaluation.len());
+    let bar = progress(lads_sim::verify::work(evaluation));
     let certificate = lads_sim::verify::run(evaluation, reference, open, versions(), stop, &|| {
         bar.inc(1);
     });
