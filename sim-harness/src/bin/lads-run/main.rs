@@ -34,6 +34,7 @@ use lads_sim::plans;
 use lads_sim::results::{self, DecisionUsed, EnvironmentUsed, InstructionResult, Results};
 use lads_sim::rollout::Actor;
 use lads_sim::table::Table;
+use lads_sim::verify::reference::Reference;
 use lads_sim::{assets, command, fit, output, registry};
 use language::{Chosen, Heard};
 
@@ -86,9 +87,7 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
 
     let contract = policy.contract();
     let id = contract.environment_id();
-    let noise = arguments.noise.as_deref();
-    let noise = noise.or(reference.as_ref().map(|reference| reference.noise.as_str()));
-    let noise = noise.unwrap_or_else(|| registry::default_noise(id).unwrap_or("none"));
+    let noise = noise(arguments, reference.as_ref(), id);
     let open = registry::load(id, noise, &assets::vendor_dir()).map_err(refused)?;
     let environment = open();
     let commanded = fit::check(&contract, environment.as_ref()).map_err(|misfit| {
@@ -162,6 +161,15 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
         return bench.sweep(arguments.json.as_deref());
     }
     bench.rollouts(arguments, recording)
+}
+
+/// The level of the observation noise: what was asked for, else the reference's, else the environment's usual one.
+fn noise<'a>(arguments: &'a Arguments, reference: Option<&'a Reference>, id: &str) -> &'a str {
+    let asked = arguments.noise.as_deref();
+    asked
+        .or(reference.map(|reference| reference.noise.as_str()))
+        .or(registry::default_noise(id))
+        .unwrap_or("none")
 }
 
 /// How many episodes of each instruction keep their control steps.
