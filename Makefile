@@ -51,7 +51,7 @@ lint: setup
 	cargo clippy $(ALL) --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc $(ALL) --no-deps --quiet
 	# What `make run` builds, without the features of the tests.
-	cargo check --quiet $(RUNTIME) -p lads-sim
+	cargo clippy --quiet $(RUNTIME) -p lads-sim -- -D warnings
 
 ## test-runtime: the runtime alone; needs neither MuJoCo nor Python
 test-runtime:

@@ -167,7 +167,10 @@ def _acting(model, contract, run):
     encoded = language.encode(setting.config.language, [row["text"] for row in setting.instructions])
     lads = Lads(setting, encoded)
     lads.load_state_dict(saved["lads"])
-    return weights.from_lads(lads), "the run's checkpoint"
+    trained, exported = weights.from_lads(lads), weights.from_bundle(model, contract)
+    if not all(torch.equal(a, b) for a, b in ((trained.codes, exported.codes), (trained.high_level.head.weight, exported.high_level.head.weight))):
+        raise config.UserError(f"{run} is not the run that the bundle was exported from; name that one, or leave --run out")
+    return trained, "the run's checkpoint"
 
 
 class Progress:

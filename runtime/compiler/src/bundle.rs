@@ -3,14 +3,13 @@
 //! A [`Bundle`] is checked as a whole before anything is compiled: the file is an ONNX model, its contract reads, every entry that
 //! a policy of its kind needs is there, and the shapes that the entries declare are those of the contract. Nothing is written.
 
-use std::fmt::Write as _;
 use std::path::Path;
 
 use bytes::Bytes;
 use prost::Message;
-use sha2::{Digest, Sha256};
 
 use crate::contract::Contract;
+use crate::digest::sha256;
 use crate::entries;
 use crate::error::BundleError;
 use crate::golden::Golden;
@@ -62,15 +61,10 @@ impl Bundle {
             problem: "it has no graph".into(),
         })?;
         entries::check(graph, &contract)?;
-        let mut sha256 = String::new();
-        for byte in Sha256::digest(bytes) {
-            // Writing to a string cannot fail.
-            let _ = write!(sha256, "{byte:02x}");
-        }
         Ok(Self {
             contract,
             golden,
-            sha256,
+            sha256: sha256(bytes),
             bytes: bytes.len(),
             model,
         })

@@ -74,11 +74,6 @@ impl Encoder {
         })
     }
 
-    /// What the encoder is.
-    pub fn manifest(&self) -> &Manifest {
-        &self.manifest
-    }
-
     /// The word embeddings `[n, E]`, row by row, of a sentence.
     ///
     /// They are those of the exporter to 1e-4: hidden layer `language.layer` without the leading `[CLS]` and with the trailing `[SEP]`, or the mean

@@ -14,7 +14,6 @@ use std::path::PathBuf;
 
 pub use encoder::Encoder;
 pub use error::LanguageError;
-pub use manifest::Manifest;
 
 /// Names the folder that holds what was downloaded or built once for this user.
 pub const CACHE_VARIABLE: &str = "LADS_CACHE";

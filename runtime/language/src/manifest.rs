@@ -1,13 +1,12 @@
 //! `manifest.json`: what lies in an encoder's folder.
 
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 use std::io::ErrorKind;
 use std::path::Path;
 
 use lads_compiler::contract::Language;
+use lads_compiler::sha256;
 use serde::Deserialize;
-use sha2::{Digest, Sha256};
 
 use crate::error::LanguageError;
 
@@ -97,14 +96,4 @@ impl Manifest {
         }
         Ok(bytes)
     }
-}
-
-/// Hexadecimal.
-pub fn sha256(bytes: &[u8]) -> String {
-    let mut text = String::new();
-    for byte in Sha256::digest(bytes) {
-        // Writing to a string cannot fail.
-        let _ = write!(text, "{byte:02x}");
-    }
-    text
 }

@@ -1,14 +1,12 @@
 //! The encoder on a small network: `PyTorch`'s embeddings, and everything that it refuses.
 
-use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use lads_compiler::contract::Pooling;
-use lads_compiler::{Bundle, Contract};
+use lads_compiler::{Bundle, Contract, sha256};
 use lads_language::{Encoder, LanguageError, default_folder};
 use serde::Deserialize;
-use sha2::{Digest, Sha256};
 
 const TOLERANCE: f32 = 1e-5;
 
@@ -228,11 +226,7 @@ fn trust(folder: &Path, file: &str, bytes: &[u8]) {
     let path = folder.join("manifest.json");
     let mut manifest: serde_json::Value =
         serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
-    let mut digest = String::new();
-    for byte in Sha256::digest(bytes) {
-        write!(digest, "{byte:02x}").unwrap();
-    }
-    manifest["files"][file] = digest.into();
+    manifest["files"][file] = sha256(bytes).into();
     fs::write(path, manifest.to_string()).unwrap();
 }
 

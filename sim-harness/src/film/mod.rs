@@ -162,12 +162,17 @@ impl Scene<'_> {
         let [width, height] = PICTURE;
         let mut canvas = Canvas::new(width, caption::HEAD + height + caption::FOOT);
         let mut sink = Sink::new(form, path, canvas.size(), period_s)?;
+        let go_on = || {
+            let stopped = stop.load(Ordering::Relaxed);
+            (!stopped).then_some(()).ok_or(FilmError::Interrupted)
+        };
         let episode = |environment: &mut dyn Environment, look: &mut Look<'_>| {
             play(self.trace, self.commanded, self.seed, environment, look)
         };
         if sink.learns() {
             let every = self.trace.steps.len().div_ceil(SAMPLES).max(1);
             episode(environment, &mut |moment, environment| {
+                go_on()?;
                 if moment.number.is_multiple_of(every) || moment.step.is_none() {
                     canvas.paste(camera.shoot(environment)?, width, 0, caption::HEAD);
                     sink.learn(&canvas);
@@ -176,9 +181,7 @@ impl Scene<'_> {
             })?;
         }
         episode(environment, &mut |moment, environment| {
-            if stop.load(Ordering::Relaxed) {
-                return Err(FilmError::Interrupted);
-            }
+            go_on()?;
             canvas.paste(camera.shoot(environment)?, width, 0, caption::HEAD);
             caption.draw(moment, &mut canvas);
             sink.add(&canvas, moment.step.is_none())?;

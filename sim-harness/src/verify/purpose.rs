@@ -4,10 +4,8 @@
 //! their code points, `[value ...]`, texts as `"bytes:UTF-8`, numbers as the 16 hexadecimal digits of their IEEE 754 double, `true`,
 //! `false` and `null`, no separators. What can fail: text that is no JSON object.
 
-use std::fmt::Write as _;
-
+use lads_compiler::sha256 as digest;
 use serde_json::Value;
-use sha2::{Digest, Sha256};
 
 /// The parts of a contract that say what a policy is for; the others say how it is built.
 const PURPOSE: [&str; 7] = [
@@ -28,53 +26,32 @@ pub fn sha256(contract: &str) -> Option<String> {
         .iter()
         .filter_map(|&key| Some((key.to_owned(), all.get(key)?.clone())))
         .collect();
-    let mut digest = Sha256::new();
-    add(&Value::Object(purpose), &mut digest);
-    Some(hexadecimal(&digest.finalize()))
+    Some(digest(canonical(&Value::Object(purpose)).as_bytes()))
 }
 
-fn hexadecimal(bytes: &[u8]) -> String {
-    let mut text = String::new();
-    for byte in bytes {
-        // Writing to a string cannot fail.
-        let _ = write!(text, "{byte:02x}");
-    }
-    text
-}
-
-fn add(value: &Value, digest: &mut Sha256) {
+fn canonical(value: &Value) -> String {
     match value {
         Value::Object(object) => {
-            digest.update(b"{");
             let mut keys: Vec<_> = object.keys().collect();
             keys.sort_unstable();
-            for key in keys {
-                add_text(key, digest);
-                add(&object[key], digest);
-            }
-            digest.update(b"}");
+            let rows = keys
+                .into_iter()
+                .map(|key| text(key) + &canonical(&object[key]));
+            format!("{{{}}}", rows.collect::<String>())
         }
-        Value::Array(list) => {
-            digest.update(b"[");
-            for value in list {
-                add(value, digest);
-            }
-            digest.update(b"]");
-        }
-        Value::String(text) => add_text(text, digest),
+        Value::Array(list) => format!("[{}]", list.iter().map(canonical).collect::<String>()),
+        Value::String(words) => text(words),
         Value::Number(number) => {
             let bits = number.as_f64().unwrap_or(f64::NAN).to_bits();
-            digest.update(format!("{bits:016x}"));
+            format!("{bits:016x}")
         }
-        Value::Bool(true) => digest.update(b"true"),
-        Value::Bool(false) => digest.update(b"false"),
-        Value::Null => digest.update(b"null"),
+        Value::Bool(flag) => flag.to_string(),
+        Value::Null => "null".to_owned(),
     }
 }
 
-fn add_text(text: &str, digest: &mut Sha256) {
-    digest.update(format!("\"{}:", text.len()));
-    digest.update(text);
+fn text(words: &str) -> String {
+    format!("\"{}:{words}", words.len())
 }
 
 #[cfg(test)]
@@ -91,7 +68,7 @@ mod tests {
         // Worked out by hand: {"16:control_period_s3fa999999999999a"11:environment{"2:id"1:x"7:version"1:1}}
         let canonical =
             r#"{"16:control_period_s3fa999999999999a"11:environment{"2:id"1:x"7:version"1:1}}"#;
-        let expected = hexadecimal(&Sha256::digest(canonical));
+        let expected = digest(canonical.as_bytes());
         assert_eq!(sha256(a), Some(expected));
         assert_eq!(sha256("[]"), None);
         assert_eq!(sha256("no JSON"), None);

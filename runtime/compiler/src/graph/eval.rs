@@ -7,7 +7,7 @@ use lads_core::op::{BinaryKind, ReduceKind, UnaryKind};
 use super::{Op, Unary};
 use crate::tensor::{Data, Tensor, strides};
 
-/// The most operations that folding the constants of one entry may take. A policy's take some ten thousands; a small model could
+/// The most operations that folding the constants of one entry may take. A policy's take some hundred thousands; a small model could
 /// ask for hours and for all memory.
 pub(crate) const MAX_FOLDING: usize = 1 << 26;
 

@@ -167,6 +167,10 @@ mod without {
     }
 
     /// None: [`check`] has refused.
+    #[expect(
+        clippy::unnecessary_wraps,
+        reason = "with pictures there may be no EGL"
+    )]
     pub fn prepare(
         _: &RecordingArguments,
         _: &Evaluation<'_>,
