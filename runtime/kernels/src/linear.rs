@@ -19,7 +19,7 @@ use crate::dispatch::{Isa, Kernel};
 use crate::elementwise::assign;
 use crate::lanes::{Block, LANES};
 use crate::math;
-use crate::simd::Simd;
+use crate::simd::{Simd, prefetch};
 use crate::stored::{Bf16, F16, F32, Int8, Panels, Stored};
 
 /// Blocks of sixteen outputs in a whole panel.
@@ -249,7 +249,7 @@ fn panel<S: Simd, W: Stored, const R: usize>(
 ) {
     // Behind this panel lies the next, or the next layer.
     for page in (0..size_of_val(w)).step_by(PAGE) {
-        simd.prefetch(w.as_ptr_range().end.wrapping_byte_add(page));
+        prefetch(w.as_ptr_range().end.wrapping_byte_add(page));
     }
     let mut at = 0;
     while at < blocks {

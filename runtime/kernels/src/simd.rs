@@ -39,8 +39,19 @@ pub(crate) trait Simd: Copy {
     fn load_bf16(self, from: &[u16; LANES]) -> Self::V;
     /// Sixteen integers.
     fn load_i8(self, from: &[i8; LANES]) -> Self::V;
-    /// Asks for the cache line at an address, which need not be there.
-    fn prefetch<T>(self, _at: *const T) {}
+}
+
+/// Asks for the cache line at an address, where the target has an instruction for it. A hint: nothing need be there.
+#[inline(always)]
+pub(crate) fn prefetch<T>(at: *const T) {
+    #[cfg(target_arch = "x86_64")]
+    // SAFETY: part of SSE, which every x86-64 CPU has; it reads nothing.
+    unsafe {
+        use core::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        _mm_prefetch::<_MM_HINT_T0>(at.cast());
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = at;
 }
 
 /// What the build's target has in any case: arrays, which compilers put into its registers.
@@ -118,8 +129,8 @@ impl Simd for Portable {
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod x86_64 {
     use core::arch::x86_64::{
-        __m256, __m512, _CMP_LT_OQ, _MM_HINT_T0, _mm_loadl_epi64, _mm_loadu_si128, _mm_prefetch,
-        _mm256_add_ps, _mm256_blendv_ps, _mm256_castsi256_ps, _mm256_cmp_ps, _mm256_cvtepi8_epi32,
+        __m256, __m512, _CMP_LT_OQ, _mm_loadl_epi64, _mm_loadu_si128, _mm256_add_ps,
+        _mm256_blendv_ps, _mm256_castsi256_ps, _mm256_cmp_ps, _mm256_cvtepi8_epi32,
         _mm256_cvtepi32_ps, _mm256_cvtepu16_epi32, _mm256_cvtph_ps, _mm256_loadu_ps,
         _mm256_loadu_si256, _mm256_mul_ps, _mm256_set1_ps, _mm256_setzero_ps, _mm256_slli_epi32,
         _mm256_storeu_ps, _mm512_add_ps, _mm512_castsi512_ps, _mm512_cmp_ps_mask,
@@ -244,12 +255,6 @@ pub(crate) mod x86_64 {
         }
 
         #[inline(always)]
-        fn prefetch<T>(self, at: *const T) {
-            // SAFETY: a prefetch is a hint; it may name any address.
-            unsafe { _mm_prefetch::<_MM_HINT_T0>(at.cast()) };
-        }
-
-        #[inline(always)]
         fn load_i8(self, from: &[i8; LANES]) -> Self::V {
             let from = from.as_ptr();
             // SAFETY: whoever made `self` has AVX2; both halves, of eight bytes each, lie inside the block.
@@ -323,12 +328,6 @@ pub(crate) mod x86_64 {
                 let words = _mm512_cvtepu16_epi32(_mm256_loadu_si256(from.as_ptr().cast()));
                 _mm512_castsi512_ps(_mm512_slli_epi32::<16>(words))
             }
-        }
-
-        #[inline(always)]
-        fn prefetch<T>(self, at: *const T) {
-            // SAFETY: a prefetch is a hint; it may name any address.
-            unsafe { _mm_prefetch::<_MM_HINT_T0>(at.cast()) };
         }
 
         #[inline(always)]
