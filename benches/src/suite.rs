@@ -88,7 +88,8 @@ pub fn with_contenders<R>(
     let episode = Episode::of(first)?;
     let known = first.contract().instruction(episode.instruction as usize);
     let words = known.map_or(0, |known| known.words.len() / first.contract().word_dim());
-    let mut memories: Vec<_> = policies.iter().map(Memory::of).collect();
+    let memories = policies.iter().map(Memory::of).collect::<Result<_, _>>();
+    let mut memories: Vec<Memory> = memories.map_err(|error| refused(&error))?;
     let controllers = memories
         .iter_mut()
         .zip(&policies)

@@ -8,8 +8,8 @@ use std::panic::resume_unwind;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 
-use lads_compiler::Memory;
-use lads_core::{Decision, Isa, KnownInstruction, Policy, WorkspaceTooSmall};
+use lads_compiler::{Memory, MemoryError};
+use lads_core::{Decision, Isa, KnownInstruction, Policy};
 use thiserror::Error;
 
 use crate::environment::{Environment, EpisodeSeed};
@@ -75,9 +75,9 @@ pub struct Evaluation<'e> {
 /// Why an evaluation gave no result.
 #[derive(Debug, Error)]
 pub enum EvaluationError {
-    /// The policy's own numbers do not add up.
-    #[error("the policy's workspace is too small: {0}")]
-    Workspace(WorkspaceTooSmall),
+    /// There is no memory for the policy's controller.
+    #[error(transparent)]
+    Memory(MemoryError),
     /// An episode could not be finished.
     #[error("episode {episode} of instruction {instruction}: {source}")]
     Rollout {
@@ -200,10 +200,10 @@ impl Evaluation<'_> {
         finished: &dyn Fn(),
     ) -> Result<Share, EvaluationError> {
         let mut environment = open();
-        let mut memory = Memory::of(&self.policy);
+        let mut memory = Memory::of(&self.policy).map_err(EvaluationError::Memory)?;
         let controller = memory
             .controller_with(&self.policy, self.isa)
-            .map_err(EvaluationError::Workspace)?;
+            .map_err(EvaluationError::Memory)?;
         let mut driver = Driver::new(controller, environment.as_mut());
         if self.setup.traced > 0 {
             driver.record();

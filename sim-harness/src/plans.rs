@@ -7,8 +7,8 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use lads_compiler::Memory;
-use lads_core::{Contract, EncodeError, Policy, WorkspaceTooSmall};
+use lads_compiler::{Memory, MemoryError};
+use lads_core::{Contract, EncodeError, Policy};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -84,9 +84,9 @@ pub enum PlanError {
     /// The same episode twice.
     #[error("'{0}' has plans for the same episode twice")]
     Twice(String),
-    /// The policy's own numbers do not add up.
-    #[error("the policy's workspace is too small: {0}")]
-    Workspace(WorkspaceTooSmall),
+    /// There is no memory for the policy's controller.
+    #[error(transparent)]
+    Memory(MemoryError),
     /// The encoder refused.
     #[error("the trajectory encoder: {0}")]
     Encode(EncodeError),
@@ -180,8 +180,8 @@ pub fn encode<'t>(
     recordings: impl IntoIterator<Item = &'t [Step]>,
 ) -> Result<Vec<Vec<u32>>, PlanError> {
     let horizon = policy.contract().horizon();
-    let mut memory = Memory::of(policy);
-    let mut controller = memory.controller(policy).map_err(PlanError::Workspace)?;
+    let mut memory = Memory::of(policy).map_err(PlanError::Memory)?;
+    let mut controller = memory.controller(policy).map_err(PlanError::Memory)?;
     let mut of_segment = |segment: &[Step]| {
         let observations: Vec<f32> = segment.iter().flat_map(|s| s.observation.clone()).collect();
         let actions: Vec<f32> = segment.iter().flat_map(|s| s.executed.clone()).collect();

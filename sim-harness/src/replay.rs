@@ -4,10 +4,10 @@
 //! damaged log. What can fail: a log of a policy with other sizes, an instruction that this policy does not know, an observation that it
 //! refuses.
 
-use lads_compiler::Memory;
+use lads_compiler::{Memory, MemoryError};
 use lads_core::{
     ActError, Contract, Decision, Element, Instruction, InstructionError, PlanIndex, Policy,
-    StepError, WorkspaceTooSmall,
+    StepError,
 };
 use thiserror::Error;
 
@@ -33,9 +33,9 @@ pub enum ReplayError {
     /// The policy refused it.
     #[error("the policy refuses the instruction: {0}")]
     Instruct(InstructionError),
-    /// The policy's own numbers do not add up.
-    #[error("the policy's workspace is too small: {0}")]
-    Workspace(WorkspaceTooSmall),
+    /// There is no memory for the policy's controller.
+    #[error(transparent)]
+    Memory(MemoryError),
     /// The controller refused an observation.
     #[error("{episode}: the controller refuses the observation of control step {step}: {error}")]
     Step {
@@ -91,8 +91,8 @@ pub fn replay(
     finished: &dyn Fn(),
 ) -> Result<Replayed, ReplayError> {
     fits(&policy.contract(), log)?;
-    let mut memory = Memory::of(policy);
-    let mut controller = memory.controller(policy).map_err(ReplayError::Workspace)?;
+    let mut memory = Memory::of(policy).map_err(ReplayError::Memory)?;
+    let mut controller = memory.controller(policy).map_err(ReplayError::Memory)?;
     let mut replayed = Replayed::default();
     let mut action = vec![0.0; policy.contract().action_len()];
     for flight in &log.flights {

@@ -6,9 +6,9 @@
 
 use std::sync::OnceLock;
 
-use lads_compiler::{Bundle, compile};
+use lads_compiler::{Bundle, Memory, compile};
 use lads_core::image::{CRC_WORD, crc32};
-use lads_core::{Controller, GuardConfig, GuardedController, Instruction, Policy, Tick, Workspace};
+use lads_core::{GuardConfig, GuardedController, Instruction, Policy, Tick};
 
 use crate::wire;
 
@@ -135,13 +135,16 @@ fn open_and_drive(bytes: &[u8]) {
         .saturating_add(contract.action_len());
     let lens = [policy.arena_len(), policy.state_len(), elements];
     if lens.iter().any(|&len| len > MOST_ELEMENTS) {
+        let bytes = lens[0].saturating_add(lens[1]).saturating_mul(4);
+        let refused = bytes > Memory::MOST_BYTES;
+        assert!(!refused || Memory::of(&policy).is_err(), "{bytes}");
         return;
     }
-    let (mut arena, mut state) = (vec![0.0; policy.arena_len()], vec![0.0; policy.state_len()]);
-    let workspace =
-        Workspace::new(&policy, &mut arena, &mut state).expect("there is as much as it asks for");
+    let mut memory = Memory::of(&policy).expect("so little is there");
     let mut guard = vec![0.0; GuardedController::memory_len(&policy)];
-    let controller = Controller::new(policy, workspace);
+    let controller = memory
+        .controller(&policy)
+        .expect("there is as much as it asks for");
     let mut guarded = GuardedController::new(controller, &GuardConfig::default(), &mut guard)
         .expect("the contract's own limits are sound");
     let _ = guarded.self_test();

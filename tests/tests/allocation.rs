@@ -89,7 +89,7 @@ fn a_controller_allocates_nothing() {
     for path in bundles() {
         let image = compiled(&path);
         let policy = Policy::new_checked(image.as_bytes()).unwrap();
-        let mut memory = Memory::of(&policy);
+        let mut memory = Memory::of(&policy).expect("there is memory");
         let mut controller = memory.controller(&policy).unwrap();
         let mut action = vec![0.0; policy.contract().action_len()];
         let calls = calls_during(|| work(&mut controller, &mut action));

@@ -17,7 +17,7 @@ fn golden_episodes_replay() {
             "{}: it decides more than once",
             path.display()
         );
-        let mut memory = Memory::of(&policy);
+        let mut memory = Memory::of(&policy).expect("there is memory");
         let passed = memory.controller(&policy).unwrap().self_test();
         let passed = passed.unwrap_or_else(|error| panic!("{}: {error}", path.display()));
         assert_eq!(passed.steps as usize, golden.len());
@@ -34,7 +34,7 @@ fn the_plans_of_a_golden_episode_differ_by_instruction() {
         let mut action = vec![0.0; policy.contract().action_len()];
         let mut logits = Vec::new();
         for instruction in 0..policy.contract().instruction_count() as u32 {
-            let mut memory = Memory::of(&policy);
+            let mut memory = Memory::of(&policy).expect("there is memory");
             let mut controller = memory.controller(&policy).unwrap();
             controller
                 .set_instruction(Instruction::Id(instruction))
@@ -82,7 +82,7 @@ fn a_controller_that_was_used_answers_like_a_fresh_one() {
                 .map(step)
                 .collect::<Vec<_>>()
         };
-        let mut memory = Memory::of(&policy);
+        let mut memory = Memory::of(&policy).expect("there is memory");
         let mut controller = memory.controller(&policy).unwrap();
         controller.set_instruction(Instruction::Id(1)).unwrap();
         let fresh = episode(&mut controller);
@@ -113,7 +113,7 @@ fn one_element_less_of_memory_is_refused() {
         let Memory {
             mut arena,
             mut state,
-        } = Memory::of(&policy);
+        } = Memory::of(&policy).expect("there is memory");
         let (arena_len, state_len) = (arena.len(), state.len());
         let short = Workspace::new(&policy, &mut arena[1..], &mut state).unwrap_err();
         assert_eq!(

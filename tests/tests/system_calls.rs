@@ -23,7 +23,7 @@ fn mark(name: &str) {
 fn steps() {
     let image = compiled(&project_path("models/kitchen.onnx"));
     let policy = Policy::new_checked(image.as_bytes()).unwrap();
-    let mut memory = Memory::of(&policy);
+    let mut memory = Memory::of(&policy).expect("there is memory");
     let mut controller = memory.controller(&policy).unwrap();
     let mut action = vec![0.0; policy.contract().action_len()];
     let golden = policy.golden().unwrap();

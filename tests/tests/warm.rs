@@ -6,7 +6,7 @@ use lads_tests::{bundles, compiled};
 
 /// Plans, actions and logits of steps over a context's end, with a second instruction on the way.
 fn episode(policy: &Policy<'_>, warm: bool) -> Vec<(u32, Vec<f32>, Vec<f32>)> {
-    let mut memory = Memory::of(policy);
+    let mut memory = Memory::of(policy).expect("there is memory");
     let mut controller = memory.controller(policy).unwrap();
     let mut action = vec![0.0; policy.contract().action_len()];
     let golden = policy.golden().unwrap();

@@ -32,8 +32,10 @@ pub fn act(
 ) -> Result<(), Refusal> {
     let policy = model.policy()?;
     let instruction = model.instruction(request.instruction)?;
-    let mut memory = Memory::of(&policy);
-    let mut controller = memory.controller(&policy)?;
+    let mut memory = Memory::of(&policy).map_err(|error| model.refused(error))?;
+    let mut controller = memory
+        .controller(&policy)
+        .map_err(|error| model.refused(error))?;
     // A policy that answers differently on this machine is not let near a motor.
     self_test::replay(model, &policy, &mut controller)?;
     if let Some(seed) = request.sample {

@@ -3,6 +3,7 @@
 //! What can fail: the file cannot be read, is neither of the two, or is broken; each is one line with the remedy. A `Model` that was
 //! opened holds an image that was checked.
 
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
 use lads_compiler::{Bundle, Image, Options, compile_with};
@@ -90,6 +91,11 @@ impl Model {
                 "compile it again from its bundle",
             )
         })
+    }
+
+    /// What is wrong with the policy, by an error that says itself what to do.
+    pub fn refused(&self, error: impl Display) -> Refusal {
+        Refusal::with_remedy_inside(self.path.display(), error)
     }
 
     /// The number of the instruction with this id, or with this text up to case and white space.

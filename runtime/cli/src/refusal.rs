@@ -5,8 +5,6 @@
 use std::error::Error;
 use std::fmt::{self, Display};
 
-use lads_core::WorkspaceTooSmall;
-
 /// Why the command ended without doing what it was asked; exit code 2.
 #[derive(Debug)]
 pub struct Refusal(String);
@@ -20,16 +18,6 @@ impl Refusal {
     /// The same with an error that says itself what to do.
     pub fn with_remedy_inside(thing: impl Display, error: impl Display) -> Self {
         Self(one_line(&format!("{thing}: {error}")))
-    }
-}
-
-impl From<WorkspaceTooSmall> for Refusal {
-    fn from(error: WorkspaceTooSmall) -> Self {
-        Self::new(
-            "the policy's workspace",
-            error,
-            "compile it again from its bundle",
-        )
     }
 }
 

@@ -9,8 +9,10 @@ use crate::refusal::Refusal;
 /// Replays the golden episode and says in one line how it went; a policy without one is refused.
 pub fn self_test(model: &Model) -> Result<String, Refusal> {
     let policy = model.policy()?;
-    let mut memory = Memory::of(&policy);
-    let mut controller = memory.controller(&policy)?;
+    let mut memory = Memory::of(&policy).map_err(|error| model.refused(error))?;
+    let mut controller = memory
+        .controller(&policy)
+        .map_err(|error| model.refused(error))?;
     match replay(model, &policy, &mut controller)? {
         Some(line) => Ok(line),
         None => Err(Refusal::new(

@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
 use lads_compiler::{Bundle, compile};
-use lads_core::image::{CRC_WORD, crc32};
+use lads_core::codec::{Field, Reader, Writer};
+use lads_core::image::{CRC_WORD, ProgramKind, ProgramRecord, SECTION_TABLE_WORD, Section, crc32};
+use lads_core::op::{OP_WORDS, Op, Operand, Space, Span};
 use lads_core::{Golden, Policy};
 use serde_json::Value;
 
@@ -394,6 +396,77 @@ fn bad_files_are_refused_by_every_command() {
         "",
         &["altered.onnx", "version 7", "version 1"],
     );
+}
+
+/// An image with a program whose arena has `elements`, and, where it is to be used, an op over all of it.
+fn greedy(image: &[u8], elements: u32, used: bool) -> Vec<u8> {
+    let (words, _) = image.as_chunks::<4>();
+    let mut words: Vec<u32> = words.iter().map(|&word| u32::from_le_bytes(word)).collect();
+    let section = |words: &[u32], section: Section| {
+        words[SECTION_TABLE_WORD + 2 * section as usize] as usize / 4
+    };
+    let at =
+        section(&words, Section::Programs) + ProgramKind::Encode as usize * ProgramRecord::WORDS;
+    let mut record = ProgramRecord::take(&mut Reader::new(&words[at..])).unwrap();
+    record.arena_len = elements;
+    record.put(&mut Writer::new(&mut words[at..]));
+    if used {
+        let first = section(&words, Section::Ops) + record.first_op as usize * OP_WORDS;
+        let (ops, _) = words[first..].as_chunks_mut::<OP_WORDS>();
+        let unary = ops.iter_mut().find_map(|words| match Op::decode(words) {
+            Some(Op::Unary(op)) => Some((words, op)),
+            _ => None,
+        });
+        let (words, mut op) = unary.expect("the trajectory encoder has such an op");
+        let len = elements / 2;
+        op.x = Operand {
+            space: Space::Arena,
+            offset: 0,
+            len,
+        };
+        op.y = Span { offset: len, len };
+        *words = Op::Unary(op).encode();
+    }
+    let mut bytes: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
+    let crc = crc32(&bytes);
+    bytes[CRC_WORD * 4..][..4].copy_from_slice(&crc.to_le_bytes());
+    bytes
+}
+
+#[test]
+fn an_image_that_asks_for_gigabytes_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder
+        .path()
+        .join("greedy.lads")
+        .to_str()
+        .unwrap()
+        .to_owned();
+    let image = compile(&Bundle::open(&tiny()).unwrap()).unwrap();
+    let write =
+        |elements, used| fs::write(&path, greedy(image.as_bytes(), elements, used)).unwrap();
+    for elements in [1 << 30, u32::MAX] {
+        write(elements, false);
+        let parts = [
+            "greedy.lads",
+            "larger arena than it uses",
+            "compile it again",
+        ];
+        refused(&["inspect", &path], "", &parts);
+        refused(&["self-test", &path], "", &parts);
+        refused(&act(&path, &[]), "", &parts);
+    }
+    for elements in [1 << 28, u32::MAX - 1] {
+        write(elements, true);
+        assert!(answer(&["inspect", &path], "").contains(&(u64::from(elements) * 4).to_string()));
+        let parts = [
+            "greedy.lads",
+            "workspace of",
+            "the most that one gets is 1073741824",
+        ];
+        refused(&["self-test", &path], "", &parts);
+        refused(&act(&path, &[]), "", &parts);
+    }
 }
 
 #[test]

@@ -2,8 +2,8 @@
 
 use std::collections::HashMap;
 
+use lads_core::Policy;
 use lads_core::op::{Port, WeightFormat, WeightSpan};
-use lads_core::{Policy, SelfTest, SelfTestError};
 
 use crate::bundle::Bundle;
 use crate::entries::{
@@ -180,23 +180,17 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
     let image = image::write(bundle, &parts, report)?;
     let policy = Policy::new_checked(image.as_bytes()).map_err(CompileError::Image)?;
     if options.weights != WeightFormat::F32 && !options.force {
-        gate(&policy).map_err(|error| CompileError::Gate {
-            format: options.weights.name(),
-            error,
-            tolerance: parts.tolerance,
-        })?;
+        let mut memory = Memory::of(&policy)?;
+        memory
+            .controller(&policy)?
+            .self_test()
+            .map_err(|error| CompileError::Gate {
+                format: options.weights.name(),
+                error,
+                tolerance: parts.tolerance,
+            })?;
     }
     Ok(image)
-}
-
-/// Replays the golden episode.
-fn gate(policy: &Policy) -> Result<SelfTest, SelfTestError> {
-    let mut memory = Memory::of(policy);
-    // Memory of a policy's own size is never too small.
-    let mut controller = memory
-        .controller(policy)
-        .map_err(|_| SelfTestError::NoGolden)?;
-    controller.self_test()
 }
 
 fn signature<'s>(signatures: &'s [Signature], entry: &str) -> Result<&'s Signature, CompileError> {

@@ -5,6 +5,8 @@ use std::path::PathBuf;
 
 use lads_core::{PolicyError, SelfTestError};
 
+use crate::memory::MemoryError;
+
 /// Text of one line: control characters, which names in a hostile file may hold, are escaped.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Line(String);
@@ -150,6 +152,9 @@ pub enum CompileError {
         /// What is too large.
         what: Line,
     },
+    /// There is no memory for the image's controller.
+    #[error(transparent)]
+    Memory(#[from] MemoryError),
     /// The image that was made does not load: a defect of this compiler.
     #[error(
         "the compiled image does not load ({0}); this is a defect of the compiler, please report it with the bundle"

@@ -50,6 +50,6 @@ pub use error::{BundleError, CompileError, Line};
 pub use golden::Golden;
 pub use image::Image;
 pub use lads_core::op::WeightFormat;
-pub use memory::Memory;
+pub use memory::{Memory, MemoryError};
 pub use report::{CompileReport, ProgramReport};
 pub use verify::PlanFault;

@@ -1,4 +1,6 @@
 //! The memory of a controller on a host that may allocate.
+//!
+//! Images are untrusted, and one may ask for more than there is: that is refused before any of it is touched.
 
 use lads_core::{Controller, Isa, Policy, Workspace, WorkspaceTooSmall};
 
@@ -12,19 +14,36 @@ pub struct Memory {
 }
 
 impl Memory {
+    /// The most that a policy gets. Real ones take a few megabytes; an operating system that promises more memory than it has
+    /// would let an image take all of it.
+    pub const MOST_BYTES: usize = 1 << 30;
+
     /// As much as `policy` asks for.
-    pub fn of(policy: &Policy<'_>) -> Self {
-        Self {
-            arena: vec![0.0; policy.arena_len()],
-            state: vec![0.0; policy.state_len()],
+    pub fn of(policy: &Policy<'_>) -> Result<Self, MemoryError> {
+        let (arena, state) = (policy.arena_len(), policy.state_len());
+        let bytes = arena.saturating_add(state).saturating_mul(size_of::<f32>());
+        if bytes > Self::MOST_BYTES {
+            return Err(MemoryError::Excessive { bytes });
         }
+        let zeros = |len| -> Result<Vec<f32>, MemoryError> {
+            let mut elements = Vec::new();
+            elements
+                .try_reserve_exact(len)
+                .map_err(|_| MemoryError::Exhausted { bytes })?;
+            elements.resize(len, 0.0);
+            Ok(elements)
+        };
+        Ok(Self {
+            arena: zeros(arena)?,
+            state: zeros(state)?,
+        })
     }
 
     /// A controller that works in this memory; refused when it was made for a smaller policy.
     pub fn controller<'p, 'm>(
         &'m mut self,
         policy: &Policy<'p>,
-    ) -> Result<Controller<'p, 'm>, WorkspaceTooSmall> {
+    ) -> Result<Controller<'p, 'm>, MemoryError> {
         self.controller_with(policy, Isa::detect())
     }
 
@@ -33,8 +52,33 @@ impl Memory {
         &'m mut self,
         policy: &Policy<'p>,
         isa: Isa,
-    ) -> Result<Controller<'p, 'm>, WorkspaceTooSmall> {
+    ) -> Result<Controller<'p, 'm>, MemoryError> {
         let workspace = Workspace::new(policy, &mut self.arena, &mut self.state)?;
         Ok(Controller::with_isa(*policy, workspace, isa))
     }
+}
+
+/// Why there is no memory for a controller.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum MemoryError {
+    /// The policy asks for more than any policy gets.
+    #[error(
+        "the policy asks for a workspace of {bytes} bytes, and the most that one gets is {most}; compile it from a bundle with a shorter context, or do not trust it",
+        most = Memory::MOST_BYTES
+    )]
+    Excessive {
+        /// What it asks for.
+        bytes: usize,
+    },
+    /// This machine does not have it.
+    #[error(
+        "this machine has no {bytes} bytes left for the policy's workspace; end other programs, or compile it from a bundle with a shorter context"
+    )]
+    Exhausted {
+        /// What the policy asks for.
+        bytes: usize,
+    },
+    /// The memory was made for a smaller policy.
+    #[error("{0}; it was made for another policy")]
+    Small(#[from] WorkspaceTooSmall),
 }

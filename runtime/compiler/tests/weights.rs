@@ -24,7 +24,7 @@ fn options(weights: WeightFormat, tolerance: f32) -> Options {
 fn actions(image: &Image, isa: Isa) -> Vec<f32> {
     let policy = Policy::new_checked(image.as_bytes()).unwrap();
     let golden = policy.golden().unwrap();
-    let mut memory = Memory::of(&policy);
+    let mut memory = Memory::of(&policy).expect("there is memory");
     let workspace = Workspace::new(&policy, &mut memory.arena, &mut memory.state).unwrap();
     let mut controller = Controller::with_isa(policy, workspace, isa);
     let instruction = lads_core::Instruction::Id(golden.instruction());
@@ -59,7 +59,7 @@ fn fewer_bits_are_admitted_inside_a_tolerance() {
         let image = compile_with(&bundle, options(format, tolerance)).unwrap();
         let policy = Policy::new_checked(image.as_bytes()).unwrap();
         assert_eq!(policy.golden().unwrap().tolerance(), tolerance);
-        let mut memory = Memory::of(&policy);
+        let mut memory = Memory::of(&policy).expect("there is memory");
         let passed = memory.controller(&policy).unwrap().self_test().unwrap();
         assert!(
             passed.largest_error > tolerance / 20.0,
@@ -117,6 +117,6 @@ fn what_changes_the_policy_is_refused_unless_forced() {
     };
     let image = compile_with(&bundle, forced).unwrap();
     let policy = Policy::new_checked(image.as_bytes()).unwrap();
-    let mut memory = Memory::of(&policy);
+    let mut memory = Memory::of(&policy).expect("there is memory");
     assert!(memory.controller(&policy).unwrap().self_test().is_err());
 }

@@ -2,6 +2,7 @@
 //!
 //! Numbers come from an image that may be hostile, so products are taken in 128 bits, where four 32-bit factors fit.
 
+use core::cell::Cell;
 use core::error::Error;
 use core::fmt;
 
@@ -30,6 +31,8 @@ pub enum Fault {
     Tokens,
     /// An integer port outside an integer slot, or the other way round.
     Port,
+    /// The arena is larger than what lies in it.
+    Arena,
 }
 
 impl fmt::Display for Fault {
@@ -43,6 +46,7 @@ impl fmt::Display for Fault {
             Self::Capacity => "the KV cache is too small for the longest context",
             Self::Tokens => "an attention appends another number of tokens than its program",
             Self::Port => "a port lies in the wrong kind of place",
+            Self::Arena => "it asks for a larger arena than it uses",
         })
     }
 }
@@ -75,6 +79,14 @@ fn reaches<const N: usize>(len: u32, dims: [u32; N], strides: [u32; N]) -> Check
 fn inside(offset: u32, len: u32, space: usize) -> Checked {
     let end = u64::from(offset).saturating_add(u64::from(len));
     require(len != 0 && end <= space as u64, Fault::Bounds)
+}
+
+/// Moves `end` to the end of a span that lies behind it.
+fn reach(end: &Cell<u64>, offset: u32, len: u32) {
+    end.set(
+        end.get()
+            .max(u64::from(offset).saturating_add(u64::from(len))),
+    );
 }
 
 fn overlap(a: [u32; 2], b: [u32; 2]) -> bool {
@@ -112,14 +124,36 @@ pub(crate) fn is_contiguous(dims: [u32; 4], strides: [u32; 4]) -> bool {
         })
 }
 
-/// Checks ops against the spaces of one program.
+/// Checks ops against the spaces of one program, and keeps how much of the spaces in memory they use.
 pub(crate) struct Checker {
     pub spaces: Spaces,
     pub arena_len: u32,
     pub tokens: u32,
+    arena_end: Cell<u64>,
+    cache_end: Cell<u64>,
 }
 
 impl Checker {
+    pub fn new(spaces: Spaces, arena_len: u32, tokens: u32) -> Self {
+        Self {
+            spaces,
+            arena_len,
+            tokens,
+            arena_end: Cell::new(0),
+            cache_end: Cell::new(0),
+        }
+    }
+
+    /// Every element of the arena belongs to something: an image cannot ask for memory that it does not use. Returns how much
+    /// of the cache is used.
+    pub fn finish(&self) -> Result<u64, Fault> {
+        require(
+            self.arena_end.get() == u64::from(self.arena_len),
+            Fault::Arena,
+        )?;
+        Ok(self.cache_end.get())
+    }
+
     pub fn op(&self, op: &Op) -> Checked {
         match op {
             Op::Linear(op) => self.linear(op),
@@ -145,7 +179,9 @@ impl Checker {
     }
 
     fn arena(&self, span: Span) -> Checked {
-        inside(span.offset, span.len, self.arena_len as usize)
+        inside(span.offset, span.len, self.arena_len as usize)?;
+        reach(&self.arena_end, span.offset, span.len);
+        Ok(())
     }
 
     fn weights(&self, span: WeightSpan) -> Checked {
@@ -153,13 +189,18 @@ impl Checker {
     }
 
     fn cache(&self, span: StateSpan) -> Checked {
-        inside(span.offset, span.len, self.spaces.cache_len)
+        inside(span.offset, span.len, self.spaces.cache_len)?;
+        reach(&self.cache_end, span.offset, span.len);
+        Ok(())
     }
 
     fn operand(&self, operand: Operand) -> Checked {
         match operand.space {
             Space::Weights => inside(operand.offset, operand.len, self.spaces.weights_len),
-            Space::Arena => inside(operand.offset, operand.len, self.arena_len as usize),
+            Space::Arena => self.arena(Span {
+                offset: operand.offset,
+                len: operand.len,
+            }),
         }
     }
 

@@ -2,7 +2,7 @@
 //!
 //! [`Policy::new_checked`] copies nothing and allocates nothing; the policy borrows the image. It proves what running relies
 //! on: the sections lie inside the image, every program is well formed, every port has the contract's length, and the KV cache
-//! holds the longest context. It does not read the weights: [`Policy::checksum_matches`] does.
+//! holds the longest context. Nor can an image ask for memory that its own programs do not use. It does not read the weights: [`Policy::checksum_matches`] does.
 
 use core::error::Error;
 use core::fmt;
@@ -80,6 +80,10 @@ impl<'a> Policy<'a> {
             open(ProgramKind::Act)?,
             open(ProgramKind::Encode)?,
         ];
+        let cache_end = programs.iter().map(Program::cache_end).max();
+        if cache_end != Some(contract.cache_len() as u64) {
+            return Err(PolicyError::Cache);
+        }
         Ok(Self {
             image,
             programs,
@@ -361,6 +365,8 @@ pub enum PolicyError {
     Strings,
     /// The contract makes no sense.
     Contract(ContractError),
+    /// The KV cache is larger than what the programs keep in it.
+    Cache,
     /// A program that every policy has is missing.
     Missing(ProgramKind),
     /// A program is not well formed.
@@ -396,6 +402,9 @@ impl fmt::Display for PolicyError {
             }
             Self::Strings => f.write_str("the strings of the program image are no UTF-8"),
             Self::Contract(error) => write!(f, "contract: {error}"),
+            Self::Cache => {
+                f.write_str("the program image asks for a larger KV cache than its programs use")
+            }
             Self::Missing(program) => write!(f, "the program image has no program {program:?}"),
             Self::Program { program, error } => write!(f, "program {program:?}, {error}"),
         }

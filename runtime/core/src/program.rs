@@ -30,6 +30,7 @@ pub struct Program<'a> {
     record: &'a [u32],
     arena_len: u32,
     tokens: u32,
+    cache_end: u64,
 }
 
 impl<'a> Program<'a> {
@@ -47,22 +48,12 @@ impl<'a> Program<'a> {
             .checked_add(parsed.ops_len as usize)
             .and_then(|end| ops.get(first..end))
             .ok_or(error(None, Fault::Bounds))?;
-        let checker = Checker {
-            spaces,
-            arena_len: parsed.arena_len,
-            tokens: parsed.tokens,
-        };
+        let checker = Checker::new(spaces, parsed.arena_len, parsed.tokens);
         for (i, words) in ops.iter().enumerate() {
             let at = Some(i as u32);
             let op = Op::decode(words).ok_or(error(at, Fault::Encoding))?;
             checker.op(&op).map_err(|fault| error(at, fault))?;
         }
-        let program = Self {
-            ops,
-            record,
-            arena_len: parsed.arena_len,
-            tokens: parsed.tokens,
-        };
         for (ports, len) in [
             (&parsed.inputs, parsed.inputs_len),
             (&parsed.outputs, parsed.outputs_len),
@@ -74,7 +65,19 @@ impl<'a> Program<'a> {
                 checker.port(port).map_err(|fault| error(None, fault))?;
             }
         }
-        Ok(program)
+        let cache_end = checker.finish().map_err(|fault| error(None, fault))?;
+        Ok(Self {
+            ops,
+            record,
+            arena_len: parsed.arena_len,
+            tokens: parsed.tokens,
+            cache_end,
+        })
+    }
+
+    /// Elements of the KV cache up to the end of what the program reads or appends.
+    pub(crate) fn cache_end(&self) -> u64 {
+        self.cache_end
     }
 
     /// Elements of arena that a run needs.

@@ -492,6 +492,28 @@ fn a_missing_program_or_port_is_named() {
 }
 
 #[test]
+fn an_image_cannot_ask_for_memory_that_it_does_not_use() {
+    for kind in [ProgramKind::Instruct, ProgramKind::Act, ProgramKind::Encode] {
+        for more in [1, u32::MAX / 2] {
+            let mut parts = sound();
+            parts.programs[kind as usize].0.arena_len += more;
+            let refused = Policy::new_checked(parts.image().bytes()).map(|_| ());
+            assert!(
+                matches!(refused, Err(PolicyError::Program { program, error })
+                    if program == kind && error.fault == Fault::Arena),
+                "{refused:?}"
+            );
+        }
+    }
+    for more in [1, u32::MAX / 2] {
+        let mut parts = sound();
+        parts.contract.cache_len += more;
+        let refused = Policy::new_checked(parts.image().bytes()).map(|_| ());
+        assert_eq!(refused, Err(PolicyError::Cache));
+    }
+}
+
+#[test]
 fn a_timestep_beyond_the_table_is_an_error_of_the_step() {
     let mut parts = sound();
     // The table of timesteps is read one row too far: the last step of a context has no row.

@@ -254,6 +254,7 @@ impl From<PolicyError> for Status {
             | PolicyError::Section(_)
             | PolicyError::Strings
             | PolicyError::Contract(_)
+            | PolicyError::Cache
             | PolicyError::Missing(_)
             | PolicyError::Program { .. } => Self::ImageMalformed,
         }

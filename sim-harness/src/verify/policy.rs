@@ -91,10 +91,10 @@ pub fn ask(
             .min(ACTION_TOLERANCE),
         ..Answers::default()
     };
-    let mut memory = Memory::of(policy);
+    let mut memory = Memory::of(policy).map_err(EvaluationError::Memory)?;
     let mut controller = memory
         .controller_with(policy, isa)
-        .map_err(EvaluationError::Workspace)?;
+        .map_err(EvaluationError::Memory)?;
     controller.set_decision(Decision::Argmax);
     for &Assignment {
         instruction: index, ..

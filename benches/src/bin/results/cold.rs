@@ -57,7 +57,7 @@ pub fn child(image: &Path, warm: bool) -> Result<(), BenchError> {
     let (policy, open) = timed(|| Policy::new_checked(bytes));
     let policy = policy.map_err(refused)?;
     let episode = Episode::of(&policy)?;
-    let mut memory = Memory::of(&policy);
+    let mut memory = Memory::of(&policy).map_err(refused)?;
     let (controller, prepare) = timed(|| memory.controller(&policy));
     let mut controller = controller.map_err(refused)?;
     // What a robot does before its policy starts: other work, which takes the caches.

@@ -411,7 +411,7 @@ fn check_numbers(arguments: &Arguments) -> Result<usize, End> {
 
 /// Replays the bundle's golden episode on this machine; a policy that answers differently is not run.
 fn self_test(policy: &Policy<'_>) -> Result<(), String> {
-    let mut memory = Memory::of(policy);
+    let mut memory = Memory::of(policy).map_err(|error| error.to_string())?;
     let mut controller = memory
         .controller(policy)
         .map_err(|error| error.to_string())?;
