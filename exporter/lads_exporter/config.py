@@ -28,7 +28,7 @@ class HighLevel:
     layers: int
     heads: int
     dropout: float
-    context_steps: int  # rows of the timestep embedding
+    context_steps: int  # rows of the timestep embedding; longer trajectories are cut where the controller restarts its context
     balance: float  # times the log frequency of each plan is taken off its logit after training; 0 is the paper's
 
 
@@ -62,6 +62,7 @@ class Alignment:
     heads: int
     dropout: float
     out: int
+    segments: int  # plans of the longest trajectory that is aligned
     segment_dropout: float  # probability with which a plan is left out of the sequence that is aligned; 0 is the paper's
 
 

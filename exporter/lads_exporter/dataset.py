@@ -79,16 +79,23 @@ def _check(dataset, path, setting):
         raise UserError(f"{path}: no episode in it")
     if dataset.offsets[0] != 0 or (dataset.lengths() < 1).any():
         raise UserError(f"{path}: episode_offsets must start at 0 and grow")
-    limit = setting.config.high_level.context_steps
-    if dataset.lengths().max() > limit:
-        raise UserError(
-            f"{path}: an episode has {dataset.lengths().max()} steps, more than high_level.context_steps = {limit}"
-        )
+    for key, limit in _longest(setting).items():
+        if dataset.lengths().max() > limit:
+            raise UserError(f"{path}: an episode has {dataset.lengths().max()} steps, more than the {limit} of {key}")
     if dataset.texts is not None:
         return
     for index in np.unique(dataset.instruction):
         if setting.instructions[index]["split"] != "seen":
             raise UserError(f"{path}: has demonstrations of the unseen instruction {setting.instructions[index]['id']!r}")
+
+
+def _longest(setting):
+    """What bounds the length of an episode: {key of the configuration: control steps}."""
+    config = setting.config
+    longest = {"alignment.segments": config.alignment.segments * config.encoder.horizon}
+    if config.beyond_context == "refuse":
+        longest["high_level.context_steps"] = config.high_level.context_steps
+    return longest
 
 
 def _read_safetensors(path, setting):
@@ -174,7 +181,7 @@ def _read_d4rl(path, setting):
             continue
         states = observations[start:stop, :width]
         done = frozenset(_completed(states, sub_tasks, radius))
-        if done in labels and stop - start <= setting.config.high_level.context_steps:
+        if done in labels and stop - start <= min(_longest(setting).values()):
             kept.append(labels[done])
             rows.append(np.arange(start, stop))
         elif done in labels:

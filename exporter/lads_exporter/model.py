@@ -204,11 +204,11 @@ class TrajectoryEncoder(nn.Module):
 class Alignment(nn.Module):
     """The projectors phi and psi and the contrastive loss of equations 10, 25 and 26."""
 
-    def __init__(self, config, plan_len, sentence_dim, max_segments):
+    def __init__(self, config, plan_len, sentence_dim):
         super().__init__()
         hidden = config.hidden
         self.embed = nn.Linear(plan_len, hidden)
-        self.position = nn.Parameter(torch.randn(max_segments, hidden) * 0.02)
+        self.position = nn.Parameter(torch.randn(config.segments, hidden) * 0.02)
         layer = nn.TransformerEncoderLayer(hidden, config.heads, 4 * hidden, config.dropout, batch_first=True)
         self.transformer = nn.TransformerEncoder(layer, config.layers, enable_nested_tensor=False)
         self.phi = self._projector(hidden, hidden, config.out)
@@ -260,5 +260,4 @@ class Lads(nn.Module):
         self.low_level = LowLevelPolicy(config.low_level, o, encoder.codebook_dim, a)
         self.high_level = HighLevelPolicy(config.high_level, encoded.dim, o, a, encoder.codebook_size)
         sentence_dim = len(encoded.instructions[0].sentence)
-        max_segments = -(-config.high_level.context_steps // encoder.horizon)
-        self.alignment = Alignment(config.alignment, encoder.codebook_dim, sentence_dim, max_segments)
+        self.alignment = Alignment(config.alignment, encoder.codebook_dim, sentence_dim)

@@ -89,10 +89,25 @@ class Losses:
         length = int(corpus.lengths[episodes].max())
         at = episodes.to(corpus.device)
         words, codes = self._instructions(episodes, codes[:, :length])
+        observations, executed = corpus.observations[at, :length], corpus.executed[at, :length]
+        words, codes, observations, executed = self._contexts(words, codes, observations, executed)
         with torch.autocast(corpus.device.type, torch.bfloat16, enabled=self.autocast):
-            logits = self.lads.high_level(words, corpus.observations[at, :length], corpus.executed[at, :length])
+            logits = self.lads.high_level(words, observations, executed)
         logits, targets = logits[codes >= 0], codes[codes >= 0]
         return F.cross_entropy(logits, targets), (logits.argmax(-1) == targets).float().mean()
+
+    def _contexts(self, words, codes, observations, executed):
+        """Cuts trajectories that are longer than the context where the controller restarts it: a row for each context."""
+        most, length = self.config.high_level.context_steps, codes.shape[1]
+        if length <= most:
+            return words, codes, observations, executed
+        count = -(-length // most)
+        more = count * most - length
+        codes = F.pad(codes, (0, more), value=-1).reshape(-1, most)
+        observations, executed = (F.pad(x, (0, 0, 0, more)).reshape(-1, most, x.shape[-1]) for x in (observations, executed))
+        kept = (codes >= 0).any(1)
+        words = [words[row // count] for row in kept.nonzero()[:, 0].tolist()]
+        return words, codes[kept], observations[kept], executed[kept]
 
     def _instructions(self, episodes, codes):
         """The words of each episode's instruction and its targets; in training, some with another ending."""

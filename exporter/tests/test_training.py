@@ -89,6 +89,42 @@ def test_cross_entropy_does_not_move_the_plans(tmp_path):
     assert any(value.grad.abs().max() > 0 for value in trainer.lads.high_level.parameters())
 
 
+def test_trajectories_longer_than_the_context_are_cut_where_the_controller_restarts_it(tmp_path):
+    setting = setting_for("staged")
+    setting.tables[0]["high_level"]["context_steps"] = 10
+    trainer = trainer_for(tmp_path / "run", config.from_tables(*setting.tables, "test"))
+    trainer.lads.eval()
+    corpus, high_level = trainer.corpus, trainer.lads.high_level
+    episodes = corpus.validation.repeat(2)
+    codes = torch.randint(5, (len(episodes), corpus.steps))
+    losses, hits = [], []
+    for row, episode in enumerate(episodes.tolist()):
+        length = int(corpus.lengths[episode])
+        assert length > 10
+        codes[row, length:] = -1
+        words = [corpus.words[corpus.instruction[episode]]]
+        for start in range(0, length, 10):
+            part = slice(start, min(start + 10, length))
+            logits = high_level(words, corpus.observations[[episode], part], corpus.executed[[episode], part])[0]
+            losses.append(torch.nn.functional.cross_entropy(logits, codes[row, part], reduction="none"))
+            hits.append(logits.argmax(-1) == codes[row, part])
+    trainer.losses.autocast = False
+    loss, accuracy = trainer.losses.high_level(episodes, codes)
+    torch.testing.assert_close(loss, torch.cat(losses).mean())
+    torch.testing.assert_close(accuracy, torch.cat(hits).float().mean())
+
+
+def test_episodes_that_are_too_long_are_refused(tmp_path):
+    setting = setting_for("staged")
+    path = synthetic.write(tmp_path / "tiny.safetensors", setting)
+    for table, key, value, named in (("alignment", "segments", 2, "alignment.segments"), ("high_level", "context_steps", 8, "context_steps")):
+        tables = copy.deepcopy(setting.tables)
+        tables[0]["beyond_context"] = "refuse"
+        tables[0][table][key] = value
+        with pytest.raises(UserError, match=named):
+            dataset.load(path, config.from_tables(*tables, "test"))
+
+
 @pytest.mark.parametrize(("schedule", "stop_at"), [("joint", 40), ("staged", 70), ("staged", 130), ("staged", 200)])
 def test_resumed_run_equals_an_uninterrupted_one(tmp_path, schedule, stop_at):
     setting = setting_for(schedule)
