@@ -16,7 +16,7 @@ RUNTIME := -p lads-core -p lads-kernels -p lads-compiler -p lads-ffi -p lads-cli
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report record say language verify test setup lint test-rust test-runtime test-exporter collect train export reference install bench clean help
+.PHONY: run report record say language verify test setup lint test-rust test-runtime test-exporter sanitize collect train export reference install bench clean help
 
 ## run: the shipped policy over the paper's seen and unseen instructions
 run: setup
@@ -59,6 +59,17 @@ test-runtime:
 
 test-rust: setup
 	cargo test $(ALL)
+
+# Tests of what has unsafe code or untrusted input, in a build with AddressSanitizer, whose run-time library comes with the toolchain,
+# and under valgrind, which also sees memory that was never written. Debug assertions and the checks of unsafe preconditions are on in both.
+SANITIZED := --tests -p lads-kernels -p lads-core -p lads-ffi
+HOST = $(shell rustc --print host-tuple)
+
+## sanitize: the runtime's tests with AddressSanitizer, then under valgrind; some minutes
+sanitize:
+	RUSTC_BOOTSTRAP=1 RUSTFLAGS=-Zsanitizer=address cargo test --target $(HOST) --target-dir target/sanitize $(SANITIZED)
+	PROPTEST_CASES=8 CARGO_TARGET_$(shell echo $(HOST) | tr a-z- A-Z_)_RUNNER="valgrind --quiet --error-exitcode=99" \
+		cargo test --target $(HOST) $(SANITIZED)
 
 # The stamp makes the environment anew whenever the package's pins change.
 $(VENV)/stamp: exporter/pyproject.toml

@@ -1,7 +1,7 @@
 #!/bin/sh
 # Builds liblads.a: one object that exports lads_* and nothing else, and that cannot panic.
 # usage: runtime/ffi/archive.sh <output file> [<target>]
-# Needs cargo and binutils; for another target set LD, OBJCOPY, AR and NM to its tools.
+# Needs cargo and binutils; for another target set LD, OBJCOPY, AR and NM to its tools, and CARGO_FLAGS to what cargo needs for it.
 set -eu
 output=$1
 target=${2:-}
@@ -14,16 +14,20 @@ case $output in /*) ;; *) output=$PWD/$output ;; esac
 mkdir -p "$(dirname "$output")"
 
 build=${CARGO_TARGET_DIR:-$root/target}/archive-build
-(cd "$root" && "$CARGO" rustc --quiet --locked -p lads-ffi --profile archive --features static-library \
+# shellcheck disable=SC2086
+(cd "$root" && "$CARGO" rustc --quiet --locked ${CARGO_FLAGS:-} -p lads-ffi --profile archive --features static-library \
     --crate-type staticlib --target-dir "$build" ${target:+--target "$target"})
+
+# Some targets' objects carry their bitcode too; binutils with a plugin for it would read that instead.
+"$OBJCOPY" --remove-section=.llvmbc --remove-section=.llvmcmd "$build/${target:+$target/}archive/liblads_ffi.a" "$work/whole.a"
 
 # Beside the crate's own object, a staticlib carries all of Rust's compiler builtins; the linker takes from it what is used.
 # What only a panic would reach is dropped: no root leads there.
-roots=$("$NM" --defined-only "$build/${target:+$target/}archive/liblads_ffi.a" 2>/dev/null |
+roots=$("$NM" --defined-only "$work/whole.a" 2>/dev/null |
     sed -n 's/^[0-9a-f]* T \(lads_[a-z0-9_]*\)$/\1/p' | sort -u)
 [ -n "$roots" ] || { echo "archive.sh: the library exports no lads_ function" >&2; exit 1; }
 # shellcheck disable=SC2046
-"$LD" -r --gc-sections $(printf -- '-u %s ' $roots) -o "$work/lads.o" "$build/${target:+$target/}archive/liblads_ffi.a"
+"$LD" -r --gc-sections $(printf -- '-u %s ' $roots) -o "$work/lads.o" "$work/whole.a"
 "$OBJCOPY" --strip-debug --wildcard --keep-global-symbol='lads_*' "$work/lads.o"
 
 if "$NM" "$work/lads.o" | grep -E 'lads_a_panic_is_reachable|panicking|rust_begin_unwind' >"$work/panics"; then

@@ -40,9 +40,10 @@ pub fn replay(
         )
     })?;
     Ok(Some(format!(
-        "self-test passed: {} steps, all plans equal, largest difference of an action {:.1e} (tolerance {:.0e})",
+        "self-test passed: {} steps, all plans equal, largest difference of an action {:.1e} (tolerance {:.0e}), digest {:08x}",
         test.steps,
         test.largest_error,
-        golden.tolerance()
+        golden.tolerance(),
+        test.digest
     )))
 }

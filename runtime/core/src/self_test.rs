@@ -8,6 +8,10 @@ use crate::controller::{Controller, Instruction};
 use crate::decision::PlanIndex;
 use crate::errors::{InstructionError, StepError};
 
+/// The hash of nothing, and the factor, of FNV-1a with 32 bits.
+const FNV_OFFSET: u32 = 0x811c_9dc5;
+const FNV_PRIME: u32 = 0x0100_0193;
+
 /// What a self-test that passed has measured.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SelfTest {
@@ -15,6 +19,9 @@ pub struct SelfTest {
     pub steps: u32,
     /// Largest absolute difference of an action element.
     pub largest_error: f32,
+    /// FNV-1a, of 32 bits, over the bits of all actions, as little-endian bytes: two targets with the same digest computed the same
+    /// bits.
+    pub digest: u32,
 }
 
 /// Why a self-test failed; steps count from 0.
@@ -69,7 +76,7 @@ impl Controller<'_, '_> {
         let instruction = Instruction::Id(golden.instruction());
         self.set_instruction(instruction)
             .map_err(SelfTestError::Instruction)?;
-        let mut largest_error = 0.0_f32;
+        let (mut largest_error, mut digest) = (0.0_f32, FNV_OFFSET);
         for (step, (observation, plan, action)) in (0_u32..).zip(golden.steps()) {
             let report = self
                 .advance(observation)
@@ -93,11 +100,15 @@ impl Controller<'_, '_> {
                     });
                 }
                 largest_error = largest_error.max(difference);
+                for byte in got.to_le_bytes() {
+                    digest = (digest ^ u32::from(byte)).wrapping_mul(FNV_PRIME);
+                }
             }
         }
         Ok(SelfTest {
             steps: golden.len() as u32,
             largest_error,
+            digest,
         })
     }
 }

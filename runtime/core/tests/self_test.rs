@@ -25,6 +25,29 @@ fn a_sound_policy_passes_with_no_error_at_all() {
 }
 
 #[test]
+fn the_digest_is_that_of_the_bits_of_all_actions() {
+    // FNV-1a's own test vectors, then the recorded actions, which are what was computed.
+    let fnv = |bytes: &[u8]| {
+        bytes.iter().fold(0x811c9dc5_u32, |hash, &byte| {
+            (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193)
+        })
+    };
+    assert_eq!(
+        [fnv(b""), fnv(b"a"), fnv(b"foobar")],
+        [0x811c9dc5, 0xe40c292c, 0xbf9cf968]
+    );
+    let parts = recorded();
+    let episode = parts.golden.as_ref().expect("there is one");
+    let bytes: Vec<u8> = episode
+        .actions
+        .iter()
+        .flat_map(|x| x.to_le_bytes())
+        .collect();
+    let passed = outcome(&parts).expect("the policy is sound");
+    assert_eq!(passed.digest, fnv(&bytes));
+}
+
+#[test]
 fn without_a_recording_there_is_no_test() {
     let mut parts = recorded();
     parts.golden = None;

@@ -424,6 +424,25 @@ typedef struct lads_options {
 } lads_options;
 
 /**
+ * What a self-test that passed has measured.
+ */
+typedef struct lads_self_test_t {
+    /**
+     * Control steps replayed.
+     */
+    uint32_t steps;
+    /**
+     * FNV-1a, of 32 bits, over the bits of all actions, as little-endian bytes: two targets with the same digest computed the same
+     * bits.
+     */
+    uint32_t digest;
+    /**
+     * Largest absolute difference of an action element from the recorded one.
+     */
+    float largest_error;
+} lads_self_test_t;
+
+/**
  * The clock of one control period.
  */
 typedef struct lads_tick {
@@ -630,14 +649,14 @@ lads_status lads_controller_init(const struct lads_policy *policy,
 
 /**
  * Replays the recorded episode, compares plans and actions, and arms the controller if it passes, disarms it if not. Afterwards
- * there is no instruction. `largest_error`, which may be null, gets the largest difference of an action element.
+ * there is no instruction. `result`, which may be null, gets what a test that passed has measured.
  *
  * # Safety
  * `controller` is null or a workspace, zeroed or set up by `lads_controller_init`, and no other call uses it now;
- * `largest_error` is null or may be written.
+ * `result` is null or may be written.
  */
 lads_status lads_self_test(struct lads_controller *controller,
-                           float *largest_error);
+                           struct lads_self_test_t *result);
 
 /**
  * Follows a known instruction, by its number, from the next step on: a new episode. `LADS_INSTRUCT_FAILED`, which a sound image

@@ -128,7 +128,7 @@ public:
     }
 
     /** Replays the recorded episode, and arms if it passes. */
-    Status self_test(float *largest_error = nullptr) noexcept { return lads_self_test(controller_, largest_error); }
+    Status self_test(lads_self_test_t *result = nullptr) noexcept { return lads_self_test(controller_, result); }
 
     Status set_instruction(std::uint32_t number) noexcept { return lads_set_instruction(controller_, number); }
     Status set_instruction(std::string_view name) noexcept {

@@ -251,27 +251,27 @@ pub unsafe extern "C" fn lads_controller_init(
 }
 
 /// Replays the recorded episode, compares plans and actions, and arms the controller if it passes, disarms it if not. Afterwards
-/// there is no instruction. `largest_error`, which may be null, gets the largest difference of an action element.
+/// there is no instruction. `result`, which may be null, gets what a test that passed has measured.
 ///
 /// # Safety
 /// `controller` is null or a workspace, zeroed or set up by `lads_controller_init`, and no other call uses it now;
-/// `largest_error` is null or may be written.
+/// `result` is null or may be written.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_self_test(
     controller: *mut LadsController,
-    largest_error: *mut f32,
+    result: *mut LadsSelfTest,
 ) -> Status {
-    if !largest_error.is_aligned() {
+    if !result.is_aligned() {
         return Status::Misaligned;
     }
     // SAFETY: the caller guarantees both.
     status(unsafe {
         handle::handle(controller).and_then(|handle| {
             let passed = handle.guarded.self_test()?;
-            if largest_error.is_null() {
+            if result.is_null() {
                 return Ok(());
             }
-            give(largest_error, passed.largest_error)
+            give(result, passed.into())
         })
     })
 }

@@ -3,7 +3,7 @@
 use core::ffi::c_char;
 use core::{ptr, slice};
 
-use lads_core::{Counters, Element, GuardReport, KnownInstruction, Policy};
+use lads_core::{Counters, Element, GuardReport, KnownInstruction, Policy, SelfTest};
 
 use crate::status::Status;
 
@@ -265,6 +265,34 @@ impl LadsReport {
             margin: step.map_or(0.0, |step| step.margin),
             saturated: u32::from(report.saturated),
             rate_limited: u32::from(report.rate_limited),
+        }
+    }
+}
+
+/// What a self-test that passed has measured.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[repr(C)]
+pub struct LadsSelfTest {
+    /// Control steps replayed.
+    pub steps: u32,
+    /// FNV-1a, of 32 bits, over the bits of all actions, as little-endian bytes: two targets with the same digest computed the same
+    /// bits.
+    pub digest: u32,
+    /// Largest absolute difference of an action element from the recorded one.
+    pub largest_error: f32,
+}
+
+impl From<SelfTest> for LadsSelfTest {
+    fn from(passed: SelfTest) -> Self {
+        let SelfTest {
+            steps,
+            largest_error,
+            digest,
+        } = passed;
+        Self {
+            steps,
+            digest,
+            largest_error,
         }
     }
 }

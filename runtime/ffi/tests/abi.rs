@@ -266,13 +266,14 @@ fn the_self_test_arms_or_does_not() {
     let mut action = [7.0; 2];
     assert_eq!(step(c, &[0.0; 3], &mut action).0, Status::NotArmed);
     assert_eq!(action, [0.0; 2]);
-    let mut error = f32::NAN;
-    // SAFETY: the controller and the error are alive.
+    let mut result = LadsSelfTest::default();
+    // SAFETY: the controller and the result are alive.
     unsafe {
-        assert_eq!(lads_self_test(c, &raw mut error), Status::Ok);
+        assert_eq!(lads_self_test(c, &raw mut result), Status::Ok);
         assert_eq!(lads_self_test(c, null_mut()), Status::Ok);
     }
-    assert_eq!(error, 0.0);
+    assert_eq!((result.steps, result.largest_error), (12, 0.0));
+    assert_ne!(result.digest, 0);
     assert_eq!(step(c, &[0.0; 3], &mut action).0, Status::NoInstruction);
     instruct(c, 0);
     assert_eq!(step(c, &[0.0; 3], &mut action).0, Status::Ok);
@@ -592,7 +593,7 @@ fn a_wrong_call_does_nothing() {
             Status::Overlap
         );
         assert_eq!(
-            lads_self_test(c, to.wrapping_byte_add(1)),
+            lads_self_test(c, to.wrapping_byte_add(1).cast()),
             Status::Misaligned
         );
         assert_eq!(lads_counters(c, null_mut()), Status::Null);

@@ -103,6 +103,10 @@ impl fmt::Debug for Isa {
 /// A kernel and its operands.
 pub(crate) trait Kernel {
     /// Whether AVX-512 runs it on half as wide vectors: where conversions take the time, which wide ones do not shorten.
+    #[cfg_attr(
+        not(target_arch = "x86_64"),
+        expect(dead_code, reason = "only AVX-512 asks")
+    )]
     const NARROW: bool = false;
 
     /// Does the work. `#[inline(always)]` in every implementation, and in what it calls, so that each instruction set gets a

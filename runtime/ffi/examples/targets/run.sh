@@ -1,41 +1,63 @@
 #!/bin/sh
 # The self-test of a small policy on other targets under qemu, bit for bit as on this machine. What is missing is skipped and named.
-# usage: runtime/ffi/examples/targets/run.sh <image.c> <bytes of the image>     image.c: lads compile small.onnx --emit-c policy.c
-# Needs, per target, the compiler and qemu named below, and core: either the target added to the toolchain, or rust-src and
-# RUSTC_BOOTSTRAP=1 (Debian's rustc-web with rust-web-src does: RUSTC=/usr/bin/rustc RUSTC_BOOTSTRAP=1).
+# usage: runtime/ffi/examples/targets/run.sh <image.c>     image.c: lads compile models/kitchen-small.onnx --emit-c image.c
+# Needs, per target, the C compiler and the qemu named below, and Rust's core for it: the target added to a toolchain
+# (rustup target add), or a toolchain with rust-src, of which core is built on the way. Every toolchain on PATH and of rustup is tried.
 set -eu
-[ $# -eq 2 ] || { echo "usage: run.sh <image.c> <bytes>" >&2; exit 2; }
+[ $# -eq 1 ] || { echo "usage: run.sh <image.c>" >&2; exit 2; }
 here=$(cd "$(dirname "$0")" && pwd)
 root=$(cd "$here/../../../.." && pwd)
 image=$1
+name=$(sed -n 's/^extern const unsigned char \([a-z0-9_]*\)\[[0-9]*\];$/\1/p' "$image" | head -n 1)
+bytes=$(sed -n 's/^extern const unsigned char [a-z0-9_]*\[\([0-9]*\)\];$/\1/p' "$image" | head -n 1)
+[ -n "$name" ] || { echo "run.sh: $image: not a source of lads compile --emit-c" >&2; exit 2; }
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT INT TERM
-flags="-std=gnu11 -O2 -ffp-contract=off -DIMAGE_BYTES=$2 -I$here/../../include -Wl,--gc-sections"
+flags="-std=gnu11 -O2 -Wall -Wextra -ffp-contract=off -DIMAGE=$name -DIMAGE_BYTES=$bytes -I$here/../../include -Wl,--gc-sections -Wl,-z,noexecstack"
 
-# archive <target>: builds the library into $archive
-archive() {
-    sysroot=$("${RUSTC:-rustc}" --print sysroot)
-    if [ -d "$sysroot/lib/rustlib/$1" ]; then
-        std=
-    elif [ -n "${RUSTC_BOOTSTRAP:-}" ] && [ -d "$sysroot/lib/rustlib/src/rust/library" ]; then
-        std=-Zbuild-std=core
-    else
-        echo "skipped: $1: neither the target nor rust-src is there"
-        return 1
-    fi
-    # shellcheck disable=SC2086
-    (cd "$root" && cargo rustc --quiet $std -p lads-ffi --profile archive --features static-library --crate-type staticlib \
-        --target-dir "$root/target/archive-build" --target "$1")
-    archive=$root/target/archive-build/$1/archive/liblads_ffi.a
-}
 have() {
     for tool in "$@"; do
         command -v "$tool" >/dev/null || { echo "skipped: $tool is not installed"; return 1; }
     done
 }
+compilers() {
+    echo "${RUSTC:-rustc}"
+    echo "$PATH" | tr ':' '\n' | sed 's:$:/rustc:'
+    echo "${RUSTUP_HOME:-$HOME/.rustup}"/toolchains/*/bin/rustc | tr ' ' '\n'
+}
+# toolchain <target>: finds a compiler that can, as $compiler with $bootstrap and $build_core
+toolchain() {
+    for compiler in $(compilers); do
+        sysroot=$("$compiler" --print sysroot 2>/dev/null) || continue
+        if [ -d "$sysroot/lib/rustlib/$1/lib" ]; then
+            bootstrap=0 build_core=
+            return
+        fi
+    done
+    for compiler in $(compilers); do
+        sysroot=$("$compiler" --print sysroot 2>/dev/null) || continue
+        if [ -d "$sysroot/lib/rustlib/src/rust/library/core" ]; then
+            bootstrap=1 build_core=-Zbuild-std=core
+            return
+        fi
+    done
+    echo "skipped: $1: no Rust toolchain has it; rustup target add $1, or install a rust-src (rustup component add rust-src)"
+    return 1
+}
+# archive <target> <prefix of its binutils>: builds the library, as for this machine, into $archive
+archive() {
+    archive=$work/$1.a
+    RUSTC=$compiler RUSTC_BOOTSTRAP=$bootstrap CARGO_FLAGS=$build_core CARGO_TARGET_DIR=$root/target/targets \
+        LD=$2ld OBJCOPY=$2objcopy AR=$2ar NM=$2nm "$root/runtime/ffi/archive.sh" "$archive" "$1"
+}
 same() {
     printf '%s: ' "$1"
-    if [ "$2" = "$expected" ]; then echo "the same bits"; else echo "differs: $2"; exit 1; fi
+    if [ "$(echo "$2" | grep -v '^stack')" = "$expected" ]; then
+        echo "the same bits$(echo "$2" | sed -n 's/^stack/; stack/p')"
+    else
+        echo "differs: $2"
+        exit 1
+    fi
 }
 
 "$root/runtime/ffi/archive.sh" "$work/liblads.a"
@@ -44,16 +66,18 @@ cc $flags "$here/selftest.c" "$image" "$work/liblads.a" -o "$work/host"
 expected=$("$work/host")
 echo "$expected"
 
-if have aarch64-linux-gnu-gcc qemu-aarch64 && archive aarch64-unknown-linux-gnu; then
+if have aarch64-linux-gnu-gcc qemu-aarch64 && toolchain aarch64-unknown-linux-gnu; then
+    archive aarch64-unknown-linux-gnu aarch64-linux-gnu-
     # shellcheck disable=SC2086
     aarch64-linux-gnu-gcc -static $flags "$here/selftest.c" "$image" "$archive" -o "$work/aarch64"
     same aarch64 "$(qemu-aarch64 "$work/aarch64")"
 fi
-if have arm-none-eabi-gcc qemu-system-arm && archive thumbv7em-none-eabihf; then
+if have arm-none-eabi-gcc qemu-system-arm && toolchain thumbv7em-none-eabihf; then
+    archive thumbv7em-none-eabihf arm-none-eabi-
     # shellcheck disable=SC2086
     arm-none-eabi-gcc $flags -ffreestanding -fno-builtin -nostdlib -mthumb -mcpu=cortex-m4 -mfloat-abi=hard -mfpu=fpv4-sp-d16 \
         "$here/selftest.c" "$here/startup.c" "$image" "$archive" -lgcc -T "$here/mps2.ld" -o "$work/cortex"
     for board in mps2-an386 mps2-an500; do
-        same "$board" "$(qemu-system-arm -machine $board -nographic -semihosting -kernel "$work/cortex")"
+        same "$board" "$(qemu-system-arm -machine $board -nographic -semihosting -kernel "$work/cortex" 2>&1)"
     done
 fi

@@ -26,6 +26,33 @@ static void leave(int status) {
 
 static void fault(void) { leave(99); }
 
+/* The stack grows down from the end of the memory to the data: what is free is painted, and what is no longer paint was used. */
+#define PAINT 0xa5a5a5a5u
+
+static void __attribute__((noinline)) paint(void) {
+    /* Up to well below this function's own frame. */
+    const uintptr_t end = (uintptr_t)__builtin_frame_address(0) - 64;
+    for (uintptr_t free = (uintptr_t)&bss_end; free < end; free += sizeof(uint32_t)) {
+        *(volatile uint32_t *)free = PAINT;
+    }
+}
+
+static void say_stack(void) {
+    char text[] = "0000000 bytes\n";
+    const volatile uint32_t *untouched = &bss_end;
+    while (untouched < &stack_top && *untouched == PAINT) {
+        untouched++;
+    }
+    uint32_t bytes = (uint32_t)((uintptr_t)&stack_top - (uintptr_t)untouched);
+    int digit = 7;
+    do {
+        text[--digit] = (char)('0' + bytes % 10);
+        bytes /= 10;
+    } while (bytes > 0 && digit > 0);
+    say("stack ");
+    say(text + digit);
+}
+
 void *memcpy(void *restrict to, const void *restrict from, size_t bytes) {
     unsigned char *t = to;
     const unsigned char *f = from;
@@ -54,7 +81,10 @@ void reset(void) {
     for (uint32_t *to = &bss_start; to < &bss_end; to++) {
         *to = 0;
     }
-    leave(run());
+    paint();
+    const int status = run();
+    say_stack();
+    leave(status);
 }
 
 __attribute__((section(".vectors"), used)) static const void *const vectors[16] = {

@@ -23,7 +23,7 @@ int main(int count, char **arguments) {
     lads_element element;
     lads_controller *controller;
     lads_counters_t counters;
-    float largest_error;
+    lads_self_test_t tested;
 
     if (count != 2 || lads_abi_version() != LADS_ABI_VERSION) {
         return 2;
@@ -67,7 +67,7 @@ int main(int count, char **arguments) {
     if (status != LADS_STATUS_OK) {
         return fail("init", status);
     }
-    if ((status = lads_self_test(controller, &largest_error)) != LADS_STATUS_OK) {
+    if ((status = lads_self_test(controller, &tested)) != LADS_STATUS_OK) {
         return fail("self-test", status);
     }
     if ((status = lads_set_instruction(controller, 0)) != LADS_STATUS_OK) {
@@ -88,7 +88,7 @@ int main(int count, char **arguments) {
         return 6;
     }
     lads_counters(controller, &counters);
-    printf("self-test within %g, %d steps, %d fallback\n", (double)largest_error, (int)counters.policy,
+    printf("self-test within %g, %d steps, %d fallback\n", (double)tested.largest_error, (int)counters.policy,
            (int)counters.no_observation);
     free(observation);
     free(action);
