@@ -7,6 +7,7 @@ PY     := $(VENV)/bin/python
 MODEL  ?= models/kitchen.onnx
 ARGS   ?=
 ENV    ?= kitchen
+DATA   ?= data/$(ENV).safetensors
 COLLECT_kitchen := --episodes-per-instruction 50
 COLLECT_lorel   := --episodes 50000
 # What lints and tests cover; one selection, because each is a build of its own, of tract too: the oracle and the language encoder's engine.
@@ -87,9 +88,10 @@ test-exporter: setup $(VENV)/stamp
 collect: setup
 	cargo run --release -p lads-sim --bin lads-collect -- --env $(ENV) $(COLLECT_$(ENV)) -o data/$(ENV).safetensors
 
-## train: the shipped policy from data/ENV.safetensors into runs/ENV; one thread, because sums depend on their number
+## train: the shipped policy from data/ENV.safetensors into runs/ENV; one thread, because sums depend on their number.
+##        A smaller one for microcontrollers: make train export ENV=kitchen-small DATA=data/kitchen.safetensors
 train: $(VENV)/stamp
-	$(PY) -m lads_exporter train --config exporter/configs/$(ENV).toml --data data/$(ENV).safetensors --out runs/$(ENV) --threads 1
+	$(PY) -m lads_exporter train --config exporter/configs/$(ENV).toml --data $(DATA) --out runs/$(ENV) --threads 1
 
 ## export: runs/ENV into models/ENV.onnx
 export: $(VENV)/stamp
