@@ -5,10 +5,10 @@ use std::hint::black_box;
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main};
 use lads_benches::sweep::Sweep;
-use lads_kernels::stored::to_f16;
+use lads_kernels::stored::{round_to_f16, to_f16};
 use lads_kernels::{
-    Activation, Attention, Isa, LayerNorm, Linear, Panels, attention_scratch_len, keys_len, pack,
-    packed_len,
+    Activation, Attention, Cache, CacheFormat, Isa, LayerNorm, Linear, Panels,
+    attention_scratch_len, keys_len, pack, packed_len,
 };
 
 /// Elements that are neither zero nor all the same.
@@ -67,25 +67,40 @@ fn attention(criterion: &mut Criterion) {
         numbers(keys_len(capacity, width)),
         numbers(capacity * width),
     );
-    let attention = Attention {
-        heads,
-        head_dim,
-        scale: 0.2,
-        q_stride: width,
-        visible,
-        cache_k: &keys,
-        cache_v: &values,
-    };
-    let (q, mut y) = (numbers(2 * width), vec![0.0; 2 * width]);
-    let mut scratch = vec![0.0; attention_scratch_len(2, heads, capacity)];
-    let bytes = 2 * visible * width * size_of::<f32>();
-    let mut group = criterion.benchmark_group("attention/2 on 300, 4 heads of 32");
-    group.throughput(Throughput::Bytes(bytes as u64));
-    group.bench_function("kernel", |bencher| {
-        bencher.iter(|| attention.run(isa, black_box(&q), &mut y, &mut scratch));
-    });
-    roofline(&mut group, bytes);
-    group.finish();
+    let halves = |x: &[f32]| -> Vec<u16> { x.iter().map(|&x| round_to_f16(x)).collect() };
+    let [half_keys, half_values] = [halves(&keys), halves(&values)];
+    let caches = [
+        Cache::F32 {
+            keys: &keys,
+            values: &values,
+        },
+        Cache::F16 {
+            keys: &half_keys,
+            values: &half_values,
+        },
+    ];
+    for (format, cache) in CacheFormat::ALL.into_iter().zip(caches) {
+        let attention = Attention {
+            heads,
+            head_dim,
+            scale: 0.2,
+            q_stride: width,
+            visible,
+            cache,
+        };
+        let (q, mut y) = (numbers(2 * width), vec![0.0; 2 * width]);
+        let mut scratch = vec![0.0; attention_scratch_len(2, heads, capacity)];
+        let bytes = 2 * visible * width * format.bytes();
+        let name = format.name();
+        let mut group =
+            criterion.benchmark_group(format!("attention/2 on 300, 4 heads of 32, {name}"));
+        group.throughput(Throughput::Bytes(bytes as u64));
+        group.bench_function("kernel", |bencher| {
+            bencher.iter(|| attention.run(isa, black_box(&q), &mut y, &mut scratch));
+        });
+        roofline(&mut group, bytes);
+        group.finish();
+    }
 }
 
 fn layer_norm(criterion: &mut Criterion) {

@@ -1,6 +1,6 @@
 //! Brings all contenders to the start: opens what they need and compares what they compute, before anything is timed.
 
-use lads_compiler::Memory;
+use lads_compiler::{CacheFormat, Memory, Options, WeightFormat};
 use lads_core::{Controller, Policy};
 
 use crate::clock::now;
@@ -10,6 +10,23 @@ use crate::lads::Lads;
 
 /// Control steps that are compared.
 const COMPARED: usize = 60;
+
+/// An action that is further from the recorded one than this is not rounding.
+const BROKEN: f32 = 0.1;
+
+/// How a policy is compiled to be measured: with fewer bits for the weights, the cache has half of them too, and the tolerance, which
+/// is otherwise the machine's, only has to tell a sound policy from a broken one.
+pub fn options(weights: WeightFormat) -> Options {
+    if weights == WeightFormat::F32 {
+        return Options::default();
+    }
+    Options {
+        weights,
+        cache: CacheFormat::F16,
+        tolerance: Some(BROKEN),
+        ..Options::default()
+    }
+}
 
 /// An image to measure.
 #[derive(Debug, Clone, Copy)]

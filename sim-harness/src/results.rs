@@ -384,6 +384,8 @@ pub struct Results {
     pub environment: EnvironmentUsed,
     /// SHA-256 of the bundle file, in hexadecimal digits.
     pub bundle_sha256: String,
+    /// SHA-256 of the program image that ran.
+    pub image_sha256: String,
     /// Seed of all random streams.
     pub seed: u64,
     /// Noise level of the environment.

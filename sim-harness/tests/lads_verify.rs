@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::time::{Duration, Instant};
 
+use lads_compiler::{Bundle, CacheFormat, Options, WeightFormat};
 use serde_json::Value;
 
 /// A file of the project, by its path from the root.
@@ -63,6 +64,74 @@ fn one_episode_agrees_on_every_instruction_set_and_is_too_few() {
     }
     // The bits of the policy do not depend on the instruction set.
     assert!(certificates.windows(2).all(|pair| pair[0] == pair[1]));
+}
+
+/// The image that goes into the machine is what is verified, here one with fewer bits where they only help to choose the plan.
+#[test]
+fn a_given_image_is_what_is_verified() {
+    let folder = tempfile::tempdir().unwrap();
+    let [image, other, broken] = ["image.lads", "other.lads", "broken.lads"].map(|name| {
+        let path = folder.path().join(name);
+        path.to_str().unwrap().to_owned()
+    });
+    let options = Options {
+        weights: WeightFormat::F16,
+        low_level: Some(WeightFormat::F32),
+        cache: CacheFormat::F16,
+        ..Options::default()
+    };
+    let compile = |bundle: &str| {
+        let bundle = Bundle::open(&project_file(bundle)).unwrap();
+        let image = lads_compiler::compile_with(&bundle, options).unwrap();
+        image.as_bytes().to_vec()
+    };
+    let mut bytes = compile("models/kitchen.onnx");
+    fs::write(&image, &bytes).unwrap();
+    let few = ["--episodes", "1", "--instruction", "kbls"];
+    let (code, found) = certificate(&[&few[..], &["--image", &image]].concat(), folder.path());
+    assert_eq!((code, &found["verdict"]), (Some(3), &"INCONCLUSIVE".into()));
+    assert_eq!(found["policy"]["differing_episodes"], 0);
+    assert_eq!(found["rollouts"]["identical_completions"], 1.0);
+    assert_eq!(
+        found["setting"]["image_sha256"],
+        lads_compiler::sha256(&bytes)
+    );
+    // The low level's bits are those of the exact policy.
+    let (_, exact) = certificate(&few, folder.path());
+    assert_eq!(
+        found["policy"]["largest_action_difference"],
+        exact["policy"]["largest_action_difference"]
+    );
+    assert_ne!(
+        found["setting"]["image_sha256"],
+        exact["setting"]["image_sha256"]
+    );
+
+    fs::write(&other, compile("models/lorel.onnx")).unwrap();
+    refused(
+        &["--image", &other],
+        &[
+            "other.lads",
+            "another bundle",
+            "kitchen.onnx",
+            "lads compile",
+        ],
+    );
+    *bytes.last_mut().unwrap() ^= 1;
+    fs::write(&broken, &bytes).unwrap();
+    refused(
+        &["--image", &broken],
+        &["broken.lads", "checksum", "lads compile"],
+    );
+    fs::write(&broken, &bytes[..5000]).unwrap();
+    refused(
+        &["--image", &broken],
+        &["broken.lads", "bytes", "lads compile"],
+    );
+    refused(
+        &["--image", "/nowhere/x.lads"],
+        &["/nowhere/x.lads", "name a program image"],
+    );
 }
 
 #[test]

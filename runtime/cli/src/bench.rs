@@ -8,17 +8,14 @@ use std::path::PathBuf;
 
 use clap::Args;
 use lads_benches::paced::{Protocol, Report, measure};
-use lads_benches::suite::{Candidate, Peers};
-use lads_compiler::{Options, WeightFormat};
+use lads_benches::suite::{Candidate, Peers, options};
+use lads_compiler::WeightFormat;
 
 use crate::model::Model;
 use crate::refusal::Refusal;
 
 /// Where `benches/setup.py` puts the library of ONNX Runtime.
 const ONNXRUNTIME: &str = "vendor/onnxruntime/libonnxruntime.so";
-
-/// An action that is further from the recorded one than this is not rounding.
-const BROKEN: f32 = 0.1;
 
 /// What to measure and how.
 #[derive(Debug, Args)]
@@ -35,7 +32,8 @@ pub struct Request {
     /// Threads that thrash the caches and compute beside it
     #[arg(long, default_value_t = 0)]
     load: usize,
-    /// Formats of the weights to measure, side by side; an image has those that it was compiled with
+    /// Formats of the weights to measure, side by side, those of 16 bits or fewer with a cache of 16; an image has those that it was
+    /// compiled with
     #[arg(
         long,
         value_name = "FORMAT",
@@ -96,14 +94,8 @@ pub fn bench(request: &Request) -> Result<Report, Refusal> {
     request.check()?;
     let mut models = vec![];
     for &weights in &request.weights {
-        // The tolerance of fewer bits is the gate's; here it only has to tell a sound policy from a broken one.
-        let tolerance = (weights != WeightFormat::F32).then_some(BROKEN);
-        let options = Options {
-            weights,
-            tolerance,
-            force: false,
-        };
-        models.push((weights.name(), Model::compile(&request.model, options)?));
+        let model = Model::compile(&request.model, options(weights))?;
+        models.push((weights.name(), model));
     }
     let (_, model) = models
         .first()

@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use lads_compiler::{Options, WeightFormat};
+use lads_compiler::{CacheFormat, Options, WeightFormat};
 
 use crate::model::Model;
 use crate::refusal::Refusal;
@@ -61,6 +61,13 @@ enum Command {
         /// episode replays with the same plans, and with actions inside the tolerance
         #[arg(long, value_name = "FORMAT", default_value = "f32", value_parser = weight_format)]
         weights: WeightFormat,
+        /// How the weights of the low level are stored, if otherwise: with f32 the actions of a plan keep their bits, and all
+        /// that fewer bits elsewhere can do is to choose another plan
+        #[arg(long, value_name = "FORMAT", value_parser = weight_format)]
+        low_level: Option<WeightFormat>,
+        /// How the KV cache is stored: f32, or f16 in half the memory. It has to pass the same gate
+        #[arg(long, value_name = "FORMAT", default_value = "f32", value_parser = cache_format)]
+        cache: CacheFormat,
         /// Largest difference of an action that the gate, and later the image's self-test, accept, in the action's units; the
         /// bundle's own is meant for 32-bit weights
         #[arg(long, value_name = "DIFFERENCE", value_parser = tolerance)]
@@ -148,11 +155,15 @@ fn run(command: Command) -> Result<(), Refusal> {
             emit_c,
             emit_rust,
             weights,
+            low_level,
+            cache,
             tolerance,
             force,
         } => {
             let options = Options {
                 weights,
+                low_level,
+                cache,
                 tolerance,
                 force,
             };
@@ -179,11 +190,11 @@ fn run(command: Command) -> Result<(), Refusal> {
                 write_file(path, bytes)?;
                 print(&format!("{}: {} bytes\n", path.display(), bytes.len()))?;
             }
-            if weights == WeightFormat::F32 || force {
+            if options.is_exact() || force {
                 return Ok(());
             }
             let line = self_test::self_test(&model)?;
-            print(&format!("{} weights: {line}\n", weights.name()))
+            print(&format!("{options}: {line}\n"))
         }
         Command::SelfTest { model } => {
             let line = self_test::self_test(&Model::open(&model)?)?;
@@ -216,6 +227,12 @@ fn weight_format(name: &str) -> Result<WeightFormat, String> {
     let known = WeightFormat::ALL;
     let found = known.into_iter().find(|format| format.name() == name);
     found.ok_or_else(|| format!("known are {}", known.map(WeightFormat::name).join(", ")))
+}
+
+fn cache_format(name: &str) -> Result<CacheFormat, String> {
+    let known = CacheFormat::ALL;
+    let found = known.into_iter().find(|format| format.name() == name);
+    found.ok_or_else(|| format!("known are {}", known.map(CacheFormat::name).join(", ")))
 }
 
 fn tolerance(text: &str) -> Result<f32, String> {

@@ -6,7 +6,7 @@
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
-use lads_compiler::{Bundle, Image, Options, compile_with};
+use lads_compiler::{Aligned, Bundle, Image, Options, compile_with};
 use lads_core::{KnownInstruction, Policy};
 
 use crate::refusal::{Refusal, chain};
@@ -18,8 +18,8 @@ const SUGGESTIONS: usize = 3;
 enum Bytes {
     /// Compiled from a bundle just now.
     Compiled(Image),
-    /// Read from a file, in words for their alignment.
-    Read(Vec<u128>, usize),
+    /// Read from a file.
+    Read(Aligned),
 }
 
 /// A policy that was read, with its compiled image.
@@ -35,7 +35,7 @@ impl Model {
         Self::compile(path, Options::default())
     }
 
-    /// The same with other weights; an image has those that it was compiled with.
+    /// The same with other weights or another cache; an image has those that it was compiled with.
     pub fn compile(path: &Path, options: Options) -> Result<Self, Refusal> {
         let file = std::fs::read(path).map_err(|error| {
             Refusal::new(
@@ -45,7 +45,7 @@ impl Model {
             )
         })?;
         let bytes = if file.starts_with(&lads_core::image::MAGIC.to_le_bytes()) {
-            aligned(&file)
+            Bytes::Read(Aligned::new(&file))
         } else {
             let about = |error: &dyn std::error::Error| {
                 Refusal::with_remedy_inside(path.display(), chain(error))
@@ -78,7 +78,7 @@ impl Model {
     pub fn image(&self) -> &[u8] {
         match &self.bytes {
             Bytes::Compiled(image) => image.as_bytes(),
-            Bytes::Read(words, len) => bytemuck::cast_slice(words).get(..*len).unwrap_or_default(),
+            Bytes::Read(bytes) => bytes.as_bytes(),
         }
     }
 
@@ -132,13 +132,4 @@ fn plain(text: &str) -> String {
         .collect::<Vec<_>>()
         .join(" ")
         .to_lowercase()
-}
-
-fn aligned(file: &[u8]) -> Bytes {
-    let mut words = vec![0_u128; file.len().div_ceil(size_of::<u128>())];
-    let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
-    for (to, &from) in bytes.iter_mut().zip(file) {
-        *to = from;
-    }
-    Bytes::Read(words, file.len())
 }

@@ -488,8 +488,16 @@ fn weights_of_fewer_bits_pass_a_gate() {
     assert!(tested.contains("tolerance 5e-3"), "{tested}");
     answer(&compile(&["--weights", "int8", "--force"]), "");
     refused(&["self-test", image], "", &["self-test failed"]);
+    // What only helps to choose the plan takes fewer bits with no other tolerance, and the self-test says so.
+    let smaller = ["--weights", "f16", "--low-level", "f32", "--cache", "f16"];
+    let said = answer(&compile(&smaller), "");
+    let stored = "f16 weights (low level f32) and an f16 cache: self-test passed";
+    assert!(said.contains(stored), "{said}");
+    answer(&["self-test", image], "");
     for (flag, value, known) in [
         ("--weights", "f8", "f32, f16, bf16, int8"),
+        ("--low-level", "f64", "f32, f16, bf16, int8"),
+        ("--cache", "bf16", "f32, f16"),
         ("--tolerance", "0", "positive"),
     ] {
         refused(&compile(&[flag, value]), "", &[value, known]);

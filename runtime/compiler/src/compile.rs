@@ -1,9 +1,10 @@
 //! The whole way from a bundle to an image.
 
 use std::collections::HashMap;
+use std::fmt;
 
 use lads_core::Policy;
-use lads_core::op::{Port, WeightFormat, WeightSpan};
+use lads_core::op::{CacheFormat, Port, WeightFormat, WeightSpan};
 
 use crate::bundle::Bundle;
 use crate::entries::{
@@ -106,28 +107,58 @@ struct Made {
 pub struct Options {
     /// How the weights of dense layers are stored.
     pub weights: WeightFormat,
+    /// How those of the low level are, if otherwise: they alone are in the action, all others only help to choose the plan.
+    pub low_level: Option<WeightFormat>,
+    /// How the KV cache is stored.
+    pub cache: CacheFormat,
     /// How far an action may be from the recorded one, instead of what the bundle says; the image's self-test keeps to it too.
     pub tolerance: Option<f32>,
     /// Whether an image is made even if the gate refuses it; its self-test then fails.
     pub force: bool,
 }
 
-/// Compiles a bundle with 32-bit weights.
+impl Options {
+    /// Whether nothing is stored with fewer bits than it was computed with.
+    pub fn is_exact(&self) -> bool {
+        let weights = [self.weights, self.low_level()];
+        weights == [WeightFormat::F32; 2] && self.cache == CacheFormat::F32
+    }
+
+    fn low_level(&self) -> WeightFormat {
+        self.low_level.unwrap_or(self.weights)
+    }
+}
+
+/// For example `f16 weights (low level f32) and an f16 cache`.
+impl fmt::Display for Options {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "{} weights", self.weights.name())?;
+        if self.low_level() != self.weights {
+            write!(f, " (low level {})", self.low_level().name())?;
+        }
+        match self.cache {
+            CacheFormat::F32 => Ok(()),
+            CacheFormat::F16 => f.write_str(" and an f16 cache"),
+        }
+    }
+}
+
+/// Compiles a bundle with 32-bit weights and cache.
 pub fn compile(bundle: &Bundle) -> Result<Image, CompileError> {
     compile_with(bundle, Options::default())
 }
 
-/// Compiles a bundle. Weights of fewer bits have to pass a gate, unless forced: the image that was made replays the bundle's golden
+/// Compiles a bundle. Weights or a cache of fewer bits have to pass a gate, unless forced: the image that was made replays the bundle's golden
 /// episode with the same plans, and with actions inside the episode's tolerance.
 pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileError> {
     let contract = bundle.contract();
     let signatures = entries::signatures(contract);
     let model = Model::new(&bundle.model, bundle.graph())?;
-    let cache = Cache::new(contract);
+    let cache = Cache::new(contract, options.cache);
     let cache_len = cache.len().ok_or_else(|| CompileError::TooLarge {
         what: "the KV cache".into(),
     })?;
-    let mut weights = Weights::new(options.weights);
+    let mut weights = Weights::default();
     let mut made: Vec<Made> = vec![];
     // Whole matrices come before the parts of them that other programs need, and what runs in every control step comes first.
     let (before, rest) = RECIPES.split_at(1);
@@ -135,6 +166,11 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
         let signature = signature(&signatures, recipe.entry)?;
         let entry = model.import(signature, &HashMap::new())?;
         let fused = fuse(entry, signature, recipe.outputs)?;
+        weights.format = if recipe.entry == ACT {
+            options.low_level()
+        } else {
+            options.weights
+        };
         let lowered = lower(recipe.entry, &fused, recipe.ports, cache, &mut weights)?;
         let placed = plan(&lowered);
         verify(&lowered, &placed).map_err(|fault| CompileError::Plan {
@@ -179,13 +215,13 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
     };
     let image = image::write(bundle, &parts, report)?;
     let policy = Policy::new_checked(image.as_bytes()).map_err(CompileError::Image)?;
-    if options.weights != WeightFormat::F32 && !options.force {
+    if !options.is_exact() && !options.force {
         let mut memory = Memory::of(&policy)?;
         memory
             .controller(&policy)?
             .self_test()
             .map_err(|error| CompileError::Gate {
-                format: options.weights.name(),
+                stored: options.to_string().into(),
                 error,
                 tolerance: parts.tolerance,
             })?;

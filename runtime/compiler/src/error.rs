@@ -132,13 +132,13 @@ pub enum CompileError {
         /// What the verifier found.
         fault: crate::verify::PlanFault,
     },
-    /// Weights of fewer bits change what the policy does.
+    /// Weights or a cache of fewer bits change what the policy does.
     #[error(
-        "with {format} weights the golden episode does not replay: {error} (tolerance {tolerance:e}); store more bits, or name the tolerance that the machine can live with"
+        "with {stored} the golden episode does not replay: {error} (tolerance {tolerance:e}); store more bits, or name the tolerance that the machine can live with"
     )]
     Gate {
-        /// The format of the weights.
-        format: &'static str,
+        /// How weights and cache are stored.
+        stored: Line,
         /// What came out otherwise than recorded.
         error: SelfTestError,
         /// Largest absolute difference of an action that counts as equal.

@@ -11,6 +11,7 @@ use lads_core::image::{
 };
 use lads_core::op::{Place, Port, WeightSpan};
 
+use crate::aligned::Aligned;
 use crate::bundle::Bundle;
 use crate::contract::{self, Contract};
 use crate::error::CompileError;
@@ -18,23 +19,17 @@ use crate::golden::Golden;
 use crate::plan::Placed;
 use crate::report::CompileReport;
 
-/// Alignment of the image in memory: that of the weights inside it.
-const ALIGN: usize = image::WEIGHTS_ALIGN;
-
 /// A compiled policy.
 #[derive(Debug)]
 pub struct Image {
-    /// The image starts at `start`, so that its address is a multiple of [`ALIGN`].
-    memory: Vec<u8>,
-    start: usize,
-    len: usize,
+    bytes: Aligned,
     report: CompileReport,
 }
 
 impl Image {
     /// The image; its address is a multiple of 64.
     pub fn as_bytes(&self) -> &[u8] {
-        &self.memory[self.start..self.start + self.len]
+        self.bytes.as_bytes()
     }
 
     /// Sizes of what was compiled.
@@ -43,18 +38,11 @@ impl Image {
     }
 
     fn new(words: &[u32], report: CompileReport) -> Self {
-        let bytes = words.len() * 4;
-        let mut memory = vec![0; bytes + ALIGN];
-        let start = memory.as_ptr().align_offset(ALIGN).min(ALIGN);
-        for (to, word) in memory[start..].chunks_exact_mut(4).zip(words) {
-            to.copy_from_slice(&word.to_le_bytes());
-        }
-        let crc = image::crc32(&memory[start..start + bytes]);
-        memory[start + CRC_WORD * 4..][..4].copy_from_slice(&crc.to_le_bytes());
+        let mut bytes: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
+        let crc = image::crc32(&bytes);
+        bytes[CRC_WORD * 4..][..4].copy_from_slice(&crc.to_le_bytes());
         Self {
-            memory,
-            start,
-            len: bytes,
+            bytes: Aligned::new(&bytes),
             report,
         }
     }

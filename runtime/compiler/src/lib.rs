@@ -20,6 +20,7 @@
 #![forbid(unsafe_code)]
 
 mod access;
+mod aligned;
 mod bundle;
 mod compile;
 pub mod contract;
@@ -42,6 +43,7 @@ mod verify;
 #[cfg(test)]
 mod tests;
 
+pub use aligned::Aligned;
 pub use bundle::Bundle;
 pub use compile::{Options, compile, compile_with};
 pub use contract::Contract;
@@ -49,7 +51,7 @@ pub use digest::sha256;
 pub use error::{BundleError, CompileError, Line};
 pub use golden::Golden;
 pub use image::Image;
-pub use lads_core::op::WeightFormat;
+pub use lads_core::op::{CacheFormat, WeightFormat};
 pub use memory::{Memory, MemoryError};
 pub use report::{CompileReport, ProgramReport};
 pub use verify::PlanFault;

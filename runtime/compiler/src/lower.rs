@@ -13,9 +13,8 @@ mod weights;
 
 use std::collections::{HashMap, HashSet};
 
+use lads_core::op::{self, CacheFormat, IntSlot, Operand, Place, Port, Space, Span, StateSpan};
 use lads_kernels::keys_len;
-
-use lads_core::op::{self, IntSlot, Operand, Place, Port, Space, Span, StateSpan};
 
 use crate::contract::Contract;
 use crate::error::CompileError;
@@ -43,6 +42,7 @@ pub(crate) struct Lowered {
 /// `[capacity, heads * head_dim]`.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Cache {
+    pub format: CacheFormat,
     capacity: usize,
     layers: usize,
     heads: usize,
@@ -51,10 +51,11 @@ pub(crate) struct Cache {
 
 impl Cache {
     /// Room for the longest instruction, the first observation and a pair of tokens for every later control step.
-    pub fn new(contract: &Contract) -> Self {
+    pub fn new(contract: &Contract, format: CacheFormat) -> Self {
         let network = contract.network;
         let capacity = contract.context.words + 2 * contract.context.steps - 1;
         Self {
+            format,
             capacity,
             layers: network.layers,
             heads: network.heads,
@@ -66,17 +67,23 @@ impl Cache {
         self.heads * self.head_dim
     }
 
-    /// Elements of all layers.
-    pub fn len(&self) -> Option<u32> {
-        let values = self.width().checked_mul(self.capacity)?;
+    /// Words of one layer's keys and of its values.
+    fn words(&self) -> Option<[usize; 2]> {
         let keys = keys_len(self.capacity, self.width());
+        let values = self.width().checked_mul(self.capacity)?;
+        Some([keys, values].map(|elements| self.format.words(elements)))
+    }
+
+    /// Words of all layers.
+    pub fn len(&self) -> Option<u32> {
+        let [keys, values] = self.words()?;
         let layer = values.checked_add(keys)?;
         u32::try_from(layer.checked_mul(self.layers)?).ok()
     }
 
     pub(crate) fn spans(&self, layer: usize) -> [StateSpan; 2] {
-        let values = (self.capacity * self.width()) as u32;
-        let keys = keys_len(self.capacity, self.width()) as u32;
+        // Of a cache whose length was asked for, and fits 32 bits.
+        let [keys, values] = self.words().unwrap_or_default().map(|words| words as u32);
         let offset = layer as u32 * (keys + values);
         [
             StateSpan { offset, len: keys },

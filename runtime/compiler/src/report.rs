@@ -24,7 +24,7 @@ pub struct CompileReport {
     pub programs: Vec<ProgramReport>,
     /// Bytes of weights, tables and word embeddings, each content once.
     pub weight_bytes: usize,
-    /// Elements of state that the KV cache takes.
+    /// 4-byte words of state that the KV cache takes.
     pub cache_len: usize,
 }
 
@@ -56,8 +56,9 @@ impl fmt::Display for CompileReport {
         }
         write!(
             f,
-            "weights {} bytes, KV cache {} elements",
-            self.weight_bytes, self.cache_len
+            "weights {} bytes, KV cache {} bytes",
+            self.weight_bytes,
+            self.cache_len * 4
         )
     }
 }

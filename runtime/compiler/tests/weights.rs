@@ -1,11 +1,13 @@
-//! Weights of fewer bits: what an image with them holds, does, and has to pass.
+//! Weights and caches of fewer bits: what an image with them holds, does, and has to pass.
 
 use std::path::Path;
 
-use lads_compiler::{Bundle, CompileError, Image, Memory, Options, WeightFormat, compile_with};
+use lads_compiler::{
+    Bundle, CacheFormat, CompileError, Image, Memory, Options, WeightFormat, compile_with,
+};
 use lads_core::image::ProgramKind;
 use lads_core::op::Op;
-use lads_core::{Controller, Isa, Policy, SelfTestError, Workspace};
+use lads_core::{Isa, Policy, SelfTestError};
 
 fn tiny() -> Bundle {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/tiny.onnx");
@@ -16,25 +18,40 @@ fn options(weights: WeightFormat, tolerance: f32) -> Options {
     Options {
         weights,
         tolerance: Some(tolerance),
-        force: false,
+        ..Options::default()
     }
 }
 
-/// Every action of the golden episode, on chosen instructions.
-fn actions(image: &Image, isa: Isa) -> Vec<f32> {
+/// Every action of the golden episode, on chosen instructions, and of every decision how clear it was.
+fn replayed(image: &Image, isa: Isa) -> (Vec<f32>, Vec<f32>) {
     let policy = Policy::new_checked(image.as_bytes()).unwrap();
     let golden = policy.golden().unwrap();
     let mut memory = Memory::of(&policy).expect("there is memory");
-    let workspace = Workspace::new(&policy, &mut memory.arena, &mut memory.state).unwrap();
-    let mut controller = Controller::with_isa(policy, workspace, isa);
+    let mut controller = memory.controller_with(&policy, isa).unwrap();
     let instruction = lads_core::Instruction::Id(golden.instruction());
     controller.set_instruction(instruction).unwrap();
     let mut action = vec![0.0; policy.contract().action_len()];
-    let steps = golden.steps().flat_map(|(observation, _, _)| {
-        controller.step(observation, &mut action).unwrap();
-        action.clone()
-    });
-    steps.collect()
+    let (mut actions, mut margins) = (vec![], vec![]);
+    for (observation, _, _) in golden.steps() {
+        let report = controller.step(observation, &mut action).unwrap();
+        actions.extend_from_slice(&action);
+        margins.push(report.margin);
+    }
+    (actions, margins)
+}
+
+fn actions(image: &Image, isa: Isa) -> Vec<f32> {
+    replayed(image, isa).0
+}
+
+/// How the dense layers of a program are stored.
+fn layers(image: &Image, program: ProgramKind) -> Vec<WeightFormat> {
+    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let format = |op| match op {
+        Op::Linear(op) => Some(op.format),
+        _ => None,
+    };
+    policy.program(program).ops().filter_map(format).collect()
 }
 
 fn largest_difference(a: &[f32], b: &[f32]) -> f32 {
@@ -80,14 +97,8 @@ fn fewer_bits_are_admitted_inside_a_tolerance() {
             assert!(image.as_bytes().len() < bytes, "{format:?}");
             bytes = image.as_bytes().len();
         }
-        let mut layers = policy
-            .program(ProgramKind::Act)
-            .ops()
-            .filter_map(|op| match op {
-                Op::Linear(op) => Some(op.format),
-                _ => None,
-            });
-        assert!(layers.next().is_some() && layers.all(|found| found == format));
+        let layers = layers(&image, ProgramKind::Act);
+        assert!(!layers.is_empty() && layers.iter().all(|&found| found == format));
     }
 }
 
@@ -103,14 +114,15 @@ fn what_changes_the_policy_is_refused_unless_forced() {
         matches!(
             refused,
             CompileError::Gate {
-                format: "bf16",
                 error: SelfTestError::Action { .. },
-                tolerance
+                tolerance,
+                ..
             } if tolerance == bundle.golden().tolerance
         ),
         "{refused}"
     );
-    assert_eq!(refused.to_string().lines().count(), 1);
+    let text = refused.to_string();
+    assert!(text.starts_with("with bf16 weights the golden") && text.lines().count() == 1);
     let forced = Options {
         force: true,
         ..default
@@ -119,4 +131,52 @@ fn what_changes_the_policy_is_refused_unless_forced() {
     let policy = Policy::new_checked(image.as_bytes()).unwrap();
     let mut memory = Memory::of(&policy).expect("there is memory");
     assert!(memory.controller(&policy).unwrap().self_test().is_err());
+}
+
+/// The cache is in no action, and of the weights only the low level's are: what is rounded may only change which plan is chosen.
+#[test]
+fn what_only_chooses_plans_may_take_fewer_bits_and_no_tolerance() {
+    let bundle = tiny();
+    let exact = compile_with(&bundle, Options::default()).unwrap();
+    let (reference, margins) = replayed(&exact, Isa::detect());
+    let halves = Options {
+        cache: CacheFormat::F16,
+        ..Options::default()
+    };
+    let mixed = Options {
+        weights: WeightFormat::F16,
+        low_level: Some(WeightFormat::F32),
+        ..halves
+    };
+    let state = |image: &Image| {
+        let policy = Policy::new_checked(image.as_bytes()).unwrap();
+        policy.state_len()
+    };
+    for (options, text) in [
+        (halves, "f32 weights and an f16 cache"),
+        (mixed, "f16 weights (low level f32) and an f16 cache"),
+    ] {
+        assert_eq!(
+            (options.to_string().as_str(), options.is_exact()),
+            (text, false)
+        );
+        let image = compile_with(&bundle, options).unwrap();
+        let own = replayed(&image, Isa::portable());
+        assert!(Isa::all().all(|isa| replayed(&image, isa) == own), "{text}");
+        assert_eq!(
+            own.0, reference,
+            "{text}: the same plans give the same bits"
+        );
+        assert_ne!(own.1, margins, "{text}: it is the exact policy");
+        let [half, full] = [&image, &exact].map(state);
+        assert!(half < full * 3 / 5, "{text}: {half} of {full} words");
+    }
+    let image = compile_with(&bundle, mixed).unwrap();
+    let of = |program, format| {
+        let layers = layers(&image, program);
+        !layers.is_empty() && layers.iter().all(|&found| found == format)
+    };
+    assert!(of(ProgramKind::Act, WeightFormat::F32));
+    assert!(of(ProgramKind::StepDecide, WeightFormat::F16));
+    assert!(image.as_bytes().len() < exact.as_bytes().len());
 }

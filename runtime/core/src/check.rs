@@ -6,7 +6,7 @@ use core::cell::Cell;
 use core::error::Error;
 use core::fmt;
 
-use lads_kernels::{attention_scratch_len, keys_len};
+use lads_kernels::{CacheFormat, attention_scratch_len};
 
 use crate::image::PortRecord;
 use crate::op::{self, Op, Operand, Place, Space, Span, StateSpan, WeightFormat, WeightSpan};
@@ -63,6 +63,17 @@ fn require(condition: bool, fault: Fault) -> Checked {
 fn exactly<const N: usize>(len: u32, dims: [u32; N]) -> Checked {
     let product: u128 = dims.into_iter().map(u128::from).product();
     require(product != 0 && product == u128::from(len), Fault::Shape)
+}
+
+/// `len` words hold exactly so many elements of a format of the cache.
+fn exactly_words(len: u32, format: CacheFormat, dims: [u32; 2]) -> Checked {
+    let elements: u128 = dims.into_iter().map(u128::from).product();
+    let held = u128::from(len).saturating_mul(format.per_word() as u128);
+    // The last word may be half empty.
+    let fits = held
+        .checked_sub(elements)
+        .is_some_and(|spare| spare < format.per_word() as u128);
+    require(elements != 0 && fits, Fault::Shape)
 }
 
 /// A strided layout stays inside `len` elements.
@@ -256,10 +267,13 @@ impl Checker {
         self.cache(op.cache_v)?;
         let caches = [op.cache_k, op.cache_v].map(|span| [span.offset, span.len]);
         require(!overlap(caches[0], caches[1]), Fault::Overlap)?;
-        let capacity = op.cache_v.len.checked_div(width).ok_or(Fault::Shape)?;
-        exactly(op.cache_v.len, [capacity, width])?;
-        let keys = keys_len(capacity as usize, width as usize);
-        require(op.cache_k.len as usize == keys, Fault::Shape)?;
+        // Elements of the values, up to one more than there are.
+        let values = u64::from(op.cache_v.len).saturating_mul(op.format.per_word() as u64);
+        let capacity = values.checked_div(width.into()).ok_or(Fault::Shape)?;
+        let capacity = u32::try_from(capacity).map_err(|_| Fault::Shape)?;
+        exactly_words(op.cache_v.len, op.format, [capacity, width])?;
+        let whole = capacity.checked_next_multiple_of(16).ok_or(Fault::Shape)?;
+        exactly_words(op.cache_k.len, op.format, [whole, width])?;
         let needed = (self.spaces.past_max as u64).saturating_add(u64::from(op.tokens));
         require(u64::from(capacity) >= needed, Fault::Capacity)?;
         if op.queries == 0 {

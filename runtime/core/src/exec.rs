@@ -14,8 +14,8 @@ use lads_kernels::Isa;
 use crate::check::arena_span;
 use crate::image::PortRecord;
 use crate::op::{
-    self, INT_SLOTS, IntSlot, Op, Operand, Place, Port, Space, Span, StateSpan, WeightFormat,
-    WeightSpan,
+    self, CacheFormat, INT_SLOTS, IntSlot, Op, Operand, Place, Port, Space, Span, StateSpan,
+    WeightFormat, WeightSpan,
 };
 use crate::program::Program;
 
@@ -314,23 +314,26 @@ fn attention(
 ) -> Option<()> {
     let (heads, head_dim) = (op.heads as usize, op.head_dim as usize);
     let width = heads.checked_mul(head_dim)?;
-    let [cache_k, cache_v] = cache
+    let [keys, values] = cache
         .get_disjoint_mut([state_range(op.cache_k), state_range(op.cache_v)])
         .ok()?;
-    kernels::append_keys(
-        arena.get(range(op.k))?,
-        op.k_stride as usize,
+    // Casts of whole words to smaller numbers: they fail on no span.
+    let mut cache = match op.format {
+        CacheFormat::F32 => kernels::CacheMut::F32 { keys, values },
+        CacheFormat::F16 => kernels::CacheMut::F16 {
+            keys: bytemuck::try_cast_slice_mut(keys).ok()?,
+            values: bytemuck::try_cast_slice_mut(values).ok()?,
+        },
+    };
+    let append = kernels::Append {
+        k: arena.get(range(op.k))?,
+        k_stride: op.k_stride as usize,
+        v: arena.get(range(op.v))?,
+        v_stride: op.v_stride as usize,
         width,
-        cache_k,
-        past,
-    );
-    kernels::append_values(
-        arena.get(range(op.v))?,
-        op.v_stride as usize,
-        width,
-        cache_v,
-        past,
-    );
+        first: past,
+    };
+    append.run(isa, &mut cache);
     if op.queries == 0 {
         return Some(());
     }
@@ -346,8 +349,7 @@ fn attention(
             .saturating_add(op.tokens as usize)
             .saturating_sub(op.queries as usize)
             .saturating_add(1),
-        cache_k,
-        cache_v,
+        cache: cache.as_ref(),
     };
     attention.run(isa, q, y, scratch);
     Some(())

@@ -16,7 +16,7 @@ mod place;
 
 use crate::codec::{Field, Reader, Writer, record, word_enum_for};
 
-pub use lads_kernels::{Activation, BinaryKind, ReduceKind, UnaryKind, WeightFormat};
+pub use lads_kernels::{Activation, BinaryKind, CacheFormat, ReduceKind, UnaryKind, WeightFormat};
 pub use place::{INT_SLOTS, IntSlot, Operand, Place, Port, Space, Span, StateSpan, WeightSpan};
 
 /// Words of an encoded op.
@@ -51,6 +51,8 @@ impl Field for Activation {
 }
 
 word_enum_for!(WeightFormat { F32 = 0, F16 = 1, Bf16 = 2, Int8 = 3, });
+
+word_enum_for!(CacheFormat { F32 = 0, F16 = 1, });
 
 word_enum_for!(BinaryKind { Add = 0, Sub = 1, Mul = 2, Div = 3, Max = 4, Min = 5, Pow = 6, });
 
@@ -144,9 +146,12 @@ record! {
         pub v_stride: u32,
         /// `[queries, heads * head_dim]`, contiguous.
         pub y: Span,
-        /// `[capacity / 16, heads * head_dim, 16]`, blocks of 16 tokens, the last one whole: `lads_kernels::keys_len`.
+        /// How the cache is stored.
+        pub format: CacheFormat,
+        /// `[capacity / 16, heads * head_dim, 16]`, blocks of 16 tokens, the last one whole: `lads_kernels::keys_len` elements
+        /// of `format`.
         pub cache_k: StateSpan,
-        /// `[capacity, heads * head_dim]`; does not overlap `cache_k`.
+        /// `[capacity, heads * head_dim]` elements of `format`; does not overlap `cache_k`.
         pub cache_v: StateSpan,
         /// Heads.
         pub heads: u32,

@@ -3,7 +3,7 @@
 mod support;
 
 use lads_core::image::{CRC_WORD, ProgramKind, Section};
-use lads_core::op::{Activation, BinaryKind, Op, Span};
+use lads_core::op::{Activation, BinaryKind, CacheFormat, Op, Span};
 use lads_core::{Controller, Fault, Instruction, Policy, PolicyError, Workspace};
 use proptest::prelude::*;
 use support::assemble::{ops_mut, parts, with_golden};
@@ -321,6 +321,17 @@ fn each_rule_of_an_op_is_enforced() {
         });
     };
     assert_eq!(fault(StepDecide, shrink), Some(Fault::Capacity));
+    let halved = |spare: u32| {
+        fault(StepDecide, |ops| {
+            edit_first!(ops, Attention, op => {
+                op.format = CacheFormat::F16;
+                op.cache_k.len = op.cache_k.len.div_ceil(2);
+                op.cache_v.len = op.cache_v.len.div_ceil(2) - spare;
+            });
+        })
+    };
+    assert_eq!(halved(0), None);
+    assert_eq!(halved(1), shape);
 }
 
 #[test]

@@ -3,9 +3,9 @@
 use lads_core::codec::{Field, Reader, Writer};
 use lads_core::image::{ContractRecord, Layout, PortRecord, ProgramRecord, Section};
 use lads_core::op::{
-    Activation, ArgMax, ArgMin, Attention, Binary, BinaryKind, Copy, GatherRow, IntSlot, LayerNorm,
-    Linear, MatMul, OP_WORDS, Op, Operand, Reduce, ReduceKind, Softmax, Space, Span, StateSpan,
-    Unary, UnaryKind, WeightFormat, WeightSpan,
+    Activation, ArgMax, ArgMin, Attention, Binary, BinaryKind, CacheFormat, Copy, GatherRow,
+    IntSlot, LayerNorm, Linear, MatMul, OP_WORDS, Op, Operand, Reduce, ReduceKind, Softmax, Space,
+    Span, StateSpan, Unary, UnaryKind, WeightFormat, WeightSpan,
 };
 use proptest::prelude::*;
 
@@ -96,9 +96,10 @@ fn op() -> impl Strategy<Value = Op> {
     let attention = (
         prop::array::uniform5(span()),
         any::<[u32; 11]>(),
+        prop::sample::select(CacheFormat::ALL.to_vec()),
         -9.0_f32..9.0,
     )
-        .prop_map(|(s, n, scale)| {
+        .prop_map(|(s, n, format, scale)| {
             let state = |offset, len| StateSpan { offset, len };
             Attention {
                 q: s[0],
@@ -108,6 +109,7 @@ fn op() -> impl Strategy<Value = Op> {
                 v: s[2],
                 v_stride: n[2],
                 y: s[3],
+                format,
                 cache_k: state(n[3], n[4]),
                 cache_v: state(n[5], n[6]),
                 heads: n[7],

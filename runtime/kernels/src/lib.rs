@@ -27,6 +27,7 @@
 )]
 
 mod attention;
+mod cache;
 mod dispatch;
 mod elementwise;
 mod lanes;
@@ -41,7 +42,8 @@ pub mod stored;
 mod strided;
 mod subnormal;
 
-pub use attention::{Attention, append_keys, append_values, attention_scratch_len, keys_len};
+pub use attention::{Attention, attention_scratch_len};
+pub use cache::{Append, Cache, CacheFormat, CacheMut, keys_len};
 pub use dispatch::Isa;
 pub use elementwise::{Unary, UnaryKind, assign};
 pub use linear::{Activation, Linear, PANEL, pack, packed_len};

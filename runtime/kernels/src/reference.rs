@@ -4,7 +4,10 @@
     reason = "twins read like the definition and run in tests only"
 )]
 
-use crate::{Activation, Attention, Axis, BinaryKind, MatMul, ReduceKind, StridedCopy, UnaryKind};
+use crate::stored::from_f16;
+use crate::{
+    Activation, Attention, Axis, BinaryKind, Cache, MatMul, ReduceKind, StridedCopy, UnaryKind,
+};
 
 /// `x`, after the non-linearity.
 pub fn activation(activation: Activation, x: f64) -> f64 {
@@ -86,14 +89,30 @@ pub fn attention(op: &Attention, q: &[f32], y: &mut [f32]) {
             let score: f64 = (head..head + op.head_dim)
                 .map(|c| {
                     f64::from(q[query * op.q_stride + c])
-                        * f64::from(op.cache_k[key(width, row, c)])
+                        * f64::from(op.cache.key(key(width, row, c)))
                 })
                 .sum();
             let p = libm::exp(score * f64::from(op.scale));
-            sum += p * f64::from(op.cache_v[row * width + col]);
+            sum += p * f64::from(op.cache.value(row * width + col));
             total += p;
         }
         *y = (sum / total) as f32;
+    }
+}
+
+impl Cache<'_> {
+    fn key(&self, at: usize) -> f32 {
+        match self {
+            Self::F32 { keys, .. } => keys[at],
+            Self::F16 { keys, .. } => from_f16(keys[at]),
+        }
+    }
+
+    fn value(&self, at: usize) -> f32 {
+        match self {
+            Self::F32 { values, .. } => values[at],
+            Self::F16 { values, .. } => from_f16(values[at]),
+        }
     }
 }
 

@@ -35,6 +35,8 @@ pub(crate) trait Simd: Copy {
     fn add_product(self, sum: Self::V, a: Self::V, b: Self::V) -> Self::V;
     /// Sixteen half-precision numbers, [`stored::from_f16`].
     fn load_f16(self, from: &[u16; LANES]) -> Self::V;
+    /// Sixteen numbers as half-precision ones, [`stored::round_to_f16`].
+    fn round_to_f16(self, v: Self::V) -> [u16; LANES];
     /// Sixteen brain floats, [`stored::from_bf16`].
     fn load_bf16(self, from: &[u16; LANES]) -> Self::V;
     /// Sixteen integers.
@@ -116,6 +118,11 @@ impl Simd for Portable {
     }
 
     #[inline(always)]
+    fn round_to_f16(self, v: Block) -> [u16; LANES] {
+        stored::round_all_to_f16(&v)
+    }
+
+    #[inline(always)]
     fn load_bf16(self, from: &[u16; LANES]) -> Block {
         from.map(stored::from_bf16)
     }
@@ -129,14 +136,15 @@ impl Simd for Portable {
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod x86_64 {
     use core::arch::x86_64::{
-        __m256, __m512, _CMP_LT_OQ, _mm_loadl_epi64, _mm_loadu_si128, _mm256_add_ps,
-        _mm256_blendv_ps, _mm256_castsi256_ps, _mm256_cmp_ps, _mm256_cvtepi8_epi32,
-        _mm256_cvtepi32_ps, _mm256_cvtepu16_epi32, _mm256_cvtph_ps, _mm256_loadu_ps,
-        _mm256_loadu_si256, _mm256_mul_ps, _mm256_set1_ps, _mm256_setzero_ps, _mm256_slli_epi32,
-        _mm256_storeu_ps, _mm512_add_ps, _mm512_castsi512_ps, _mm512_cmp_ps_mask,
-        _mm512_cvtepi8_epi32, _mm512_cvtepi32_ps, _mm512_cvtepu16_epi32, _mm512_cvtph_ps,
-        _mm512_loadu_ps, _mm512_mask_blend_ps, _mm512_mul_ps, _mm512_set1_ps, _mm512_setzero_ps,
-        _mm512_slli_epi32, _mm512_storeu_ps,
+        __m256, __m512, _CMP_LT_OQ, _MM_FROUND_TO_NEAREST_INT, _mm_loadl_epi64, _mm_loadu_si128,
+        _mm_storeu_si128, _mm256_add_ps, _mm256_blendv_ps, _mm256_castsi256_ps, _mm256_cmp_ps,
+        _mm256_cvtepi8_epi32, _mm256_cvtepi32_ps, _mm256_cvtepu16_epi32, _mm256_cvtph_ps,
+        _mm256_cvtps_ph, _mm256_loadu_ps, _mm256_loadu_si256, _mm256_mul_ps, _mm256_set1_ps,
+        _mm256_setzero_ps, _mm256_slli_epi32, _mm256_storeu_ps, _mm256_storeu_si256, _mm512_add_ps,
+        _mm512_castsi512_ps, _mm512_cmp_ps_mask, _mm512_cvtepi8_epi32, _mm512_cvtepi32_ps,
+        _mm512_cvtepu16_epi32, _mm512_cvtph_ps, _mm512_cvtps_ph, _mm512_loadu_ps,
+        _mm512_mask_blend_ps, _mm512_mul_ps, _mm512_set1_ps, _mm512_setzero_ps, _mm512_slli_epi32,
+        _mm512_storeu_ps,
     };
 
     use super::Simd;
@@ -243,6 +251,19 @@ pub(crate) mod x86_64 {
         }
 
         #[inline(always)]
+        fn round_to_f16(self, v: Self::V) -> [u16; LANES] {
+            let mut to = [0; LANES];
+            let at: *mut u16 = to.as_mut_ptr();
+            // SAFETY: whoever made `self` has AVX2 and F16C; both halves lie inside the block.
+            unsafe {
+                let [low, high] = v.map(|v| _mm256_cvtps_ph::<_MM_FROUND_TO_NEAREST_INT>(v));
+                _mm_storeu_si128(at.cast(), low);
+                _mm_storeu_si128(at.add(8).cast(), high);
+            }
+            to
+        }
+
+        #[inline(always)]
         fn load_bf16(self, from: &[u16; LANES]) -> Self::V {
             let from = from.as_ptr();
             // SAFETY: whoever made `self` has AVX2; both halves lie inside the block.
@@ -319,6 +340,17 @@ pub(crate) mod x86_64 {
         fn load_f16(self, from: &[u16; LANES]) -> Self::V {
             // SAFETY: whoever made `self` has AVX-512; a block is sixteen numbers.
             unsafe { _mm512_cvtph_ps(_mm256_loadu_si256(from.as_ptr().cast())) }
+        }
+
+        #[inline(always)]
+        fn round_to_f16(self, v: Self::V) -> [u16; LANES] {
+            let mut to = [0; LANES];
+            // SAFETY: whoever made `self` has AVX-512; a block is sixteen numbers.
+            unsafe {
+                let halves = _mm512_cvtps_ph::<_MM_FROUND_TO_NEAREST_INT>(v);
+                _mm256_storeu_si256(to.as_mut_ptr().cast(), halves);
+            }
+            to
         }
 
         #[inline(always)]

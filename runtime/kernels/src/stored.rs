@@ -140,24 +140,44 @@ pub fn from_f16(bits: u16) -> f32 {
     f32::from_bits(found | u32::from(bits & 0x8000) << 16)
 }
 
-/// The nearest half-precision number, ties to even; `None` for what is not finite or rounds to more than 65504.
-pub fn to_f16(x: f32) -> Option<u16> {
+/// The nearest half-precision number, ties to even; infinite from 65520 on, the midpoint between 65504 and what would come next.
+#[inline(always)]
+pub fn round_to_f16(x: f32) -> u16 {
+    const INFINITE: u32 = 0x7c00;
+    const SMALLEST: f32 = f32::from_bits((127 - 14) << 23);
     let sign = (x.to_bits() >> 16) as u16 & 0x8000;
     let magnitude = x.abs();
-    // The midpoint between the largest number and what would be the next one.
-    if magnitude.is_nan() || magnitude >= 65520.0 {
-        return None;
-    }
-    let bits = if magnitude < f32::from_bits((127 - 14) << 23) {
-        // Steps of 2^-24: adding 0.5, whose last place has that value, rounds there.
-        ((magnitude + 0.5).to_bits() - 0.5_f32.to_bits()) as u16
+    let bits = magnitude.to_bits();
+    // Steps of 2^-24: adding 0.5, whose last place has that value, rounds there.
+    let subnormal = (magnitude + 0.5).to_bits().wrapping_sub(0.5_f32.to_bits());
+    // Half a unit of what is dropped, less one where the kept part is even; the carry may go into the exponent.
+    let rounded = bits.wrapping_add(0xfff + (bits >> 13 & 1));
+    let normal = rounded.wrapping_sub((127 - 15) << 23) >> 13;
+    // Selections of computed numbers, so that compilers vectorise loops over this.
+    let found = if magnitude < SMALLEST {
+        subnormal
     } else {
-        // Half a unit of what is dropped, less one where the kept part is even; the carry may go into the exponent.
-        let bits = magnitude.to_bits();
-        let rounded = bits + 0xfff + (bits >> 13 & 1);
-        ((rounded - ((127 - 15) << 23)) >> 13) as u16
+        normal
     };
-    Some(sign | bits)
+    let found = if magnitude < 65520.0 { found } else { INFINITE };
+    // As processors do: quiet, with what fits of its payload.
+    let found = if magnitude.is_nan() {
+        INFINITE | 0x200 | bits >> 13 & 0x1ff
+    } else {
+        found
+    };
+    sign | found as u16
+}
+
+/// Sixteen of them; compiled once, because it is long and a control step needs it for the new tokens only.
+#[inline(never)]
+pub(crate) fn round_all_to_f16(x: &Block) -> [u16; LANES] {
+    x.map(round_to_f16)
+}
+
+/// The same for one; `None` for what is not finite or rounds to infinity.
+pub fn to_f16(x: f32) -> Option<u16> {
+    (x.abs() < 65520.0).then(|| round_to_f16(x))
 }
 
 /// The number that a brain float means; exact.

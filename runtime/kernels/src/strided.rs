@@ -60,6 +60,14 @@ pub fn binary(kind: BinaryKind, a: Input, b: Input, dims: [usize; 4], y: &mut [f
 }
 
 fn binary_row(kind: BinaryKind, a: Row, b: Row, y: &mut [f32]) {
+    // Of two operands the first goes to `y`, and the second is combined with it there.
+    let a = match (a, b) {
+        (Row::Strided(x, stride), Row::Strided(..)) => {
+            combine(y, x, stride, |_, x| x);
+            Row::Output
+        }
+        _ => a,
+    };
     match kind {
         BinaryKind::Add => apply(a, b, y, |a, b| a + b),
         BinaryKind::Sub => apply(a, b, y, |a, b| a - b),
@@ -71,25 +79,13 @@ fn binary_row(kind: BinaryKind, a: Row, b: Row, y: &mut [f32]) {
     }
 }
 
-/// `y = f(a, b)`: the first operand goes to `y`, the second is combined with it there.
+/// `y = f(a, b)`, where at least one of them is in `y` already.
 #[inline(always)]
 fn apply(a: Row, b: Row, y: &mut [f32], f: impl Fn(f32, f32) -> f32) {
     match (a, b) {
-        (Row::Strided(a, s), b) if !matches!(b, Row::Output) => {
-            combine(y, a, s, |_, a| a);
-            apply_second(b, y, f);
-        }
-        // `b` is already in `y`.
-        (Row::Strided(a, s), _) => combine(y, a, s, |y, a| f(a, y)),
-        (Row::Output, b) => apply_second(b, y, f),
-    }
-}
-
-#[inline(always)]
-fn apply_second(b: Row, y: &mut [f32], f: impl Fn(f32, f32) -> f32) {
-    match b {
-        Row::Strided(b, s) => combine(y, b, s, f),
-        Row::Output => {
+        (Row::Strided(a, stride), _) => combine(y, a, stride, |b, a| f(a, b)),
+        (Row::Output, Row::Strided(b, stride)) => combine(y, b, stride, f),
+        (Row::Output, Row::Output) => {
             for y in y {
                 *y = f(*y, *y);
             }

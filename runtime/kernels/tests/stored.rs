@@ -1,6 +1,8 @@
 //! The formats of stored weights against their definitions, over all bit patterns or a dense sample of all `f32`.
 
-use lads_kernels::stored::{from_bf16, from_f16, int8_scale, to_bf16, to_f16, to_int8};
+use lads_kernels::stored::{
+    from_bf16, from_f16, int8_scale, round_to_f16, to_bf16, to_f16, to_int8,
+};
 
 /// IEEE 754-2019, section 3.4, with 5 bits of exponent and 10 of fraction.
 fn half(bits: u16) -> f64 {
@@ -50,9 +52,12 @@ fn halves_are_the_nearest_ones_ties_to_even() {
     for x in samples() {
         let Some(bits) = to_f16(x) else {
             assert!(x.abs() >= 65520.0, "{x} is refused");
+            let infinite = from_f16(round_to_f16(x));
+            assert!(infinite.is_infinite() && infinite.signum() == x.signum());
             continue;
         };
         assert!(x.abs() < 65520.0, "{x} is taken");
+        assert_eq!(bits, round_to_f16(x));
         assert_eq!(x.is_sign_negative(), bits >> 15 == 1);
         let error = |bits: u16| (half(bits) - f64::from(x)).abs();
         for other in [bits.wrapping_sub(1), bits + 1]
@@ -64,6 +69,15 @@ fn halves_are_the_nearest_ones_ties_to_even() {
                 own < its || own == its && bits & 1 == 0,
                 "{x:e}: {bits:#06x} or {other:#06x}"
             );
+        }
+    }
+}
+
+#[test]
+fn what_is_not_a_number_stays_none_as_a_half() {
+    for bits in (0x7f80_0001..=0x7fff_ffff_u32).step_by(4099) {
+        for x in [bits, bits | 1 << 31].map(f32::from_bits) {
+            assert!(x.is_nan() && to_f16(x).is_none() && from_f16(round_to_f16(x)).is_nan());
         }
     }
 }

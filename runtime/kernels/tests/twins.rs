@@ -2,9 +2,10 @@
 
 use lads_kernels::reference as naive;
 use lads_kernels::{
-    Activation, Attention, Axis, BinaryKind, Input, Isa, LayerNorm, Linear, MatMul, Panels,
-    ReduceKind, StridedCopy, Unary, UnaryKind, WeightFormat, append_keys, append_values, arg_max,
-    arg_min, attention_scratch_len, binary, keys_len, pack, packed_len, reduce, softmax, stored,
+    Activation, Append, Attention, Axis, BinaryKind, Cache, CacheFormat, CacheMut, Input, Isa,
+    LayerNorm, Linear, MatMul, Panels, ReduceKind, StridedCopy, Unary, UnaryKind, WeightFormat,
+    arg_max, arg_min, attention_scratch_len, binary, keys_len, pack, packed_len, reduce, softmax,
+    stored,
 };
 use proptest::prelude::*;
 use proptest::sample::select;
@@ -151,6 +152,56 @@ fn activation() -> impl Strategy<Value = Activation> {
     select(all.to_vec())
 }
 
+/// A number as a cache of this format holds it.
+fn bits(format: CacheFormat, x: f32) -> u32 {
+    match format {
+        CacheFormat::F32 => x.to_bits(),
+        CacheFormat::F16 => stored::round_to_f16(x).into(),
+    }
+}
+
+/// A cache and its memory.
+#[derive(Clone)]
+enum Stored {
+    F32([Vec<f32>; 2]),
+    F16([Vec<u16>; 2]),
+}
+
+impl Stored {
+    fn new(format: CacheFormat, keys: Vec<f32>, values: Vec<f32>) -> Self {
+        let halves = |x: Vec<f32>| x.into_iter().map(stored::round_to_f16).collect();
+        match format {
+            CacheFormat::F32 => Self::F32([keys, values]),
+            CacheFormat::F16 => Self::F16([keys, values].map(halves)),
+        }
+    }
+
+    fn readable(&self) -> Cache<'_> {
+        match self {
+            Self::F32([keys, values]) => Cache::F32 { keys, values },
+            Self::F16([keys, values]) => Cache::F16 { keys, values },
+        }
+    }
+
+    fn writable(&mut self) -> CacheMut<'_> {
+        match self {
+            Self::F32([keys, values]) => CacheMut::F32 { keys, values },
+            Self::F16([keys, values]) => CacheMut::F16 { keys, values },
+        }
+    }
+
+    fn bits(&self) -> [Vec<u32>; 2] {
+        match self {
+            Self::F32(both) => both
+                .each_ref()
+                .map(|x| x.iter().map(|x| x.to_bits()).collect()),
+            Self::F16(both) => both
+                .each_ref()
+                .map(|x| x.iter().map(|&x| x.into()).collect()),
+        }
+    }
+}
+
 proptest! {
     #[test]
     fn linear_equals_its_twin(
@@ -224,7 +275,7 @@ proptest! {
         (heads, head_dim) in (1_usize..5, select(vec![1_usize, 3, 5, 8, 16, 17, 32, 48, 64])),
         (past, tokens) in (0_usize..40, 1_usize..6),
         (queries, gap) in (1_usize..6, 0_usize..7),
-        seed in any::<u64>(),
+        (format, seed) in (select(CacheFormat::ALL.to_vec()), any::<u64>()),
     ) {
         let queries = queries.min(tokens);
         let (width, capacity) = (heads * head_dim, past + tokens + 2);
@@ -232,28 +283,29 @@ proptest! {
         let new = values(2 * tokens * stride, seed);
         let (new_k, new_v) = new.split_at(tokens * stride);
         // What lies beyond the tokens must not matter.
-        let mut cache_v = values(capacity * width, seed ^ 2);
-        cache_v[(past + tokens) * width..].fill(f32::NAN);
-        let mut cache_k = vec![f32::NAN; keys_len(capacity, width)];
+        let mut values_before = values(capacity * width, seed ^ 2);
+        values_before[(past + tokens) * width..].fill(f32::NAN);
+        let mut keys_before = vec![f32::NAN; keys_len(capacity, width)];
         for (i, &k) in values(past * width, seed ^ 1).iter().enumerate() {
-            cache_k[naive::key(width, i / width, i % width)] = k;
+            keys_before[naive::key(width, i / width, i % width)] = k;
         }
-        let before = cache_k.clone();
-        append_keys(new_k, stride, width, &mut cache_k, past);
-        append_values(new_v, stride, width, &mut cache_v, past);
-        for token in 0..tokens {
-            let row = (past + token) * width..(past + token + 1) * width;
-            prop_assert_eq!(&cache_v[row], &new_v[token * stride..token * stride + width]);
-        }
-        for row in 0..capacity {
-            for col in 0..width {
-                let at = naive::key(width, row, col);
-                let expected = match row.checked_sub(past).filter(|&token| token < tokens) {
-                    Some(token) => new_k[token * stride + col],
-                    None => before[at],
-                };
-                prop_assert_eq!(cache_k[at].to_bits(), expected.to_bits());
-            }
+        let before = Stored::new(format, keys_before, values_before);
+        let append = Append { k: new_k, k_stride: stride, v: new_v, v_stride: stride, width, first: past };
+        let mut caches = Isa::all().map(|isa| {
+            let mut cache = before.clone();
+            append.run(isa, &mut cache.writable());
+            cache
+        });
+        let cache = caches.next().unwrap();
+        prop_assert!(caches.all(|other| other.bits() == cache.bits()));
+        let ([keys, rows], [keys_before, rows_before]) = (cache.bits(), before.bits());
+        for (row, col) in (0..capacity).flat_map(|row| (0..width).map(move |col| (row, col))) {
+            let (key, value) = (naive::key(width, row, col), row * width + col);
+            let expected = match row.checked_sub(past).filter(|&token| token < tokens) {
+                Some(token) => [new_k, new_v].map(|new| bits(format, new[token * stride + col])),
+                None => [keys_before[key], rows_before[value]],
+            };
+            prop_assert_eq!([keys[key], rows[value]], expected);
         }
         let q: Vec<f32> = values((queries - 1) * stride + width, seed ^ 3).iter().map(|q| q * 4.0).collect();
         let attention = Attention {
@@ -262,8 +314,7 @@ proptest! {
             scale: 1.0 / (head_dim as f32).sqrt(),
             q_stride: stride,
             visible: past + tokens - queries + 1,
-            cache_k: &cache_k,
-            cache_v: &cache_v,
+            cache: cache.readable(),
         };
         let [y] = on_all(|isa| {
             let mut scratch = vec![f32::NAN; attention_scratch_len(queries, heads, capacity)];
@@ -481,23 +532,26 @@ fn results_have_the_same_bits_everywhere() {
         eps: 1e-5,
     };
     let (keys, cache) = (values(keys_len(50, 64), 6), values(50 * 64, 4));
-    let attention = Attention {
+    let caches = CacheFormat::ALL.map(|format| Stored::new(format, keys.clone(), cache.clone()));
+    let attentions = caches.each_ref().map(|cache| Attention {
         heads: 2,
         head_dim: 32,
         scale: 0.25,
         q_stride: 64,
         visible: 49,
-        cache_k: &keys,
-        cache_v: &cache,
-    };
+        cache: cache.readable(),
+    });
     let results = on_all(|isa| {
         let [mut y, mut z, mut p] = [(); 3].map(|()| vec![0.0; 3 * n]);
         layer.run(isa, &values(3 * k, 3), &mut y);
         norm.run(isa, &y, &mut z);
         softmax(isa, &z, n, &mut p);
-        let mut attended = vec![0.0; 128];
-        attention.run(isa, &values(128, 5), &mut attended, &mut [0.0; 256]);
-        [y, z, p, attended]
+        let [attended, halves] = attentions.map(|attention| {
+            let mut attended = vec![0.0; 128];
+            attention.run(isa, &values(128, 5), &mut attended, &mut [0.0; 256]);
+            attended
+        });
+        [y, z, p, attended, halves]
     });
     let digests = results.map(|x| digest(&x));
     let expected = [
@@ -505,6 +559,7 @@ fn results_have_the_same_bits_everywhere() {
         0xddf6_4acd_014e_4f1e,
         0x370e_3ea7_0ba2_cda6,
         0x3994_9bd4_e431_7df5,
+        0x5976_8726_5e74_d609,
     ];
     assert_eq!(digests, expected, "{digests:#x?}");
 }

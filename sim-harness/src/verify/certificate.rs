@@ -84,6 +84,8 @@ pub struct Setting {
     pub environment: String,
     /// SHA-256 of the verified bundle.
     pub bundle_sha256: String,
+    /// SHA-256 of the program image that ran: what may be put into the machine.
+    pub image_sha256: String,
     /// The instruction set that the kernels ran on.
     pub isa: String,
     /// Seed of the whole run, the reference's.
@@ -321,6 +323,7 @@ mod tests {
         let setting = Setting {
             environment: "tiny-bench".to_owned(),
             bundle_sha256: String::new(),
+            image_sha256: String::new(),
             isa: "portable".to_owned(),
             seed: 0,
             noise: "none".to_owned(),

@@ -68,6 +68,7 @@ pub fn run(
     let setting = Setting {
         environment: environment.id().to_owned(),
         bundle_sha256: contract.bundle_sha256().to_owned(),
+        image_sha256: lads_compiler::sha256(evaluation.policy.image()),
         isa: evaluation.isa.name().to_owned(),
         seed: evaluation.seed,
         noise: reference.noise.clone(),

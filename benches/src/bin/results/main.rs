@@ -26,9 +26,9 @@ use lads_benches::peers::onnxruntime::OnnxRuntime;
 use lads_benches::peers::recompute::Recompute;
 use lads_benches::peers::{cut::Source, tract::Tract};
 use lads_benches::stats::{median, quantile};
-use lads_benches::suite::{Candidate, Peers, with_contenders};
+use lads_benches::suite::{Candidate, Peers, options, with_contenders};
 use lads_benches::{BenchError, bundle};
-use lads_compiler::{Bundle, Image, Options, WeightFormat, compile, compile_with};
+use lads_compiler::{Bundle, Image, WeightFormat, compile, compile_with};
 use lads_core::Policy;
 use serde_json::{Value, json};
 
@@ -127,12 +127,7 @@ fn images(bundle: &Bundle) -> Result<Vec<(&'static str, Image)>, BenchError> {
     let mut images = vec![];
     for weights in WeightFormat::ALL {
         let full = weights == WeightFormat::F32;
-        let options = Options {
-            weights,
-            tolerance: (!full).then_some(BROKEN),
-            force: false,
-        };
-        match compile_with(bundle, options) {
+        match compile_with(bundle, options(weights)) {
             Ok(image) => images.push((weights.name(), image)),
             Err(error) if full => return Err(about("models/kitchen.onnx", error)),
             Err(error) => say(&format!("without {} weights: {error}", weights.name())),
@@ -143,9 +138,6 @@ fn images(bundle: &Bundle) -> Result<Vec<(&'static str, Image)>, BenchError> {
 
 /// Images that the paced run for the tails measures: full and half precision.
 const FOR_TAILS: usize = 2;
-
-/// An action that is further from the recorded one than this is not rounding.
-const BROKEN: f32 = 0.1;
 
 #[expect(clippy::too_many_lines, reason = "the order of the run, step by step")]
 fn run(arguments: &Arguments) -> Result<(), BenchError> {

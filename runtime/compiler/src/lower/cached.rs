@@ -82,6 +82,7 @@ impl Lowering<'_> {
             v: v.span,
             v_stride: v.stride,
             y: none,
+            format: self.cache.format,
             cache_k,
             cache_v,
             heads: self.cache.heads as u32,

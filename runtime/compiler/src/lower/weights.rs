@@ -20,7 +20,7 @@ const ALIGN: usize = 16;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 enum Form {
     Plain,
-    Packed,
+    Packed(WeightFormat),
     Scales,
 }
 
@@ -36,8 +36,8 @@ pub(crate) struct Packed {
 /// The weights of an image.
 #[derive(Debug, Default)]
 pub(crate) struct Weights {
-    /// How packed matrices are stored; everything else is `f32`.
-    format: WeightFormat,
+    /// How matrices that are packed from now on are stored; everything else is `f32`.
+    pub format: WeightFormat,
     /// In words: of what is stored with fewer bits, several to an element here.
     pub data: Vec<f32>,
     /// By content, as a hash: where blocks with that hash start.
@@ -47,13 +47,6 @@ pub(crate) struct Weights {
 }
 
 impl Weights {
-    pub fn new(format: WeightFormat) -> Self {
-        Self {
-            format,
-            ..Self::default()
-        }
-    }
-
     /// Stores a tensor as it is.
     pub fn plain(&mut self, tensor: &Arc<Tensor>) -> Result<WeightSpan, String> {
         let data = tensor.as_f32().ok_or("reads integers as numbers")?;
@@ -69,18 +62,18 @@ impl Weights {
         let format = self.format;
         let mut scales = None;
         let w = match format {
-            WeightFormat::F32 => {
-                self.once(tensor, Form::Packed, |this| this.store_panels(data, [k, n]))?
-            }
+            WeightFormat::F32 => self.once(tensor, Form::Packed(format), |this| {
+                this.store_panels(data, [k, n])
+            })?,
             WeightFormat::F16 => {
                 let halves = converted(data, format, stored::to_f16)?;
-                self.once(tensor, Form::Packed, |this| {
+                self.once(tensor, Form::Packed(format), |this| {
                     this.store_panels(&halves, [k, n])
                 })?
             }
             WeightFormat::Bf16 => {
                 let halves = converted(data, format, stored::to_bf16)?;
-                self.once(tensor, Form::Packed, |this| {
+                self.once(tensor, Form::Packed(format), |this| {
                     this.store_panels(&halves, [k, n])
                 })?
             }
@@ -94,7 +87,7 @@ impl Weights {
                 })?;
                 // The scales come first, next to the bias: both are read once per panel.
                 scales = Some(self.once(tensor, Form::Scales, |this| this.store(&columns))?);
-                self.once(tensor, Form::Packed, |this| {
+                self.once(tensor, Form::Packed(format), |this| {
                     this.store_panels(&integers, [k, n])
                 })?
             }

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use lads_core::op::{Op, Port};
+use lads_core::op::{CacheFormat, Op, Port};
 use lads_kernels::reference;
 
 use super::machine::Machine;
@@ -180,7 +180,7 @@ fn cache() -> Cache {
     contract.network.layers = 1;
     contract.network.heads = HEADS;
     contract.network.head_dim = DIM;
-    Cache::new(&contract)
+    Cache::new(&contract, CacheFormat::F32)
 }
 
 /// Compiles, runs with some tokens in the cache and compares with tract.

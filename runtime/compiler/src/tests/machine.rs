@@ -250,8 +250,10 @@ impl<'w> Machine<'w> {
             head_dim: op.head_dim as usize,
             visible: past + (op.tokens - op.queries) as usize + 1,
             scale: op.scale,
-            cache_k: &self.cache[op.cache_k.offset as usize..],
-            cache_v: &self.cache[op.cache_v.offset as usize..],
+            cache: lads_kernels::Cache::F32 {
+                keys: &self.cache[op.cache_k.offset as usize..],
+                values: &self.cache[op.cache_v.offset as usize..],
+            },
         };
         let mut y = vec![0.0; op.y.len as usize];
         reference::attention(&attention, self.get(op.q), &mut y);

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use lads_core::op::Port;
+use lads_core::op::{CacheFormat, Port};
 
 use super::machine::Machine;
 use super::models::{Small, float, int, ints, text};
@@ -26,7 +26,7 @@ pub(super) const PORTS: [(&str, Port); 7] = [
 
 pub(super) fn cache() -> Cache {
     let tiny = Bundle::from_bytes(include_bytes!("../../tests/data/tiny.onnx")).expect("a bundle");
-    Cache::new(tiny.contract())
+    Cache::new(tiny.contract(), CacheFormat::F32)
 }
 
 pub(super) fn compile(small: &Small) -> Result<Compiled, CompileError> {

@@ -1,6 +1,6 @@
 //! The memory plan and the verifier that does not trust it.
 
-use lads_core::op::{Copy, Op, Operand, Place, Port, Space, Span, Unary, UnaryKind};
+use lads_core::op::{CacheFormat, Copy, Op, Operand, Place, Port, Space, Span, Unary, UnaryKind};
 use proptest::prelude::*;
 
 use super::compiled;
@@ -27,7 +27,7 @@ fn programs() -> Vec<(Lowered, Placed)> {
             signature,
             recipe.outputs,
             recipe.ports,
-            Cache::new(bundle.contract()),
+            Cache::new(bundle.contract(), CacheFormat::F32),
         );
         let program = program.unwrap_or_else(|error| panic!("{error}"));
         (program.lowered, program.placed)

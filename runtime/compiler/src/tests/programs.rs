@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use lads_core::op::Port;
+use lads_core::op::{CacheFormat, Port};
 use lads_kernels::reference;
 use tract_onnx::prelude::Tensor;
 
@@ -26,7 +26,7 @@ fn check(path: &Path) {
     // Room for the longest past, whatever the contract's context is.
     let mut roomy = bundle.contract().clone();
     roomy.context.steps = roomy.context.steps.max(200);
-    let cache = Cache::new(&roomy);
+    let cache = Cache::new(&roomy, CacheFormat::F32);
     let signatures = entries::signatures(bundle.contract());
     for recipe in &RECIPES {
         let signature = signatures

@@ -28,12 +28,13 @@ record! {
 }
 
 record! {
-    /// Elements `offset..offset + len` of the state that survives a step: the KV cache.
+    /// 4-byte words `offset..offset + len` of the state that survives a step, the KV cache: as many `f32` elements, or more of a
+    /// smaller format.
     #[derive(Eq, Default)]
     pub struct StateSpan {
-        /// First element.
+        /// First word.
         pub offset: u32,
-        /// Number of elements.
+        /// Number of words.
         pub len: u32,
     }
 }

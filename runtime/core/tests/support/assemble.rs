@@ -5,7 +5,8 @@ use lads_core::image::{
     PolicyKind, PortRecord, ProgramKind, ProgramRecord, QuaternionOrder, Text,
 };
 use lads_core::op::{
-    self, Activation, BinaryKind, IntSlot, Op, Place, Port, Span, StateSpan, WeightSpan,
+    self, Activation, BinaryKind, CacheFormat, IntSlot, Op, Place, Port, Span, StateSpan,
+    WeightSpan,
 };
 use lads_kernels::{attention_scratch_len, pack, packed_len};
 
@@ -240,6 +241,7 @@ impl Transformer {
             v: part(2, tokens),
             v_stride: stride,
             y,
+            format: CacheFormat::F32,
             cache_k: layer.cache_k,
             cache_v: layer.cache_v,
             heads: self.heads,

@@ -12,6 +12,10 @@ pub struct Arguments {
     /// The policy bundle (ONNX)
     #[arg(long)]
     pub model: PathBuf,
+    /// Run this program image of the bundle, made by `lads compile`, for instance with weights or a cache of fewer bits; left out, the
+    /// bundle is compiled with 32-bit weights
+    #[arg(long, value_name = "LADS")]
+    pub image: Option<PathBuf>,
     /// Run only this instruction, by its text or its id; any other sentence goes through the language encoder
     #[arg(long)]
     pub instruction: Option<String>,

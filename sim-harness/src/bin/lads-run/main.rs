@@ -9,6 +9,7 @@
 mod arguments;
 mod end;
 mod language;
+mod program;
 mod record;
 mod recordings;
 mod report;
@@ -25,7 +26,7 @@ use std::time::{Duration, Instant};
 use arguments::{Arguments, IsaName};
 use end::{End, check_writable, print, refused, unwritable};
 use indicatif::{ProgressBar, ProgressStyle};
-use lads_compiler::{Bundle, Memory, compile};
+use lads_compiler::{Bundle, Memory};
 use lads_core::{Contract, Decision, Isa, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Setup};
@@ -37,6 +38,7 @@ use lads_sim::table::Table;
 use lads_sim::verify::reference::Reference;
 use lads_sim::{assets, command, fit, output, registry};
 use language::{Chosen, Heard};
+use program::Program;
 
 /// Exit code after an interrupt, as shells have it: 128 and the signal's number.
 const INTERRUPTED: u8 = 130;
@@ -68,9 +70,8 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
 
     let about = |wrong: &dyn Display| refused(format!("{}: {wrong}", arguments.model.display()));
     let bundle = Bundle::open(&arguments.model).map_err(refused)?;
-    let image = compile(&bundle).map_err(|error| about(&error))?;
-    let policy = Policy::new_checked(image.as_bytes())
-        .map_err(|error| about(&format_args!("{error}; export the bundle again")))?;
+    let program = Program::of(arguments, &bundle)?;
+    let policy = program.policy(arguments)?;
     let chosen = Chosen::of(arguments, &bundle)?;
     let mut heard = language::hear(arguments, &bundle, &policy, &chosen)?;
     self_test(&policy).map_err(|wrong| about(&wrong))?;
@@ -232,6 +233,7 @@ impl Bench<'_> {
             format_version: results::FORMAT_VERSION,
             environment: EnvironmentUsed::new(environment, &splits),
             bundle_sha256: contract.bundle_sha256().to_owned(),
+            image_sha256: lads_compiler::sha256(evaluation.policy.image()),
             seed: evaluation.seed,
             noise: self.noise.to_owned(),
             decision: DecisionUsed::of(evaluation.decision, evaluation.actor),
