@@ -161,7 +161,7 @@ def test_dropout_keeps_the_mean_and_the_rate():
 
 def test_same_instruction_is_no_negative(setting):
     torch.manual_seed(0)
-    align = Alignment(setting.alignment, 4, 8, 6).eval()
+    align = Alignment(setting.alignment, 4, 8).eval()
     plans, valid, sentences = torch.randn(3, 6, 4), torch.ones(3, 6, dtype=torch.bool), torch.randn(3, 8)
     same, different = torch.tensor([0, 0, 0]), torch.tensor([0, 1, 2])
     assert align(plans, valid, sentences, same).item() == pytest.approx(0.0, abs=1e-6)
@@ -187,7 +187,7 @@ def test_encoder_sees_what_it_is_shown_only():
 
 def test_segment_dropout_leaves_out_its_share_and_never_all(setting):
     torch.manual_seed(0)
-    align = Alignment(dataclasses.replace(setting.alignment, segment_dropout=0.7), 4, 8, 20)
+    align = Alignment(dataclasses.replace(setting.alignment, segment_dropout=0.7), 4, 8)
     valid = torch.arange(20) < torch.randint(1, 21, (2000,))[:, None]
     kept = align.some(valid)
     assert not (kept & ~valid).any()

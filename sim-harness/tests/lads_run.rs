@@ -229,6 +229,27 @@ fn bad_bundles_are_refused() {
 }
 
 #[test]
+fn a_bundle_that_asks_for_gigabytes_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let greedy = altered(
+        &kitchen_bundle(),
+        folder.path(),
+        r#""context": {"words": 24, "steps": 280, "beyond""#,
+        r#""context":{"words":24,"steps": 1048576,"beyond""#,
+    );
+    refused(
+        &greedy,
+        &[],
+        &[
+            "altered.onnx",
+            "workspace of",
+            "at most 1073741824",
+            "shorter context",
+        ],
+    );
+}
+
+#[test]
 fn contracts_of_another_environment_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     refused(&tiny_bundle(), &[], &["tiny-bench", "franka-kitchen"]);

@@ -459,11 +459,7 @@ fn an_image_that_asks_for_gigabytes_is_refused() {
     for elements in [1 << 28, u32::MAX - 1] {
         write(elements, true);
         assert!(answer(&["inspect", &path], "").contains(&(u64::from(elements) * 4).to_string()));
-        let parts = [
-            "greedy.lads",
-            "workspace of",
-            "the most that one gets is 1073741824",
-        ];
+        let parts = ["greedy.lads", "workspace of", "at most 1073741824"];
         refused(&["self-test", &path], "", &parts);
         refused(&act(&path, &[]), "", &parts);
     }

@@ -158,6 +158,8 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
     let cache_len = cache.len().ok_or_else(|| CompileError::TooLarge {
         what: "the KV cache".into(),
     })?;
+    // Before the compiler itself takes memory that grows with the context.
+    Memory::bytes_of(cache_len as usize)?;
     let mut weights = Weights::default();
     let mut made: Vec<Made> = vec![];
     // Whole matrices come before the parts of them that other programs need, and what runs in every control step comes first.

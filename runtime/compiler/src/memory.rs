@@ -21,10 +21,7 @@ impl Memory {
     /// As much as `policy` asks for.
     pub fn of(policy: &Policy<'_>) -> Result<Self, MemoryError> {
         let (arena, state) = (policy.arena_len(), policy.state_len());
-        let bytes = arena.saturating_add(state).saturating_mul(size_of::<f32>());
-        if bytes > Self::MOST_BYTES {
-            return Err(MemoryError::Excessive { bytes });
-        }
+        let bytes = Self::bytes_of(arena.saturating_add(state))?;
         let zeros = |len| -> Result<Vec<f32>, MemoryError> {
             let mut elements = Vec::new();
             elements
@@ -37,6 +34,15 @@ impl Memory {
             arena: zeros(arena)?,
             state: zeros(state)?,
         })
+    }
+
+    /// Bytes of so many f32 elements, if that is not more than a policy gets.
+    pub(crate) fn bytes_of(elements: usize) -> Result<usize, MemoryError> {
+        let bytes = elements.saturating_mul(size_of::<f32>());
+        if bytes > Self::MOST_BYTES {
+            return Err(MemoryError::Excessive { bytes });
+        }
+        Ok(bytes)
     }
 
     /// A controller that works in this memory; refused when it was made for a smaller policy.
@@ -63,7 +69,7 @@ impl Memory {
 pub enum MemoryError {
     /// The policy asks for more than any policy gets.
     #[error(
-        "the policy asks for a workspace of {bytes} bytes, and the most that one gets is {most}; compile it from a bundle with a shorter context, or do not trust it",
+        "the policy asks for a workspace of {bytes} bytes, and gets at most {most}; do not trust it, or export a bundle with a shorter context",
         most = Memory::MOST_BYTES
     )]
     Excessive {
@@ -72,7 +78,7 @@ pub enum MemoryError {
     },
     /// This machine does not have it.
     #[error(
-        "this machine has no {bytes} bytes left for the policy's workspace; end other programs, or compile it from a bundle with a shorter context"
+        "this machine has no {bytes} bytes left for the policy's workspace; end other programs, or export a bundle with a shorter context"
     )]
     Exhausted {
         /// What the policy asks for.
