@@ -11,13 +11,13 @@ DATA   ?= data/$(ENV).safetensors
 COLLECT_kitchen := --episodes-per-instruction 50
 COLLECT_lorel   := --episodes 50000
 # What lints and tests cover; one selection, because each is a build of its own, of tract too: the oracle and the language encoder's engine.
-FEATURES := lads-sim/report,lads-sim/record,lads-sim/language
+FEATURES := lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language
 ALL      := --workspace --features $(FEATURES)
 RUNTIME := -p lads-core -p lads-kernels -p lads-compiler -p lads-ffi -p lads-cli
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report record say language verify test setup lint test-rust test-runtime test-exporter sanitize collect train export reference install bench clean help
+.PHONY: run report record viewer say language verify test setup lint test-rust test-runtime test-exporter sanitize collect train export reference install bench clean help
 
 ## run: the shipped policy over the paper's seen and unseen instructions
 run: setup
@@ -30,6 +30,10 @@ report: setup
 ## record: the first episode of an instruction as episode.gif; ARGS="--instruction kbls"
 record: setup
 	cargo run --release -p lads-sim --features report,record --bin lads-run -- --model $(MODEL) --episodes 1 --record episode.gif $(ARGS)
+
+## viewer: the policy at real time in a window (X display); ARGS="--instruction kbls --episodes 3"
+viewer: setup
+	cargo run --release -p lads-sim --features viewer --bin lads-run -- --model $(MODEL) --viewer $(ARGS)
 
 ## language: the language encoder into the user's cache, once, for `make say`; ENCODER=FOLDER for another BERT-family model
 language: $(VENV)/stamp

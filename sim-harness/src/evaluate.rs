@@ -16,7 +16,7 @@ use crate::environment::{Environment, EpisodeSeed};
 use crate::faults::Faults;
 use crate::plans::PlanBook;
 use crate::random::Stream;
-use crate::rollout::{Actor, Driver, Episode, RolloutError, Task, Timing};
+use crate::rollout::{Actor, Driver, Episode, Onlooker, RolloutError, Task, Timing};
 use crate::spoken::WordBook;
 use crate::trace::Trace;
 
@@ -48,6 +48,8 @@ pub struct Setup<'e> {
     pub stop_where_refused: bool,
     /// How many of each instruction's episodes, from the first, keep every control step.
     pub traced: u32,
+    /// Who looks on at the policy's episodes.
+    pub onlooker: Option<&'e dyn Onlooker>,
 }
 
 /// What to run, and how.
@@ -139,6 +141,21 @@ impl Evaluation<'_> {
         stop: &AtomicBool,
         finished: &(dyn Fn() + Sync),
     ) -> Result<Evaluated, EvaluationError> {
+        let evaluated = self.run_until(open, stop, finished)?;
+        let done: usize = evaluated.episodes.iter().map(Vec::len).sum();
+        let whole = done == self.len();
+        whole
+            .then_some(evaluated)
+            .ok_or(EvaluationError::Interrupted)
+    }
+
+    /// The same, but work that ends early, also by who looks on, comes to the episodes that were finished.
+    pub fn run_until(
+        &self,
+        open: &(dyn Fn() -> Box<dyn Environment> + Sync),
+        stop: &AtomicBool,
+        finished: &(dyn Fn() + Sync),
+    ) -> Result<Evaluated, EvaluationError> {
         let queue = AtomicUsize::new(0);
         // Raised by a thread that failed, so that the others do not work for nothing.
         let failed = AtomicBool::new(false);
@@ -170,21 +187,16 @@ impl Evaluation<'_> {
             refused_at.extend(share.refused_at);
             timing.absorb(share.timing);
         }
-        if all.len() < self.len() {
-            return Err(EvaluationError::Interrupted);
-        }
         refused_at.sort_unstable();
         all.sort_unstable_by_key(|&(place, ..)| place);
         let mut traces = Vec::new();
-        let mut ordered = all.into_iter().map(|(_, episode, trace)| {
+        let mut episodes = vec![Vec::new(); self.assignments.len()];
+        for (place, episode, trace) in all {
             traces.extend(trace);
-            episode
-        });
-        let episodes = self
-            .assignments
-            .iter()
-            .map(|_| ordered.by_ref().take(self.episodes as usize).collect())
-            .collect();
+            if let Some(own) = episodes.get_mut(place / self.episodes as usize) {
+                own.push(episode);
+            }
+        }
         Ok(Evaluated {
             episodes,
             traces,
@@ -208,6 +220,7 @@ impl Evaluation<'_> {
         if self.setup.traced > 0 {
             driver.record();
         }
+        driver.show(self.setup.onlooker);
         let (mut episodes, mut refused_at) = (Vec::new(), Vec::new());
         while let Some(place) = next() {
             let episode = (place % self.episodes as usize) as u32;
@@ -220,6 +233,7 @@ impl Evaluation<'_> {
                     refused_at.push(step);
                     driver.outcome(&task)
                 }
+                Err(RolloutError::Stopped) => break,
                 other => other.map_err(|source| EvaluationError::Rollout {
                     instruction: assignment.instruction,
                     episode,

@@ -32,3 +32,5 @@ pub mod spoken;
 pub mod table;
 pub mod trace;
 pub mod verify;
+#[cfg(feature = "viewer")]
+pub mod viewer;

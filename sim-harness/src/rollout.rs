@@ -46,6 +46,51 @@ pub enum RolloutError {
         /// The environment's reason.
         error: ActionError,
     },
+    /// Who looks on has seen enough.
+    #[error("stopped while it was looked at")]
+    Stopped,
+}
+
+/// An episode as it stands, for who looks on.
+pub struct Glimpse<'g> {
+    /// Which episode.
+    pub task: &'g Task<'g>,
+    /// How far it is.
+    pub stand: Stand,
+    /// To look at, not to change.
+    pub environment: &'g mut dyn Environment,
+}
+
+/// How far an episode is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stand {
+    /// The next action is about to be executed.
+    Acting {
+        /// The plan in force.
+        plan: u32,
+    },
+    /// The last action was executed.
+    Ended {
+        /// Whether the instruction was carried out.
+        success: bool,
+    },
+}
+
+/// How an episode that is looked at goes on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Go {
+    /// With the next control step.
+    On,
+    /// From its start, as it was.
+    Again,
+    /// Not at all.
+    Stop,
+}
+
+/// Looks on while episodes run, at every control step between decision and action, and once after the last. It may take its time.
+pub trait Onlooker: std::fmt::Debug + Sync {
+    /// One control step.
+    fn look(&self, glimpse: Glimpse<'_>) -> Go;
 }
 
 /// Who acts.
@@ -153,6 +198,7 @@ pub struct Driver<'a, 'm, 'e> {
     plans: Vec<u32>,
     /// Control steps of the episode, where they are kept.
     recording: Option<Vec<Step>>,
+    onlooker: Option<&'e dyn Onlooker>,
     /// What was measured so far.
     pub timing: Timing,
 }
@@ -176,6 +222,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             limits,
             plans: Vec::new(),
             recording: None,
+            onlooker: None,
             timing: Timing::default(),
         }
     }
@@ -204,9 +251,25 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         }
     }
 
+    /// Lets someone look on at the policy's episodes to come.
+    pub fn show(&mut self, onlooker: Option<&'e dyn Onlooker>) {
+        self.onlooker = onlooker;
+    }
+
     /// Runs one episode to its end: the instruction is carried out, or the steps or the commanded plans are used up.
     pub fn run(&mut self, task: &Task<'_>) -> Result<Episode, RolloutError> {
         let episode_cpu = cpu_time();
+        let episode = loop {
+            if let Some(episode) = self.attempt(task)? {
+                break episode;
+            }
+        };
+        self.timing.episodes_cpu += cpu_since(episode_cpu);
+        Ok(episode)
+    }
+
+    /// An episode; `None` if who looks on wants it again.
+    fn attempt(&mut self, task: &Task<'_>) -> Result<Option<Episode>, RolloutError> {
         if let Some(recording) = &mut self.recording {
             recording.clear();
         }
@@ -232,6 +295,12 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
                     if report.decided {
                         self.plans.push(report.plan.0);
                     }
+                    let plan = report.plan.0;
+                    match self.look(task, Stand::Acting { plan }) {
+                        Go::On => {}
+                        Go::Again => return Ok(None),
+                        Go::Stop => return Err(RolloutError::Stopped),
+                    }
                     let before_cpu = cpu_time();
                     link.actuate(&self.action, &mut self.executed);
                     self.keep(&report, elapsed_ns, task.plans.is_some());
@@ -243,8 +312,20 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             self.sense(&mut link);
             step += 1;
         }
-        self.timing.episodes_cpu += cpu_since(episode_cpu);
-        Ok(self.outcome(task))
+        let success = self.succeeded(task);
+        let go = self.look(task, Stand::Ended { success });
+        Ok((go != Go::Again).then(|| self.outcome(task)))
+    }
+
+    /// Shows the episode as it stands to who looks on.
+    fn look(&mut self, task: &Task<'_>, stand: Stand) -> Go {
+        self.onlooker.map_or(Go::On, |onlooker| {
+            onlooker.look(Glimpse {
+                task,
+                stand,
+                environment: &mut *self.environment,
+            })
+        })
     }
 
     fn succeeded(&self, task: &Task<'_>) -> bool {

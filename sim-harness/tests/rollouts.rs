@@ -10,7 +10,7 @@ use lads_core::{Decision, Isa, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Setup};
 use lads_sim::fit;
-use lads_sim::rollout::{Actor, Episode};
+use lads_sim::rollout::{Actor, Episode, Glimpse, Go, Onlooker, Stand};
 
 /// The seed is replaced by one per episode.
 const SAMPLE: Decision = Decision::Sample {
@@ -73,6 +73,67 @@ fn the_number_of_threads_does_not_show() {
             "another seed"
         );
     }
+}
+
+/// Has the first episode again after five control steps, and once more at its end; stops the third in the middle.
+#[derive(Debug, Default)]
+struct Restless {
+    looks: AtomicUsize,
+    agains: AtomicUsize,
+}
+
+impl Onlooker for Restless {
+    fn look(&self, glimpse: Glimpse<'_>) -> Go {
+        self.looks.fetch_add(1, Ordering::Relaxed);
+        let (episode, steps) = (glimpse.task.seed.episode, glimpse.environment.steps());
+        let agains = self.agains.load(Ordering::Relaxed);
+        let ended = matches!(glimpse.stand, Stand::Ended { .. });
+        if episode == 0 && ((agains == 0 && steps == 5) || (agains == 1 && ended)) {
+            self.agains.fetch_add(1, Ordering::Relaxed);
+            return Go::Again;
+        }
+        if episode == 2 && steps == 3 {
+            return Go::Stop;
+        }
+        Go::On
+    }
+}
+
+#[test]
+fn who_looks_on_changes_no_episode() {
+    let image = tiny_image();
+    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let assignments = assignments(&policy);
+    let restless = Restless::default();
+    let evaluation = Evaluation {
+        policy,
+        assignments: &assignments,
+        episodes: 5,
+        seed: 3,
+        decision: SAMPLE,
+        actor: Actor::Policy,
+        isa: Isa::detect(),
+        threads: 1,
+        setup: Setup {
+            onlooker: Some(&restless),
+            traced: 1,
+            ..Setup::default()
+        },
+    };
+    let seen = evaluation
+        .run_until(&open, &AtomicBool::new(false), &|| {})
+        .unwrap();
+    let plain = evaluate(&policy, 3, SAMPLE, 1).episodes;
+    let finished: Vec<usize> = seen.episodes.iter().map(Vec::len).collect();
+    assert_eq!(finished, [2, 0, 0, 0]);
+    assert_eq!(seen.episodes[0], plain[0][..2]);
+    assert_eq!(seen.traces[0].steps.len(), plain[0][0].steps);
+    // One look at every action and one at every end: the first episode's beginning and twice the whole, the third up to its fourth step.
+    let [first, second] = [0, 1].map(|episode| plain[0][episode].steps + 1);
+    let looks = restless.looks.load(Ordering::Relaxed);
+    assert_eq!(looks, 6 + 2 * first + second + 4);
+    let interrupted = evaluation.run(&open, &AtomicBool::new(false), &|| {});
+    assert!(matches!(interrupted, Err(EvaluationError::Interrupted)));
 }
 
 #[test]

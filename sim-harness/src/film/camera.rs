@@ -1,12 +1,15 @@
-//! A state of the simulator as a picture, drawn off-screen through EGL. What can fail: no EGL, no such camera.
+//! A state of the simulator as a picture, drawn off-screen through EGL, for films and for the viewer's window. What can fail: no EGL, no
+//! such camera.
 //!
 //! Mesa draws in software where there is no GPU; shadows and smoothed edges at the resolution that the scenes ask for would take it a
 //! second per picture, so the camera leaves shadows out and takes fewer samples. Making a camera takes about a second.
 
+use std::sync::Arc;
+
 use mujoco_rs::prelude::MjtObjBase;
 use mujoco_rs::renderer::{MjRenderer, RendererError};
-use mujoco_rs::wrappers::MjModel;
-use mujoco_rs::wrappers::mj_visualization::{MjtCamera, MjvCamera};
+use mujoco_rs::wrappers::mj_visualization::{MjtCamera, MjtMouse, MjvCamera};
+use mujoco_rs::wrappers::{MjData, MjModel};
 
 use super::FilmError;
 use crate::environment::{Environment, Stage, View};
@@ -19,38 +22,130 @@ const SAMPLES: i32 = 4;
 /// Draws pictures of one size.
 pub struct Camera {
     renderer: MjRenderer,
+    model: MjModel,
+    size: [u32; 2],
+}
+
+/// How a free camera moves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Motion {
+    /// Around the point that it looks at.
+    Turn,
+    /// With that point, across the picture.
+    Shift,
+    /// With that point, over the floor.
+    Glide,
+    /// To or from that point.
+    Zoom,
 }
 
 impl Camera {
     /// A camera in the scene of `environment`, for pictures of `width` by `height` pixels.
-    pub fn new(
-        environment: &mut dyn Environment,
-        [width, height]: [u32; 2],
-    ) -> Result<Self, FilmError> {
+    pub fn new(environment: &mut dyn Environment, size: [u32; 2]) -> Result<Self, FilmError> {
+        let stage = stage(environment)?;
+        let model = MjModel::clone(stage.data.model());
+        let camera = camera(&model, stage.view)?;
+        Self::build(model, camera, size)
+    }
+
+    /// The same, but one that [`steer`](Self::steer) moves: a camera of the scene is replaced by a free one where it is after a reset.
+    pub fn free(environment: &mut dyn Environment, size: [u32; 2]) -> Result<Self, FilmError> {
         let stage = stage(environment)?;
         let mut model = MjModel::clone(stage.data.model());
+        let mut camera = camera(&model, stage.view)?;
+        if let View::Camera(_) = stage.view {
+            camera = freed(&camera, stage.data, &mut model);
+        }
+        Self::build(model, camera, size)
+    }
+
+    fn build(
+        mut model: MjModel,
+        camera: MjvCamera,
+        [width, height]: [u32; 2],
+    ) -> Result<Self, FilmError> {
         let visual = model.vis_mut();
         visual.quality.shadowsize = SHADOW_SIZE;
         visual.quality.offsamples = SAMPLES;
         visual.global.offwidth = width as i32;
         visual.global.offheight = height as i32;
-        let camera = camera(&model, stage.view)?;
         let renderer = MjRenderer::builder()
             .width(width)
             .height(height)
             .camera(camera)
             .build(&model)
             .map_err(|error| FilmError::NoEgl(whole(&error)))?;
-        Ok(Self { renderer })
+        Ok(Self {
+            renderer,
+            model,
+            size: [width, height],
+        })
     }
 
-    /// The state as it is now: rows from the top, three bytes (red, green, blue) per pixel.
-    pub fn shoot(&mut self, environment: &mut dyn Environment) -> Result<&[u8], FilmError> {
-        let failed = |error: RendererError| FilmError::Draw(whole(&error));
-        let stage = stage(environment)?;
-        self.renderer.sync_data(stage.data).map_err(failed)?;
-        self.renderer.render().map_err(failed)?;
+    /// Takes pictures of another size from now on.
+    pub fn resize(&mut self, size: [u32; 2]) -> Result<(), FilmError> {
+        *self = Self::build(self.model.clone(), self.renderer.camera().clone(), size)?;
+        Ok(())
+    }
+
+    /// Width and height of its pictures in pixels.
+    pub fn size(&self) -> [u32; 2] {
+        self.size
+    }
+
+    /// Moves a free camera by a share of the picture's height, to the right and down.
+    pub fn steer(&mut self, motion: Motion, [right, down]: [f64; 2]) {
+        let action = match motion {
+            Motion::Turn => MjtMouse::mjMOUSE_ROTATE_V,
+            Motion::Shift => MjtMouse::mjMOUSE_MOVE_V,
+            Motion::Glide => MjtMouse::mjMOUSE_MOVE_H,
+            Motion::Zoom => MjtMouse::mjMOUSE_ZOOM,
+        };
+        let camera = self.renderer.camera_mut();
+        camera.move_(action, &self.model, right, down);
+    }
+
+    /// Looks at the state of the simulator as it is now.
+    pub fn see(&mut self, data: &mut MjData<Arc<MjModel>>) -> Result<(), FilmError> {
+        let seen = self.renderer.sync_data(data);
+        seen.map_err(|error| FilmError::Draw(whole(&error)))
+    }
+
+    /// Draws what it saw last: rows from the top, three bytes (red, green, blue) per pixel.
+    pub fn draw(&mut self) -> Result<&[u8], FilmError> {
+        let drawn = self.renderer.render();
+        drawn.map_err(|error: RendererError| FilmError::Draw(whole(&error)))?;
         Ok(self.renderer.rgb_flat().unwrap_or_default())
+    }
+
+    /// The state of `environment` as it is now, as [`draw`](Self::draw) gives it.
+    pub fn shoot(&mut self, environment: &mut dyn Environment) -> Result<&[u8], FilmError> {
+        self.see(stage(environment)?.data)?;
+        self.draw()
+    }
+}
+
+/// A free camera where a fixed one is, with its field of view; it turns around the point before it that is nearest to the scene's middle.
+fn freed(fixed: &MjvCamera, data: &MjData<Arc<MjModel>>, model: &mut MjModel) -> MjvCamera {
+    let (at, forward, ..) = fixed.frame(data);
+    let middle = &model.stat().center;
+    let to_middle = at.iter().zip(middle).map(|(at, middle)| middle - at);
+    let depth: f64 = to_middle.zip(forward).map(|(way, ahead)| way * ahead).sum();
+    let distance = depth.max(0.1 * model.stat().extent);
+    let mut lookat = at;
+    for (point, ahead) in lookat.iter_mut().zip(forward) {
+        *point += distance * ahead;
+    }
+    if let Some(&fovy) = model.cam_fovy().get(fixed.fixedcamid as usize) {
+        model.vis_mut().global.fovy = fovy as f32;
+    }
+    MjvCamera {
+        type_: MjtCamera::mjCAMERA_FREE as i32,
+        lookat,
+        distance,
+        azimuth: forward[1].atan2(forward[0]).to_degrees(),
+        elevation: forward[2].clamp(-1.0, 1.0).asin().to_degrees(),
+        ..MjvCamera::default()
     }
 }
 

@@ -32,6 +32,20 @@ impl Canvas {
         &self.rgb
     }
 
+    /// The pixel in column `x` and row `y` as the number `0xRRGGBB`; black outside.
+    pub fn pixel(&self, x: u32, y: u32) -> u32 {
+        let start = 3 * (y as usize * self.width as usize + x as usize);
+        match self.rgb.get(start..start + 3) {
+            Some(&[r, g, b]) if x < self.width => u32::from_be_bytes([0, r, g, b]),
+            _ => 0,
+        }
+    }
+
+    /// Makes it black.
+    pub fn clear(&mut self) {
+        self.rgb.fill(0);
+    }
+
     /// Lays another picture of `width` pixels per row over it, with its upper left corner at (`left`, `top`).
     pub fn paste(&mut self, rgb: &[u8], width: u32, left: u32, top: u32) {
         let row_len = 3 * self.width as usize;

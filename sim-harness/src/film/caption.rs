@@ -9,18 +9,21 @@ use embedded_graphics::pixelcolor::{Rgb888, RgbColor as _};
 use embedded_graphics::primitives::{Primitive as _, PrimitiveStyle, Rectangle};
 use embedded_graphics::text::{Alignment, Baseline, Text, TextStyleBuilder};
 
-use super::Moment;
 use super::canvas::Canvas;
-use crate::trace::Trace;
+use crate::environment::Completion;
+use crate::rollout::Stand;
 
 /// Height above the picture, in pixels.
 pub const HEAD: u32 = 48;
 /// Height below it.
 pub const FOOT: u32 = 80;
 
+/// Height of a line that [`line()`] writes.
+pub const LINE_HEIGHT: u32 = 18;
+
 const MARGIN: i32 = 8;
 const HEAD_LINES: usize = 2;
-const LINE: i32 = 18;
+const LINE: i32 = LINE_HEIGHT as i32;
 const STRIP: u32 = 10;
 
 const PAPER: Rgb888 = Rgb888::new(22, 24, 29);
@@ -55,12 +58,36 @@ pub struct Caption<'c> {
     pub sub_tasks: &'c [&'static str],
     /// Which of them the instruction commands.
     pub commanded: &'c [usize],
-    /// The episode.
-    pub trace: &'c Trace,
+    /// Control steps in all: the width of the strip.
+    pub steps: usize,
     /// Control period in seconds.
     pub period_s: f64,
-    /// How fast the pictures follow each other: 1 is as it was.
-    pub speed: f64,
+    /// Written beside the status.
+    pub note: &'c str,
+}
+
+/// An episode at a state on its way.
+#[derive(Debug, Clone, Copy)]
+pub struct Progress<'p> {
+    /// The plan of every control step that was executed.
+    pub plans: &'p [u32],
+    /// Completions so far.
+    pub completions: &'p [Completion],
+    /// What comes next.
+    pub stand: Stand,
+}
+
+/// Writes a line across the picture whose upper edge is at `top`.
+pub fn line(text: &str, top: u32, canvas: &mut Canvas) {
+    let corner = Point::new(0, top as i32);
+    fill(canvas, corner, [canvas.size()[0], LINE_HEIGHT], PAPER);
+    write(
+        canvas,
+        &FONT_8X13,
+        FAINT,
+        Point::new(MARGIN, top as i32 + 2),
+        text,
+    );
 }
 
 /// A sub-task as it stands.
@@ -71,10 +98,10 @@ struct Mark {
 }
 
 impl Caption<'_> {
-    /// Writes everything about a moment around the picture.
-    pub fn draw(&self, moment: Moment<'_>, canvas: &mut Canvas) {
-        let [width, height] = canvas.size();
-        let foot = height.saturating_sub(FOOT);
+    /// Writes everything around the picture, down to `bottom`.
+    pub fn draw(&self, progress: Progress<'_>, bottom: u32, canvas: &mut Canvas) {
+        let [width, _] = canvas.size();
+        let foot = bottom.saturating_sub(FOOT);
         fill(canvas, Point::zero(), [width, HEAD], PAPER);
         fill(canvas, Point::new(0, foot as i32), [width, FOOT], PAPER);
         let columns = (width as i32 - 2 * MARGIN) / FONT_10X20.character_size.width as i32;
@@ -83,54 +110,50 @@ impl Caption<'_> {
             write(canvas, &FONT_10X20, INK, Point::new(MARGIN, y), line);
         }
         let mut top = foot as i32 + 5;
-        self.status(moment, top, canvas);
+        self.status(progress, top, canvas);
         top += LINE;
-        self.marks(moment, top, canvas);
-        self.strip(moment, height - STRIP, canvas);
+        let strip = bottom.saturating_sub(STRIP);
+        self.marks(progress, top, strip, canvas);
+        self.strip(progress, strip, canvas);
     }
 
-    fn status(&self, moment: Moment<'_>, top: i32, canvas: &mut Canvas) {
-        let all = self.trace.steps.len();
-        let at = moment.number as f64 * self.period_s;
-        let state = match moment.step {
-            Some(step) => format!("plan {:>3}", step.plan),
-            None if self.trace.outcome.success => "carried out".to_owned(),
-            None => "not carried out".to_owned(),
+    fn status(&self, progress: Progress<'_>, top: i32, canvas: &mut Canvas) {
+        let (number, all) = (progress.plans.len(), self.steps);
+        let at = number as f64 * self.period_s;
+        let state = match progress.stand {
+            Stand::Acting { plan } => format!("plan {plan:>3}"),
+            Stand::Ended { .. } if self.commanded.is_empty() => "ended".to_owned(),
+            Stand::Ended { success: true } => "carried out".to_owned(),
+            Stand::Ended { success: false } => "not carried out".to_owned(),
         };
-        let text = format!("step {:>3} of {all}  {at:>5.2} s  {state}", moment.number);
+        let text = format!("step {number:>3} of {all}  {at:>5.2} s  {state}");
         write(canvas, &FONT_8X13, INK, Point::new(MARGIN, top), &text);
-        if let Some(step) = moment.step {
+        if let Stand::Acting { plan } = progress.stand {
             let x = MARGIN + FONT_8X13.character_size.width as i32 * (text.len() as i32 + 1);
-            fill(
-                canvas,
-                Point::new(x, top + 1),
-                [11, 11],
-                plan_color(step.plan),
-            );
+            fill(canvas, Point::new(x, top + 1), [11, 11], plan_color(plan));
         }
-        if self.speed < 0.99 {
+        if !self.note.is_empty() {
             let right = Point::new(canvas.size()[0] as i32 - MARGIN, top);
-            let text = format!("slowed down to {:.2} of real time", self.speed);
             let style = TextStyleBuilder::new()
                 .baseline(Baseline::Top)
                 .alignment(Alignment::Right)
                 .build();
             let ink = MonoTextStyle::new(&FONT_8X13, FAINT);
-            let Ok(_) = Text::with_text_style(&text, right, ink, style).draw(canvas);
+            let Ok(_) = Text::with_text_style(self.note, right, ink, style).draw(canvas);
         }
     }
 
     /// The sub-tasks, commanded ones first, in as many rows as there are.
-    fn marks(&self, moment: Moment<'_>, mut top: i32, canvas: &mut Canvas) {
-        let [width, height] = canvas.size();
+    fn marks(&self, progress: Progress<'_>, mut top: i32, strip: u32, canvas: &mut Canvas) {
+        let [width, _] = canvas.size();
         let mut left = MARGIN;
-        for mark in self.list(moment.number) {
+        for mark in self.list(progress.completions) {
             let character = FONT_8X13.character_size.width as i32;
             let needed = 16 + character * mark.text.chars().count() as i32;
             if left > MARGIN && left + needed > width as i32 - MARGIN {
                 (left, top) = (MARGIN, top + LINE);
             }
-            if top + LINE > (height - STRIP) as i32 {
+            if top + LINE > strip as i32 {
                 break;
             }
             let corner = Point::new(left, top + 1);
@@ -149,10 +172,9 @@ impl Caption<'_> {
         }
     }
 
-    fn list(&self, number: usize) -> Vec<Mark> {
+    fn list(&self, completions: &[Completion]) -> Vec<Mark> {
         let name = |sub_task: usize| self.sub_tasks.get(sub_task).copied().unwrap_or("?");
-        let done = &self.trace.outcome.completions;
-        let done = done.iter().filter(|done| done.step <= number);
+        let done = completions.iter();
         let asked = self.commanded.iter().map(|&sub_task| {
             let done = done.clone().find(|done| done.sub_task == sub_task);
             let text = done.map_or(name(sub_task).to_owned(), |done| {
@@ -176,20 +198,18 @@ impl Caption<'_> {
     }
 
     /// The plan in force at each step so far, as a colour, and completions as white lines.
-    fn strip(&self, moment: Moment<'_>, top: u32, canvas: &mut Canvas) {
+    fn strip(&self, progress: Progress<'_>, top: u32, canvas: &mut Canvas) {
         let width = canvas.size()[0];
-        let all = self.trace.steps.len().max(1);
+        let all = self.steps.max(1);
         let x = |step: usize| (step as u64 * u64::from(width) / all as u64) as u32;
-        for (step, known) in self.trace.steps.iter().take(moment.number).enumerate() {
+        for (step, &plan) in progress.plans.iter().enumerate() {
             let corner = Point::new(x(step) as i32, top as i32);
             let size = [x(step + 1) - x(step), STRIP];
-            fill(canvas, corner, size, plan_color(known.plan));
+            fill(canvas, corner, size, plan_color(plan));
         }
-        for done in &self.trace.outcome.completions {
-            if done.step <= moment.number {
-                let corner = Point::new(x(done.step) as i32 - 2, top as i32);
-                fill(canvas, corner, [2, STRIP], INK);
-            }
+        for done in progress.completions {
+            let corner = Point::new(x(done.step) as i32 - 2, top as i32);
+            fill(canvas, corner, [2, STRIP], INK);
         }
     }
 }

@@ -21,9 +21,10 @@ use thiserror::Error;
 
 use self::camera::Camera;
 use self::canvas::Canvas;
-use self::caption::Caption;
+use self::caption::{Caption, Progress};
 use self::file::{Finished, Form, Sink, shown_s};
 use crate::environment::{ActionError, Environment, EpisodeSeed};
+use crate::rollout::Stand;
 use crate::trace::{Step, Trace};
 
 /// Why there are no pictures.
@@ -151,14 +152,21 @@ impl Scene<'_> {
         taken: &dyn Fn(),
     ) -> Result<Finished, FilmError> {
         let period_s = environment.control_period_s();
+        let speed = period_s / shown_s(period_s);
+        let note = if speed < 0.99 {
+            format!("slowed down to {speed:.2} of real time")
+        } else {
+            String::new()
+        };
         let caption = Caption {
             instruction: self.instruction,
             sub_tasks: environment.sub_tasks(),
             commanded: self.commanded,
-            trace: self.trace,
+            steps: self.trace.steps.len(),
             period_s,
-            speed: period_s / shown_s(period_s),
+            note: &note,
         };
+        let plans: Vec<u32> = self.trace.steps.iter().map(|step| step.plan).collect();
         let [width, height] = PICTURE;
         let mut canvas = Canvas::new(width, caption::HEAD + height + caption::FOOT);
         let mut sink = Sink::new(form, path, canvas.size(), period_s)?;
@@ -183,11 +191,29 @@ impl Scene<'_> {
         episode(environment, &mut |moment, environment| {
             go_on()?;
             canvas.paste(camera.shoot(environment)?, width, 0, caption::HEAD);
-            caption.draw(moment, &mut canvas);
+            let [_, bottom] = canvas.size();
+            caption.draw(self.progress(moment, &plans), bottom, &mut canvas);
             sink.add(&canvas, moment.step.is_none())?;
             taken();
             Ok(())
         })?;
         sink.finish()
+    }
+
+    /// How far the episode is at a moment, with the plans of all its control steps.
+    fn progress<'p>(&'p self, moment: Moment<'_>, plans: &'p [u32]) -> Progress<'p> {
+        let outcome = &self.trace.outcome;
+        let done = &outcome.completions;
+        let done_len = done.partition_point(|done| done.step <= moment.number);
+        let success = outcome.success;
+        Progress {
+            plans: plans.get(..moment.number).unwrap_or(plans),
+            completions: done.get(..done_len).unwrap_or(done),
+            stand: moment
+                .step
+                .map_or(Stand::Ended { success }, |step| Stand::Acting {
+                    plan: step.plan,
+                }),
+        }
     }
 }

@@ -58,6 +58,10 @@ pub struct Arguments {
     /// Write success rates and charts to this file as one HTML page (needs the cargo feature `report`)
     #[arg(long, value_name = "HTML")]
     pub report: Option<PathBuf>,
+    /// Open a window in which the policy runs at real time, one episode after the other (needs the cargo feature `viewer`, an X display and
+    /// EGL): mouse for the camera, keys to pause, step, change the speed and start again. Closing it ends the run with what was finished
+    #[arg(long, conflicts_with_all = ["uniform", "verify", "sweep", "replay", "encode", "report", "record"])]
+    pub viewer: bool,
     #[command(flatten)]
     pub language: LanguageArguments,
     #[command(flatten)]

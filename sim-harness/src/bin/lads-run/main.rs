@@ -15,6 +15,7 @@ mod recordings;
 mod report;
 mod sweep;
 mod verify;
+mod viewer;
 
 use std::fmt::Display;
 use std::path::Path;
@@ -121,11 +122,7 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
         episodes: arguments.episodes.unwrap_or(EPISODES),
         seed: arguments.seed,
         decision: decision(&policy, arguments.sample),
-        actor: if arguments.uniform {
-            Actor::Uniform
-        } else {
-            Actor::Policy
-        },
+        actor: actor(arguments),
         isa,
         threads,
         setup: Setup {
@@ -134,6 +131,7 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
             stop_where_refused: false,
             traced: traced(arguments),
             words: Some(&heard.words),
+            onlooker: None,
         },
     };
     if let Some(reference) = reference {
@@ -150,6 +148,7 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
         );
     }
     let recording = record::prepare(files, &evaluation, &open)?;
+    let viewer = viewer::prepare(arguments, &evaluation, &open)?;
     let bench = Bench {
         evaluation,
         open: &open,
@@ -161,7 +160,7 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
     if arguments.faults.sweep {
         return bench.sweep(arguments.json.as_deref());
     }
-    bench.rollouts(arguments, recording)
+    bench.rollouts(arguments, recording, viewer)
 }
 
 /// The level of the observation noise: what was asked for, else the reference's, else the environment's usual one.
@@ -171,6 +170,14 @@ fn noise<'a>(arguments: &'a Arguments, reference: Option<&'a Reference>, id: &st
         .or(reference.map(|reference| reference.noise.as_str()))
         .or(registry::default_noise(id))
         .unwrap_or("none")
+}
+
+fn actor(arguments: &Arguments) -> Actor {
+    if arguments.uniform {
+        Actor::Uniform
+    } else {
+        Actor::Policy
+    }
 }
 
 /// How many episodes of each instruction keep their control steps.
@@ -208,6 +215,14 @@ impl Bench<'_> {
         Ok((results, evaluated))
     }
 
+    /// The same in a window; the episodes that were finished when it was closed.
+    fn show(&self, viewer: viewer::Viewer) -> Result<(Results, Evaluated), End> {
+        let start = Instant::now();
+        let evaluated = viewer.evaluate(&self.evaluation, self.open, self.stop)?;
+        let results = self.sum_up(&self.evaluation, &evaluated, start.elapsed());
+        Ok((results, evaluated))
+    }
+
     /// All that was measured, summed up.
     fn sum_up(
         &self,
@@ -222,6 +237,7 @@ impl Bench<'_> {
         splits.extend(sentence.map(|sentence| sentence.known().split.to_owned()));
         let of_each = evaluation.assignments.iter().zip(&evaluated.episodes);
         let instructions: Vec<_> = of_each
+            .filter(|(_, episodes)| !episodes.is_empty())
             .filter_map(|(assignment, episodes)| {
                 let known = evaluation.instruction(assignment.instruction)?;
                 Some(InstructionResult::new(&known, watched, episodes))
@@ -273,9 +289,17 @@ impl Bench<'_> {
         &self,
         arguments: &Arguments,
         recording: Option<record::Recording>,
+        viewer: Option<viewer::Viewer>,
     ) -> Result<ExitCode, End> {
         let (files, policy) = (&arguments.recordings, &self.evaluation.policy);
-        let (mut results, evaluated) = self.run(self.evaluation.setup, "")?;
+        let (mut results, evaluated) = match viewer {
+            None => self.run(self.evaluation.setup, "")?,
+            Some(viewer) => self.show(viewer)?,
+        };
+        if evaluated.episodes.iter().all(Vec::is_empty) {
+            print(&"the window was closed before an episode ended: no results\n")?;
+            return Ok(ExitCode::SUCCESS);
+        }
         if files.monitor {
             let agreement = plans::agreement(policy, &evaluated.traces);
             results.plan_agreement = Some(
@@ -389,6 +413,7 @@ fn check_outputs(arguments: &Arguments) -> Result<(), End> {
     check_writable("--json", arguments.json.as_deref())?;
     report::check(arguments.report.as_deref())?;
     record::check(&arguments.recordings)?;
+    viewer::check(arguments)?;
     check_writable("--log", arguments.recordings.log.as_deref())?;
     for path in &arguments.certificate {
         check_writable("--certificate", Some(path))?;
@@ -406,7 +431,11 @@ fn check_numbers(arguments: &Arguments) -> Result<usize, End> {
         Some(0) => Err(refused(
             "--threads 0: nobody to run the episodes; give at least 1",
         )),
+        Some(threads) if threads > 1 && arguments.viewer => Err(refused(format!(
+            "--viewer --threads {threads}: a window shows one episode at a time; leave --threads out"
+        ))),
         Some(threads) => Ok(threads),
+        None if arguments.viewer => Ok(1),
         None => Ok(std::thread::available_parallelism().map_or(1, usize::from)),
     }
 }

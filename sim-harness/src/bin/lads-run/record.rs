@@ -2,8 +2,10 @@
 //!
 //! The place, ffmpeg and EGL are looked at before the first episode; filming follows after the last, and is renamed to its place at the end.
 
+#[cfg(all(feature = "record", feature = "report"))]
+pub use with::scene;
 #[cfg(feature = "record")]
-pub use with::{Recording, check, prepare, scene};
+pub use with::{Recording, check, prepare};
 #[cfg(not(feature = "record"))]
 pub use without::{Recording, check, prepare};
 

@@ -1,0 +1,139 @@
+//! `--viewer`.
+//!
+//! The display and EGL are looked at before the first episode. A window that is closed ends the run with what was finished.
+
+#[cfg(feature = "viewer")]
+pub use with::{Viewer, check, prepare};
+#[cfg(not(feature = "viewer"))]
+pub use without::{Viewer, check, prepare};
+
+#[cfg(feature = "viewer")]
+mod with {
+    use std::sync::atomic::{AtomicBool, Ordering};
+
+    use lads_sim::evaluate::{Evaluated, Evaluation, Setup};
+    use lads_sim::film::FilmError;
+    use lads_sim::registry::Opener;
+    use lads_sim::viewer::{self, Texts, Viewer as Window, ViewerError};
+
+    use crate::arguments::Arguments;
+    use crate::end::{End, refused};
+    use crate::{progress, unfinished};
+
+    /// Ready to show episodes.
+    pub struct Viewer {
+        window: Window,
+        texts: Texts,
+    }
+
+    fn about(error: ViewerError) -> End {
+        match error {
+            ViewerError::Picture(FilmError::Interrupted) => End::Interrupted,
+            error => refused(format!("--viewer: {error}")),
+        }
+    }
+
+    /// Whether there may be a display, before any work.
+    pub fn check(arguments: &Arguments) -> Result<(), End> {
+        if arguments.viewer {
+            viewer::check().map_err(about)?;
+        }
+        Ok(())
+    }
+
+    /// Connects to the display and opens a camera; `None` without `--viewer`.
+    pub fn prepare(
+        arguments: &Arguments,
+        evaluation: &Evaluation<'_>,
+        open: &Opener,
+    ) -> Result<Option<Viewer>, End> {
+        if !arguments.viewer {
+            return Ok(None);
+        }
+        let mut environment = open();
+        let window = Window::new(environment.as_mut()).map_err(about)?;
+        let instructions = evaluation.assignments.iter().filter_map(|assignment| {
+            let known = evaluation.instruction(assignment.instruction)?;
+            Some((assignment.instruction, known.text.to_owned()))
+        });
+        let texts = Texts {
+            instructions: instructions.collect(),
+            sub_tasks: environment.sub_tasks(),
+            episodes: evaluation.episodes,
+            period_s: environment.control_period_s(),
+        };
+        Ok(Some(Viewer { window, texts }))
+    }
+
+    impl Viewer {
+        /// Runs the episodes in view, one after the other; those that were finished when the window was closed.
+        pub fn evaluate(
+            self,
+            evaluation: &Evaluation<'_>,
+            open: &Opener,
+            stop: &AtomicBool,
+        ) -> Result<Evaluated, End> {
+            let bar = progress(evaluation.len());
+            let shown = self.window.run(&self.texts, stop, |onlooker| {
+                let setup = Setup {
+                    onlooker: Some(onlooker),
+                    ..evaluation.setup
+                };
+                let seen = Evaluation {
+                    setup,
+                    ..*evaluation
+                };
+                seen.run_until(open, stop, &|| bar.inc(1))
+            });
+            bar.finish_and_clear();
+            let evaluated = shown.map_err(about)?.map_err(unfinished)?;
+            let stopped = stop.load(Ordering::Relaxed);
+            (!stopped).then_some(evaluated).ok_or(End::Interrupted)
+        }
+    }
+}
+
+/// This program was built without a window.
+#[cfg(not(feature = "viewer"))]
+mod without {
+    use std::sync::atomic::AtomicBool;
+
+    use lads_sim::evaluate::{Evaluated, Evaluation};
+    use lads_sim::registry::Opener;
+
+    use crate::arguments::Arguments;
+    use crate::end::{End, refused};
+
+    /// There is none.
+    pub enum Viewer {}
+
+    /// Refuses.
+    pub fn check(arguments: &Arguments) -> Result<(), End> {
+        if !arguments.viewer {
+            return Ok(());
+        }
+        Err(refused(
+            "--viewer: this lads-run was built without a window; build it with \"cargo build --release -p lads-sim --features viewer\"",
+        ))
+    }
+
+    /// None: [`check`] has refused.
+    #[expect(
+        clippy::unnecessary_wraps,
+        reason = "with a window there may be no display"
+    )]
+    pub fn prepare(_: &Arguments, _: &Evaluation<'_>, _: &Opener) -> Result<Option<Viewer>, End> {
+        Ok(None)
+    }
+
+    impl Viewer {
+        pub fn evaluate(
+            self,
+            _: &Evaluation<'_>,
+            _: &Opener,
+            _: &AtomicBool,
+        ) -> Result<Evaluated, End> {
+            match self {}
+        }
+    }
+}

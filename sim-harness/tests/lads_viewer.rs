@@ -1,0 +1,166 @@
+//! `lads-run --viewer`: that a window changes nothing, and what is refused.
+//!
+//! The tests that open a window need the X server that needs no screen (Xvfb), and EGL; without them they are skipped with a printed line.
+#![cfg(feature = "viewer")]
+
+#[path = "common/interrupt.rs"]
+mod interrupt;
+
+use std::fs;
+use std::io::{BufRead as _, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+fn lads_run(model: &str, arguments: &[&str]) -> Command {
+    let model = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../models")
+        .join(model);
+    let mut command = Command::new(env!("CARGO_BIN_EXE_lads-run"));
+    command.arg("--model").arg(model).args(arguments);
+    command.env_remove("DISPLAY");
+    command
+}
+
+/// An X server in memory, until it is dropped.
+struct Display {
+    server: Child,
+    name: String,
+}
+
+impl Display {
+    /// `None`, after a line, where there is none to be had.
+    fn open() -> Option<Self> {
+        let server = Command::new("Xvfb")
+            .args(["-displayfd", "1", "-screen", "0", "1024x768x24"])
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn();
+        let Ok(mut server) = server else {
+            println!("skipped: no display, because Xvfb is not installed");
+            return None;
+        };
+        // It says its number when it is ready.
+        let mut number = String::new();
+        let mut says = BufReader::new(server.stdout.take().unwrap());
+        says.read_line(&mut number).unwrap();
+        let name = format!(":{}", number.trim());
+        Some(Self { server, name })
+    }
+}
+
+impl Drop for Display {
+    fn drop(&mut self) {
+        let _ = self.server.kill();
+        let _ = self.server.wait();
+    }
+}
+
+/// Whether this machine lacks what pictures need, which is then said.
+fn lacks_egl(errors: &str) -> bool {
+    let lacks = errors.contains("by EGL");
+    if lacks {
+        println!("skipped: {errors}");
+    }
+    lacks
+}
+
+/// What ran, without measured times.
+fn runs(json: &Path) -> Value {
+    let results: Value = serde_json::from_str(&fs::read_to_string(json).unwrap()).unwrap();
+    results["instructions"].clone()
+}
+
+/// Exit code 2 and one line with all `parts`.
+fn assert_refused(output: &Output, parts: &[&str]) {
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{errors}");
+    assert_eq!(errors.lines().count(), 1, "{errors}");
+    for part in parts {
+        assert!(errors.contains(part), "{part}: {errors}");
+    }
+}
+
+#[test]
+fn an_episode_is_the_same_in_a_window() {
+    let Some(display) = Display::open() else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let [plain, seen] = ["plain.json", "seen.json"].map(|name| folder.path().join(name));
+    for (model, instruction) in [("lorel.onnx", "open drawer"), ("kitchen.onnx", "kbls")] {
+        let arguments = ["--instruction", instruction, "--episodes", "1", "--json"];
+        let output = lads_run(model, &arguments)
+            .arg(&seen)
+            .arg("--viewer")
+            .env("DISPLAY", &display.name)
+            .output()
+            .unwrap();
+        let errors = String::from_utf8_lossy(&output.stderr);
+        if lacks_egl(&errors) {
+            return;
+        }
+        assert!(output.status.success(), "{errors}");
+        let output = lads_run(model, &arguments).arg(&plain).output().unwrap();
+        assert!(output.status.success());
+        let [plain, seen] = [&plain, &seen].map(|json| runs(json));
+        assert_eq!(plain, seen, "{model}");
+        assert!(plain[0]["runs"][0]["steps"].as_u64() > Some(0));
+    }
+}
+
+#[test]
+fn an_interrupt_closes_the_window() {
+    let Some(display) = Display::open() else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = lads_run("kitchen.onnx", &["--viewer", "--episodes", "9", "--json"]);
+    command.arg(folder.path().join("r.json"));
+    command.env("DISPLAY", &display.name);
+    // In the first of many episodes at real time, however slow the machine is.
+    let start = Instant::now();
+    let shown = || start.elapsed() > Duration::from_secs(4);
+    let (code, errors) = interrupt::when(&mut command, &shown).unwrap();
+    if lacks_egl(&errors) {
+        return;
+    }
+    assert_eq!(code, Some(130), "{errors}");
+    assert!(errors.contains("nothing was written"), "{errors}");
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+}
+
+#[test]
+fn without_a_display_one_line_names_the_remedy() {
+    let run = |display: &str| {
+        let mut command = lads_run("kitchen.onnx", &["--viewer"]);
+        command.env("DISPLAY", display).output().unwrap()
+    };
+    let none = ["--viewer: no display", "set DISPLAY", "--record"];
+    let output = lads_run("kitchen.onnx", &["--viewer"]).output().unwrap();
+    assert_refused(&output, &none);
+    assert_refused(&run(""), &none);
+    // Where no machine listens.
+    let parts = ["no window can be opened on display /none:0", "set DISPLAY"];
+    assert_refused(&run("/none:0"), &parts);
+}
+
+#[test]
+fn what_contradicts_a_window_is_refused_by_name() {
+    for other in [
+        &["--verify"][..],
+        &["--sweep"],
+        &["--uniform"],
+        &["--replay", "a.mcap"],
+        &["--encode", "a.mcap"],
+        &["--report", "a.html"],
+        &["--record", "a.gif"],
+    ] {
+        let output = lads_run("kitchen.onnx", other).arg("--viewer").output();
+        assert_refused(&output.unwrap(), &["--viewer", other[0]]);
+    }
+    let output = lads_run("kitchen.onnx", &["--viewer", "--threads", "2"]).output();
+    assert_refused(&output.unwrap(), &["--viewer --threads 2", "leave"]);
+}
