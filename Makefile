@@ -67,7 +67,7 @@ test-rust: setup
 
 # Tests of what has unsafe code or untrusted input, in a build with AddressSanitizer, whose run-time library comes with the toolchain,
 # and under valgrind, which also sees the use of memory that was never written. Debug assertions and the checks of the preconditions of
-# unsafe functions are on in both. valgrind has no AVX-512, and its processor does not flush subnormal numbers.
+# unsafe functions are on in both. valgrind has no AVX-512 and does not flush subnormal numbers; sweeps of safe arithmetic take it too long.
 HOST = $(shell rustc --print host-tuple)
 SANITIZED = --target $(HOST) --tests -p lads-kernels -p lads-core
 BOUNDARY = --target $(HOST) -p lads-ffi --test abi
@@ -78,7 +78,7 @@ sanitize: export RUSTC_BOOTSTRAP = 1
 sanitize:
 	RUSTFLAGS=-Zsanitizer=address cargo test --target-dir target/sanitize $(SANITIZED)
 	RUSTFLAGS=-Zsanitizer=address cargo test --target-dir target/sanitize $(BOUNDARY)
-	$(MEMCHECK) cargo test --target-dir target/sanitize/plain $(SANITIZED) -- --skip subnormal_numbers_are_zero
+	$(MEMCHECK) cargo test --target-dir target/sanitize/plain $(SANITIZED) -- --skip subnormal_numbers_are_zero --skip as_exact_as
 	$(MEMCHECK) cargo test --target-dir target/sanitize/plain $(BOUNDARY)
 
 # The stamp makes the environment anew whenever the package's pins change.
