@@ -70,7 +70,7 @@ test-rust: setup
 # unsafe functions are on in both. valgrind has no AVX-512 and does not flush subnormal numbers; sweeps of safe arithmetic take it too long.
 HOST = $(shell rustc --print host-tuple)
 SANITIZED = --target $(HOST) --tests -p lads-kernels -p lads-core
-BOUNDARY = --target $(HOST) -p lads-ffi --test abi
+BOUNDARY = --target $(HOST) -p lads-ffi --test abi --test refusals
 MEMCHECK = CARGO_TARGET_$(shell echo $(HOST) | tr a-z- A-Z_)_RUNNER="valgrind --quiet --error-exitcode=99" PROPTEST_CASES=8
 
 ## sanitize: the tests of kernels, core and C boundary with AddressSanitizer, then under valgrind; some minutes
