@@ -1,86 +1,17 @@
-//! The controller against the naive model, and the rules of its calls.
+//! The rules of the calls of a controller.
 
 mod support;
 
 use lads_core::image::{Beyond, DecisionRule, ProgramKind};
 use lads_core::{
     ActError, Controller, Decision, Element, EncodeError, Instruction, InstructionError, Interval,
-    Isa, PlanIndex, Policy, StepError, Workspace,
+    PlanIndex, Policy, StepError,
 };
 use support::assemble::{parts, with_golden};
 use support::{Image, Memory, Model, Random, Spec};
 
 fn tiny() -> Model {
     Model::random(Spec::TINY, 11)
-}
-
-/// Runs an episode beside the naive model and returns the largest difference of an action.
-fn compare(model: &Model, words: &[f32], steps: usize, controller: &mut Controller) -> f64 {
-    let spec = model.spec;
-    let mut random = Random(99);
-    let (mut observations, mut actions) = (Vec::new(), Vec::new());
-    let mut plan = 0;
-    let mut largest = 0.0_f64;
-    for step in 0..steps {
-        let t = step % spec.steps;
-        if t == 0 {
-            observations.clear();
-            actions.clear();
-        }
-        observations.push(random.vec(spec.observation_len, 1.0));
-        let mut action = vec![0.0; spec.action_len];
-        let report = controller
-            .step(&observations[t], &mut action)
-            .expect("the step is sound");
-        assert_eq!(report.timestep as usize, t);
-        assert_eq!(report.decided, t.is_multiple_of(spec.horizon));
-        if report.decided {
-            let logits = model.logits(words, &observations, &actions);
-            for (&logit, expected) in controller.logits().iter().zip(&logits) {
-                assert!(
-                    (f64::from(logit) - expected).abs() < 1e-4,
-                    "step {step}: {logit} against {expected}"
-                );
-            }
-            let mut sorted = logits.clone();
-            sorted.sort_by(|a, b| b.total_cmp(a));
-            assert!((f64::from(report.margin) - (sorted[0] - sorted[1])).abs() < 2e-4);
-            plan = logits
-                .iter()
-                .position(|&logit| logit == sorted[0])
-                .expect("one is the largest");
-        }
-        assert_eq!(report.plan, PlanIndex(plan as u32), "step {step}");
-        for (&got, expected) in action.iter().zip(model.act(&observations[t], plan)) {
-            largest = largest.max((f64::from(got) - expected).abs());
-        }
-        actions.push(action);
-    }
-    largest
-}
-
-#[test]
-fn an_episode_equals_the_naive_model() {
-    let model = tiny();
-    let image = parts(&model).image();
-    let policy = image.policy();
-    let mut memory = Memory::for_policy(&policy);
-    let mut controller = memory.controller(&policy);
-    for (id, words) in model.instructions.iter().enumerate() {
-        controller
-            .set_instruction(Instruction::Id(id as u32))
-            .expect("the instruction is known");
-        let largest = compare(&model, words, model.spec.steps, &mut controller);
-        assert!(largest < 1e-5, "actions differ by {largest}");
-    }
-    // Words of our own, fewer than the longest instruction; the second episode starts from a reset.
-    let words = Random(4).vec(model.spec.word_dim, 1.0);
-    controller
-        .set_instruction(Instruction::Words(&words))
-        .expect("one word is enough");
-    compare(&model, &words, 5, &mut controller);
-    controller.reset();
-    compare(&model, &words, 5, &mut controller);
 }
 
 #[test]
@@ -134,44 +65,6 @@ fn the_low_level_alone_repeats_the_step_and_disturbs_nothing() {
         controller.act(&broken, PlanIndex(0), &mut alone),
         Err(ActError::NotFinite { index: 0 })
     );
-}
-
-#[test]
-fn a_full_context_restarts_behind_the_words() {
-    let model = tiny();
-    let image = parts(&model).image();
-    let policy = image.policy();
-    let mut memory = Memory::for_policy(&policy);
-    let mut controller = memory.controller(&policy);
-    controller
-        .set_instruction(Instruction::Id(1))
-        .expect("the instruction is known");
-    let largest = compare(
-        &model,
-        &model.instructions[1],
-        3 * model.spec.steps + 2,
-        &mut controller,
-    );
-    assert!(largest < 1e-5, "actions differ by {largest}");
-}
-
-#[test]
-fn the_sizes_of_kitchen_equal_the_naive_model() {
-    let spec = Spec {
-        steps: 12,
-        horizon: 5,
-        ..Spec::KITCHEN
-    };
-    let model = Model::random(spec, 3);
-    let image = parts(&model).image();
-    let policy = image.policy();
-    let mut memory = Memory::for_policy(&policy);
-    let mut controller = memory.controller(&policy);
-    controller
-        .set_instruction(Instruction::Id(0))
-        .expect("the instruction is known");
-    let largest = compare(&model, &model.instructions[0], 12, &mut controller);
-    assert!(largest < 2e-5, "actions differ by {largest}");
 }
 
 #[test]
@@ -376,33 +269,6 @@ fn what_was_executed_goes_into_the_context() {
 }
 
 #[test]
-fn the_executed_action_reaches_the_naive_model_too() {
-    let model = tiny();
-    let image = parts(&model).image();
-    let policy = image.policy();
-    let mut memory = Memory::for_policy(&policy);
-    let mut controller = memory.controller(&policy);
-    controller
-        .set_instruction(Instruction::Id(0))
-        .expect("the instruction is known");
-    let mut random = Random(8);
-    let observations: Vec<_> = (0..4).map(|_| random.vec(3, 1.0)).collect();
-    let executed: Vec<_> = (0..3).map(|_| random.vec(2, 1.0)).collect();
-    for (t, observation) in observations.iter().enumerate() {
-        controller
-            .step(observation, &mut [0.0; 2])
-            .expect("the step is sound");
-        if let Some(action) = executed.get(t) {
-            controller.executed(action).expect("the action is sound");
-        }
-    }
-    let expected = model.logits(&model.instructions[0], &observations, &executed);
-    for (&got, expected) in controller.logits().iter().zip(expected) {
-        assert!((f64::from(got) - expected).abs() < 1e-4);
-    }
-}
-
-#[test]
 fn sampling_is_a_function_of_the_seed() {
     let image = parts(&tiny()).image();
     let sample = |seed| {
@@ -520,122 +386,6 @@ fn demonstrations_are_encoded_to_the_nearest_plan() {
     let mut memory = Memory::for_policy(&policy);
     let refused = memory.controller(&policy).encode(&[0.0; 9], &[0.0; 6]);
     assert_eq!(refused, Err(EncodeError::NoEncoder));
-}
-
-#[test]
-fn a_workspace_one_element_too_small_is_refused() {
-    let image = parts(&tiny()).image();
-    let policy = image.policy();
-    let (arena_len, state_len) = (policy.arena_len(), policy.state_len());
-    let attempt = |arena: usize, state: usize| {
-        let (mut arena, mut state) = (vec![0.0; arena], vec![0.0; state]);
-        Workspace::new(&policy, &mut arena, &mut state)
-            .map(|_| ())
-            .map_err(|e| (e.got, e.needed))
-    };
-    assert_eq!(attempt(arena_len, state_len), Ok(()));
-    assert_eq!(attempt(arena_len + 3, state_len + 5), Ok(()));
-    assert_eq!(
-        attempt(arena_len - 1, state_len),
-        Err((arena_len - 1, arena_len))
-    );
-    assert_eq!(
-        attempt(arena_len, state_len - 1),
-        Err((state_len - 1, state_len))
-    );
-    assert_eq!(attempt(0, 0), Err((0, arena_len)));
-}
-
-#[test]
-fn a_workspace_of_another_policy_is_refused_by_the_calls() {
-    let (small, large) = (
-        parts(&tiny()).image(),
-        parts(&Model::random(
-            Spec {
-                steps: 3,
-                ..Spec::KITCHEN
-            },
-            1,
-        ))
-        .image(),
-    );
-    for (lender, user) in [(&small, &large), (&large, &small)] {
-        let (lender, user) = (lender.policy(), user.policy());
-        let mut memory = Memory::for_policy(&lender);
-        let workspace = Workspace::new(&lender, &mut memory.arena, &mut memory.state)
-            .expect("the memory suffices");
-        let mut controller = Controller::new(user, workspace);
-        let told = controller.set_instruction(Instruction::Id(0));
-        let (o, a) = (
-            user.contract().observation_len(),
-            user.contract().action_len(),
-        );
-        let stepped = controller.step(&vec![0.0; o], &mut vec![0.0; a]);
-        assert!(told.is_err() || stepped.is_err());
-        assert!(stepped.is_err());
-    }
-}
-
-/// One kitchen-sized episode, bit for bit.
-#[test]
-fn every_instruction_set_gives_the_same_actions() {
-    let image = parts(&Model::random(Spec::KITCHEN, 5)).image();
-    let policy = image.policy();
-    let episode = |isa: Isa| {
-        let mut memory = Memory::for_policy(&policy);
-        let workspace = Workspace::new(&policy, &mut memory.arena, &mut memory.state)
-            .expect("the memory suffices");
-        let mut controller = Controller::with_isa(policy, workspace, isa);
-        assert_eq!(controller.isa(), isa);
-        controller
-            .set_instruction(Instruction::Id(0))
-            .expect("there is one");
-        let mut random = Random(7);
-        let mut bits = Vec::new();
-        for _ in 0..50 {
-            let observation = random.vec(policy.contract().observation_len(), 1.0);
-            let mut action = vec![0.0; policy.contract().action_len()];
-            let report = controller
-                .step(&observation, &mut action)
-                .expect("within limits");
-            bits.push(report.margin.to_bits());
-            bits.extend(
-                action
-                    .iter()
-                    .chain(controller.logits())
-                    .map(|x| x.to_bits()),
-            );
-        }
-        bits
-    };
-    let portable = episode(Isa::portable());
-    for isa in Isa::all() {
-        assert_eq!(episode(isa), portable, "{isa:?}");
-    }
-    let mut memory = Memory::for_policy(&policy);
-    assert_eq!(memory.controller(&policy).isa(), Isa::detect());
-}
-
-#[test]
-fn what_lies_in_the_memory_beforehand_does_not_matter() {
-    let image = parts(&tiny()).image();
-    let policy = image.policy();
-    let run = |fill: f32| {
-        let mut memory = Memory {
-            arena: vec![fill; policy.arena_len()],
-            state: vec![fill; policy.state_len()],
-        };
-        let mut controller = memory.controller(&policy);
-        controller
-            .set_instruction(Instruction::Id(1))
-            .expect("the instruction is known");
-        let mut action = [0.0; 2];
-        (0..9)
-            .map(|_| controller.step(&[0.2; 3], &mut action).map(|_| action))
-            .collect::<Vec<_>>()
-    };
-    assert_eq!(run(0.0), run(f32::NAN));
-    assert_eq!(run(0.0), run(1e30));
 }
 
 #[test]
