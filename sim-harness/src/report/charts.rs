@@ -30,6 +30,9 @@ const HALF: f64 = 560.0;
 /// Width of a chart that has a row to itself.
 const WHOLE: f64 = 900.0;
 
+/// How much larger than it was laid out a chart may be shown.
+const ENLARGED: f64 = 1.3;
+
 /// A picture.
 pub struct Chart {
     /// Its SVG text.
@@ -41,8 +44,9 @@ pub struct Chart {
 fn chart(plots: Vec<Plot>, layout: Layout) -> Chart {
     let (width, height) = (layout.width.unwrap_or(HALF), layout.height.unwrap_or(HALF));
     let svg = kuva::render_to_svg(plots, layout);
-    // With it, the page may show the picture in any size.
-    let scalable = format!("<svg viewBox=\"0 0 {width} {height}\" ");
+    // With it, the page may show the picture in any size, but letters no larger than the page's.
+    let widest = ENLARGED * width;
+    let scalable = format!("<svg viewBox=\"0 0 {width} {height}\" style=\"max-width:{widest}px\" ");
     Chart {
         svg: svg.replacen("<svg ", &scalable, 1),
         wide: width > HALF,
@@ -192,7 +196,11 @@ pub fn start_distributions(report: &Report<'_>) -> Vec<Chart> {
         .iter()
         .map(|(&i, row)| (id(i), row.clone()))
         .collect();
-    let mut charts = heat_map("first decision", rows, report.contract.codebook_len());
+    let mut charts = heat_map(
+        "first decision: mean probability",
+        rows,
+        report.contract.codebook_len(),
+    );
     let words = |i: u32| -> Vec<&str> {
         let known = report.contract.instruction(i as usize);
         known.map_or(Vec::new(), |known| {
@@ -298,9 +306,10 @@ pub fn gripper(report: &Report<'_>) -> Vec<Chart> {
                 .with_data(way)
                 .with_color(color)
                 .with_size(2.0)
-                .with_x_label("x")
-                .with_y_label("y")
-                .with_z_label("z")
+                .with_x_label("x (m)")
+                .with_y_label("y (m)")
+                .with_z_label("z (m)")
+                .with_grid_lines(3)
                 .with_legend(format!("plan {plan}"));
             Some(plot.into())
         })
@@ -355,9 +364,9 @@ pub fn heat_maps(report: &Report<'_>) -> Vec<Chart> {
             .map(|(name, row)| (name, share(row)))
             .collect()
     };
-    let mut charts = heat_map("plan by word", shares(by_word), size);
+    let mut charts = heat_map("plan by word: share of decisions", shares(by_word), size);
     charts.extend(heat_map(
-        "plan by completed sub-task",
+        "plan by completed sub-task: share of completions",
         shares(by_task),
         size,
     ));
@@ -373,6 +382,14 @@ fn count(rows: &mut BTreeMap<String, Vec<f64>>, name: &str, plan: u32, size: usi
     }
 }
 
+/// The next number from `value` upwards that is easy to read: 1, 2, 2.5 or 5 times a power of ten.
+fn round_up(value: f64) -> f64 {
+    let power = 10_f64.powf(value.max(f64::MIN_POSITIVE).log10().floor());
+    let easy = [1.0, 2.0, 2.5, 5.0].map(|step| step * power);
+    let next = easy.into_iter().find(|&easy| easy >= value);
+    next.unwrap_or(10.0 * power)
+}
+
 /// All control steps by duration.
 pub fn latency(report: &Report<'_>) -> Vec<Chart> {
     let steps = report.traces.iter().flat_map(|trace| &trace.steps);
@@ -381,9 +398,14 @@ pub fn latency(report: &Report<'_>) -> Vec<Chart> {
         .map(|s| s.controller_ns as f64 / 1e3)
         .collect();
     all.sort_by(f64::total_cmp);
-    let Some(&edge) = all.get(all.len().saturating_sub(1) * 99 / 100) else {
+    let quantile = |percent: usize| all.get(all.len().saturating_sub(1) * percent / 100);
+    let (Some(&usual), Some(&most)) = (quantile(50), quantile(99)) else {
         return Vec::new();
     };
+    // A machine that does other work has steps that are hundreds of times slower; the usual ones are what there is to see.
+    let edge = 4.0 * round_up(most.min(8.0 * usual) / 4.0);
+    let beyond = all.iter().filter(|&&us| us > edge).count();
+    let title = format!("{beyond} of {} steps lie beyond the right edge", all.len());
     let of_kind = |decided: bool, name: &str, color: &str| -> Plot {
         let of_kind = steps.clone().filter(|step| step.decided == decided);
         let durations = of_kind.map(|step| step.controller_ns as f64 / 1e3);
@@ -399,8 +421,20 @@ pub fn latency(report: &Report<'_>) -> Vec<Chart> {
         of_kind(false, "ordinary step", COLORS[5]),
         of_kind(true, "decision step", COLORS[1]),
     ];
-    let layout = sized(&plots, "", WHOLE, 340.0)
-        .with_x_label("µs")
+    let layout = sized(&plots, &title, WHOLE, 340.0)
+        .with_x_label("duration (µs)")
         .with_y_label("control steps");
     vec![chart(plots, layout)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::round_up;
+
+    #[test]
+    fn numbers_are_rounded_up_to_easy_ones() {
+        for (value, easy) in [(1051.6, 2000.0), (80.0, 100.0), (0.21, 0.25), (5.0, 5.0)] {
+            assert!((round_up(value) - easy).abs() < 1e-9 * easy, "{value}");
+        }
+    }
 }

@@ -200,7 +200,7 @@ impl Report<'_> {
             ),
             figure(
                 "Latency of the controller",
-                "All control steps, in microseconds, measured while all threads ran. The slowest 1 % are beyond the right edge.",
+                "All control steps, in microseconds, measured while all threads ran.",
                 charts::latency(self),
             ),
         ];
