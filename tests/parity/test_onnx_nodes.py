@@ -18,7 +18,7 @@ from onnx import numpy_helper  # noqa: E402
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 # The Makefile's: with another one cargo would build tract once more.
-SELECTION = ("--workspace", "--features", "lads-sim/report,lads-sim/record,lads-sim/language")
+SELECTION = ("--workspace", "--features", "lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language")
 # The newest operator set that the compiler reads.
 OPSET = 21
 

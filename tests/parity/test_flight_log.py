@@ -1,0 +1,75 @@
+"""A flight log is a file that others read: MCAP's own reader with its checksums, and a JSON Schema validator, which know nothing of lads.
+
+Run with `python -m pytest tests/parity` in the exporter's environment, after `cargo build -p lads-sim`. Skipped where either is missing.
+"""
+
+import collections
+import json
+import os
+import pathlib
+import subprocess
+
+import pytest
+
+reader = pytest.importorskip("mcap.reader")
+jsonschema = pytest.importorskip("jsonschema")
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
+PROGRAM = TARGET / "debug/lads-run"
+# Of every control step.
+STEPS = ("/observation", "/action", "/plan", "/timing", "/gripper")
+
+
+@pytest.fixture(params=[("kitchen", "kbls"), ("lorel", "open drawer")], ids=lambda case: case[0])
+def flight(request, tmp_path):
+    """-> the results, the log."""
+    if not PROGRAM.is_file():
+        pytest.skip("lads-run is not built: run `cargo build -p lads-sim`")
+    model, instruction = request.param
+    log, results = tmp_path / "flight.mcap", tmp_path / "results.json"
+    command = [PROGRAM, "--model", ROOT / f"models/{model}.onnx", "--instruction", instruction, "--episodes", "2"]
+    done = subprocess.run([*command, "--log", log, "--json", results], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return json.loads(results.read_text()), log
+
+
+def test_a_log_is_what_mcap_and_json_schema_say(flight):
+    results, log = flight
+    (instruction,) = results["instructions"]
+    runs = instruction["runs"]
+    count, times = collections.Counter(), collections.defaultdict(list)
+    plans, completed = [], []
+    with log.open("rb") as file:
+        source = reader.make_reader(file, validate_crcs=True)
+        for schema, channel, message in source.iter_messages(log_time_order=False):
+            # What Foxglove asks of JSON: a schema of an object, and arrays whose items have one type.
+            assert (channel.message_encoding, schema.encoding) == ("json", "jsonschema")
+            rules, value = json.loads(schema.data), json.loads(message.data)
+            jsonschema.Draft7Validator.check_schema(rules)
+            assert rules["type"] == "object" and schema.name.startswith("lads.")
+            for field in rules["properties"].values():
+                assert field["description"] and (field["type"] != "array" or isinstance(field["items"], dict))
+            # The words of a sentence outside the table are the one field that may be missing.
+            required = [name for name in rules["properties"] if name != "words"]
+            jsonschema.validate(value, rules | {"additionalProperties": False, "required": required})
+            count[channel.topic] += 1
+            times[channel.topic].append(message.log_time)
+            if channel.topic == "/plan" and value["decided"]:
+                plans.append(value["index"])
+            if channel.topic == "/completion":
+                completed.append(value["sub_task"])
+        statistics = source.get_summary().statistics
+        about = {entry.name: entry.metadata for entry in source.iter_metadata()}["lads"]
+    assert statistics.message_count == sum(count.values())
+    steps = sum(run["steps"] for run in runs)
+    assert {topic: count[topic] for topic in STEPS} == dict.fromkeys(STEPS, steps)
+    assert count["/episode"] == len(runs) == 2
+    assert plans == [plan for run in runs for plan in run["plans"]] and count["/logits"] == len(plans)
+    assert completed == [done["sub_task"] for run in runs for done in run["completions"]]
+    assert all(row == sorted(row) for row in times.values()), "time goes on"
+    # A player shows the episode as fast as it was.
+    period = float(about["control_period_s"])
+    first = [later - earlier for earlier, later in zip(times["/action"], times["/action"][1:], strict=False)][: runs[0]["steps"] - 1]
+    assert all(abs(gap / 1e9 - period) < 1e-6 for gap in first)
+    assert about["bundle_sha256"] == results["bundle_sha256"]
