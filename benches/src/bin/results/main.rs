@@ -51,9 +51,9 @@ impl Effort {
     const FULL: Self = Self {
         hot_rounds: 60,
         recompute_rounds: 6,
-        paced_rounds: 40,
-        paced_all_rounds: 6,
-        load_rounds: 8,
+        paced_rounds: 110,
+        paced_all_rounds: 10,
+        load_rounds: 16,
         context_rounds: 6,
         growth_rounds: 8,
         processes: 15,
