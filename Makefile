@@ -122,6 +122,8 @@ $(VENV)/bench-stamp: $(VENV)/stamp
 ## bench: everything measured, beside what one would use instead, into benches/RESULTS.md; on a quiet machine, ten minutes after the build
 bench: setup $(VENV)/bench-stamp
 	$(PYTHON) benches/setup.py
+	# What an earlier run has left is not of this one.
+	rm -rf target/criterion
 	cargo bench -p lads-benches --benches -- --noplot --warm-up-time 0.3 --measurement-time 1
 	cargo build --profile bench -p lads-benches --features results
 	target/release/results $(BENCH_ARGS)
