@@ -1,5 +1,7 @@
 //! lads itself as a contender.
 
+use lads_core::image::ProgramKind;
+use lads_core::op::Op;
 use lads_core::{Controller, Instruction, PlanIndex};
 
 use crate::clock::Pace;
@@ -24,10 +26,16 @@ impl<'c, 'a, 'm> Lads<'c, 'a, 'm> {
         episode: &'c Episode,
     ) -> Self {
         let (isa, version) = (controller.isa().name(), env!("CARGO_PKG_VERSION"));
+        let step = controller.policy().program(ProgramKind::StepRecord);
+        let format = |op| match op {
+            Op::Attention(op) => Some(op.format),
+            _ => None,
+        };
+        let cache = step.ops().find_map(format).unwrap_or_default().name();
         let action = vec![0.0; controller.policy().contract().action_len()];
         Self {
             name: format!("lads {weights}"),
-            detail: format!("{version}, {weights} weights, {isa}"),
+            detail: format!("{version}, {weights} weights, {cache} cache, {isa}"),
             controller,
             episode,
             action,

@@ -5,23 +5,17 @@
 
 #[path = "common/interrupt.rs"]
 mod interrupt;
+#[path = "common/lads_run.rs"]
+mod program;
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+use program::lads_run;
 use serde_json::Value;
 
 const DRAWER: [&str; 5] = ["--instruction", "open drawer", "--episodes", "2", "--json"];
-
-fn lads_run(model: &str, arguments: &[&str]) -> Command {
-    let model = Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("../models")
-        .join(model);
-    let mut command = Command::new(env!("CARGO_BIN_EXE_lads-run"));
-    command.arg("--model").arg(model).args(arguments);
-    command
-}
 
 /// Records; `None`, after a line, where there is no EGL.
 fn recorded(model: &str, arguments: &[&str], out: &Path) -> Option<Output> {

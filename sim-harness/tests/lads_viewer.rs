@@ -5,6 +5,8 @@
 
 #[path = "common/interrupt.rs"]
 mod interrupt;
+#[path = "common/lads_run.rs"]
+mod program;
 
 use std::fs;
 use std::io::{BufRead as _, BufReader};
@@ -14,12 +16,9 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
+/// Without the display of whoever runs the tests.
 fn lads_run(model: &str, arguments: &[&str]) -> Command {
-    let model = Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("../models")
-        .join(model);
-    let mut command = Command::new(env!("CARGO_BIN_EXE_lads-run"));
-    command.arg("--model").arg(model).args(arguments);
+    let mut command = program::lads_run(model, arguments);
     command.env_remove("DISPLAY");
     command
 }

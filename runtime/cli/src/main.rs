@@ -224,15 +224,20 @@ fn run(command: Command) -> Result<(), Refusal> {
 }
 
 fn weight_format(name: &str) -> Result<WeightFormat, String> {
-    let known = WeightFormat::ALL;
-    let found = known.into_iter().find(|format| format.name() == name);
-    found.ok_or_else(|| format!("known are {}", known.map(WeightFormat::name).join(", ")))
+    named(name, WeightFormat::ALL, WeightFormat::name)
 }
 
 fn cache_format(name: &str) -> Result<CacheFormat, String> {
-    let known = CacheFormat::ALL;
-    let found = known.into_iter().find(|format| format.name() == name);
-    found.ok_or_else(|| format!("known are {}", known.map(CacheFormat::name).join(", ")))
+    named(name, CacheFormat::ALL, CacheFormat::name)
+}
+
+fn named<T: Copy, const N: usize>(
+    name: &str,
+    known: [T; N],
+    name_of: fn(T) -> &'static str,
+) -> Result<T, String> {
+    let found = known.into_iter().find(|&format| name_of(format) == name);
+    found.ok_or_else(|| format!("known are {}", known.map(name_of).join(", ")))
 }
 
 fn tolerance(text: &str) -> Result<f32, String> {

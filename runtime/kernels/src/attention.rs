@@ -73,10 +73,15 @@ impl Attention<'_> {
         let mut qs = q.chunks(self.q_stride.max(1));
         let mut visible = self.visible;
         for y in y.chunks_mut((TOGETHER * width).max(1)) {
-            let (y0, y1) = y.split_at_mut(width.min(y.len()));
-            let queries = if y1.is_empty() { 1 } else { TOGETHER };
-            let q = [qs.next().unwrap_or(&[]), qs.next().unwrap_or(&[])];
-            let q = q.map(|q| q.get(..width).unwrap_or(&[]));
+            let queries = y.len().checked_div(width).unwrap_or(0);
+            let q = [qs.next(), qs.next()].map(|q| q.and_then(|q| q.get(..width)).unwrap_or(&[]));
+            // A slice that is too short.
+            let Some((y0, y1)) = y.split_at_mut_checked(width) else {
+                return;
+            };
+            if q.iter().take(queries).any(|q| q.is_empty()) {
+                return;
+            }
             // The rows that the last query sees; earlier ones have weight zero there, and cache rows beyond are never read.
             let rows = visible + queries - 1;
             // Scores of a query and head take whole blocks, of which the last may reach beyond the visible rows.

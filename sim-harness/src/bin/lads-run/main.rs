@@ -24,11 +24,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use arguments::{Arguments, IsaName};
+use arguments::Arguments;
 use end::{End, check_writable, print, refused, unwritable};
 use indicatif::{ProgressBar, ProgressStyle};
 use lads_compiler::{Bundle, Memory};
-use lads_core::{Contract, Decision, Isa, Policy};
+use lads_core::{Contract, Decision, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Setup};
 use lads_sim::faults::Faults;
@@ -65,7 +65,7 @@ fn main() -> ExitCode {
 fn run(arguments: &Arguments) -> Result<ExitCode, End> {
     let stop = stop_on_interrupt()?;
     let threads = check_numbers(arguments)?;
-    let isa = isa(arguments.isa)?;
+    let isa = program::isa(arguments.isa)?;
     check_outputs(arguments)?;
     let reference = verify::reference(arguments)?;
 
@@ -342,21 +342,6 @@ impl Bench<'_> {
         }
         Ok(ExitCode::SUCCESS)
     }
-}
-
-/// The instructions that were asked for, if this CPU has them.
-fn isa(name: Option<IsaName>) -> Result<Isa, End> {
-    let Some(name) = name else {
-        return Ok(Isa::detect());
-    };
-    let name = format!("{name:?}").to_lowercase();
-    Isa::all().find(|isa| isa.name() == name).ok_or_else(|| {
-        let offered: Vec<_> = Isa::all().map(Isa::name).collect();
-        refused(format!(
-            "--isa {name}: this CPU does not have it; it has {}",
-            offered.join(", ")
-        ))
-    })
 }
 
 /// Refuses plans that leave an episode without any.

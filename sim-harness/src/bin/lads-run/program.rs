@@ -1,13 +1,14 @@
-//! The program image that runs: compiled from the bundle just now, or an image that was compiled before and is to be tried or verified.
+//! The program image that runs, compiled from the bundle just now or before, and the instructions that its kernels run on.
 //!
-//! What can fail: a bundle that does not compile; an image that cannot be read, is broken or is another bundle's.
+//! What can fail: a bundle that does not compile; an image that cannot be read, is broken or is another bundle's; instructions that this CPU
+//! does not have.
 
 use std::path::Path;
 
 use lads_compiler::{Aligned, Bundle, Image, compile};
-use lads_core::Policy;
+use lads_core::{Isa, Policy};
 
-use crate::arguments::Arguments;
+use crate::arguments::{Arguments, IsaName};
 use crate::end::{End, refused};
 
 /// An image and its memory.
@@ -55,6 +56,21 @@ impl Program {
             )
         })
     }
+}
+
+/// The instructions that were asked for, if this CPU has them.
+pub fn isa(name: Option<IsaName>) -> Result<Isa, End> {
+    let Some(name) = name else {
+        return Ok(Isa::detect());
+    };
+    let name = format!("{name:?}").to_lowercase();
+    Isa::all().find(|isa| isa.name() == name).ok_or_else(|| {
+        let offered: Vec<_> = Isa::all().map(Isa::name).collect();
+        refused(format!(
+            "--isa {name}: this CPU does not have it; it has {}",
+            offered.join(", ")
+        ))
+    })
 }
 
 fn about(path: &Path, wrong: &dyn std::fmt::Display) -> End {
