@@ -2,12 +2,14 @@
 
 use std::hint::black_box;
 
+use bytemuck::Pod;
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main};
 use lads_benches::sweep::Sweep;
-use lads_kernels::stored::{round_to_f16, to_f16};
+use lads_compiler::Aligned;
+use lads_kernels::stored::{round_to_f16, to_f16, to_int16};
 use lads_kernels::{
-    Activation, Attention, Cache, CacheFormat, Isa, LayerNorm, Linear, Panels,
+    Activation, Attention, Cache, CacheFormat, Isa, LayerNorm, Linear, Panels, WeightFormat,
     attention_scratch_len, keys_len, pack, packed_len,
 };
 
@@ -24,19 +26,42 @@ fn roofline(group: &mut BenchmarkGroup<'_, WallTime>, bytes: usize) {
     group.bench_function("sweep", |bencher| bencher.iter(|| sweep.read()));
 }
 
+/// A matrix in panels, where an image would have it.
+fn packed<T: Pod + Default>(format: WeightFormat, w: &[T], dims: [usize; 2]) -> Aligned {
+    let mut panels = vec![T::default(); packed_len(format, dims)];
+    pack(format, w, dims, &mut panels);
+    Aligned::new(bytemuck::cast_slice(&panels))
+}
+
 /// One dense layer, in 32 and in 16 bits, for one row and for the two tokens of a control step.
 fn linear(criterion: &mut Criterion) {
     let isa = Isa::detect();
     for (k, n) in [(128, 128), (128, 384), (512, 128)] {
         let dense = numbers(k * n);
-        let mut w = vec![0.0; packed_len(k, n)];
-        pack(&dense, k, n, &mut w);
-        let half: Vec<u16> = w.iter().map(|&x| to_f16(x).unwrap_or(0)).collect();
+        let w = packed(WeightFormat::F32, &dense, [k, n]);
+        let half: Vec<u16> = dense.iter().map(|&x| to_f16(x).unwrap_or(0)).collect();
+        let half = packed(WeightFormat::F16, &half, [k, n]);
+        let scale = 1.0 / 16383.0;
+        let whole: Vec<i16> = dense.iter().map(|&x| to_int16(x, scale)).collect();
+        let whole = packed(WeightFormat::Int16, &whole, [k, n]);
+        let scales = vec![scale; n];
         let bias = numbers(n);
         for rows in [1, 2] {
             let (x, mut y) = (numbers(rows * k), vec![0.0; rows * n]);
-            let stored = [("f32", Panels::F32(&w), 4), ("f16", Panels::F16(&half), 2)];
-            for (name, panels, bytes) in stored {
+            let integers = Panels::Int16 {
+                panels: bytemuck::cast_slice(whole.as_bytes()),
+                scales: &scales,
+            };
+            let stored = [
+                ("f32", Panels::F32(bytemuck::cast_slice(w.as_bytes())), &w),
+                ("int16", integers, &whole),
+                (
+                    "f16",
+                    Panels::F16(bytemuck::cast_slice(half.as_bytes())),
+                    &half,
+                ),
+            ];
+            for (name, panels, memory) in stored {
                 let layer = Linear {
                     k,
                     n,
@@ -47,11 +72,12 @@ fn linear(criterion: &mut Criterion) {
                 };
                 let mut group =
                     criterion.benchmark_group(format!("linear/{k}x{n} {name}, {rows} rows"));
-                group.throughput(Throughput::Bytes((bytes * w.len()) as u64));
+                let bytes = memory.as_bytes().len();
+                group.throughput(Throughput::Bytes(bytes as u64));
                 group.bench_function("kernel", |bencher| {
                     bencher.iter(|| layer.run(isa, black_box(&x), &mut y));
                 });
-                roofline(&mut group, bytes * w.len());
+                roofline(&mut group, bytes);
                 group.finish();
             }
         }

@@ -8,12 +8,13 @@
     reason = "the loop gets the vectors of the body that it is inlined into"
 )]
 
+use lads_compiler::Aligned;
 use pulp::{Arch, Simd, WithSimd};
 
-/// Memory of some size, and the machine's vectors.
+/// Memory of some size, where an image would lie too, and the machine's vectors.
 #[derive(Debug)]
 pub struct Sweep {
-    words: Vec<f32>,
+    words: Aligned,
     arch: Arch,
 }
 
@@ -47,19 +48,23 @@ impl Sweep {
     /// Memory of `bytes`, rounded down to whole words.
     pub fn new(bytes: usize) -> Self {
         Self {
-            words: vec![1.0; bytes / size_of::<f32>()],
+            words: Aligned::new(bytemuck::cast_slice(&vec![
+                1.0_f32;
+                bytes / size_of::<f32>()
+            ])),
             arch: Arch::new(),
         }
     }
 
     /// Bytes that one sweep reads.
     pub fn bytes(&self) -> usize {
-        size_of_val(self.words.as_slice())
+        self.words.as_bytes().len()
     }
 
     /// Reads all of it; the sum of its words.
     pub fn read(&self) -> f32 {
-        self.arch.dispatch(Sum(&self.words))
+        self.arch
+            .dispatch(Sum(bytemuck::cast_slice(self.words.as_bytes())))
     }
 }
 

@@ -57,8 +57,9 @@ enum Command {
         /// A Rust source to write: the image as a constant, aligned byte array
         #[arg(long, value_name = "FILE")]
         emit_rust: Option<PathBuf>,
-        /// How the weights are stored; sums are 32-bit floats in any case. Fewer bits than 32 have to pass a gate: the golden
-        /// episode replays with the same plans, and with actions inside the tolerance
+        /// How the weights are stored: f32; int16, the fastest; f16 or bf16, which leave the inputs of a layer as they are;
+        /// int8. Fewer bits than 32 have to pass a gate: the golden episode replays with the same plans, and with actions inside
+        /// the tolerance
         #[arg(long, value_name = "FORMAT", default_value = "f32", value_parser = weight_format)]
         weights: WeightFormat,
         /// How the weights of the low level are stored, if otherwise: with f32 the actions of a plan keep their bits, and all

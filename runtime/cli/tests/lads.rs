@@ -491,8 +491,8 @@ fn weights_of_fewer_bits_pass_a_gate() {
     assert!(said.contains(stored), "{said}");
     answer(&["self-test", image], "");
     for (flag, value, known) in [
-        ("--weights", "f8", "f32, f16, bf16, int8"),
-        ("--low-level", "f64", "f32, f16, bf16, int8"),
+        ("--weights", "f8", "f32, int16, f16, bf16, int8"),
+        ("--low-level", "f64", "f32, int16, f16, bf16, int8"),
         ("--cache", "bf16", "f32, f16"),
         ("--tolerance", "0", "positive"),
     ] {

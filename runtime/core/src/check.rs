@@ -9,7 +9,7 @@ use core::fmt;
 use lads_kernels::{CacheFormat, attention_scratch_len};
 
 use crate::image::PortRecord;
-use crate::op::{self, Op, Operand, Place, Space, Span, StateSpan, WeightFormat, WeightSpan};
+use crate::op::{self, Op, Operand, Place, Space, Span, StateSpan, WeightSpan};
 use crate::program::Spaces;
 
 /// What is wrong with a program or one of its ops.
@@ -227,13 +227,16 @@ impl Checker {
         exactly(op.x.len, [op.m, op.k])?;
         exactly(op.y.len, [op.m, op.n])?;
         self.weights(op.w)?;
-        // Blocks of sixteen outputs, four bytes to a word.
-        exactly(
-            op.w.len,
-            [op.n.div_ceil(16), op.k, 4, op.format.bytes() as u32],
-        )?;
-        let scaled = matches!(op.format, WeightFormat::Int8);
+        let scaled = op.format.is_scaled();
         require(op.scales.is_some() == scaled, Fault::Shape)?;
+        // Blocks of sixteen outputs, and of integers of sixteen inputs, four bytes to a word.
+        let [inputs, times] = if scaled {
+            [op.k.div_ceil(16), 16]
+        } else {
+            [op.k, 1]
+        };
+        let bytes = op.format.bytes() as u32;
+        exactly(op.w.len, [op.n.div_ceil(16), inputs, times, 4, bytes])?;
         for column in [op.scales, op.bias].into_iter().flatten() {
             self.weights(column)?;
             exactly(column.len, [op.n])?;

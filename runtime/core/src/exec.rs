@@ -281,6 +281,10 @@ fn linear(op: &op::Linear, isa: Isa, weights: &[f32], arena: &mut [f32]) -> Opti
             panels: bytemuck::try_cast_slice(w).ok()?,
             scales: read.get(op.scales?.into())?,
         },
+        WeightFormat::Int16 => kernels::Panels::Int16 {
+            panels: bytemuck::try_cast_slice(w).ok()?,
+            scales: read.get(op.scales?.into())?,
+        },
     };
     let layer = kernels::Linear {
         k: op.k as usize,

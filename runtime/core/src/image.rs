@@ -32,7 +32,7 @@ use crate::op::{Place, Port, Span, WeightSpan};
 pub const MAGIC: u32 = u32::from_le_bytes(*b"LADS");
 
 /// Version of the format that this module describes.
-pub const VERSION: u32 = 3;
+pub const VERSION: u32 = 4;
 
 /// Words of the header.
 pub const HEADER_WORDS: usize = 32;

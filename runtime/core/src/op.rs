@@ -50,7 +50,7 @@ impl Field for Activation {
     }
 }
 
-word_enum_for!(WeightFormat { F32 = 0, F16 = 1, Bf16 = 2, Int8 = 3, });
+word_enum_for!(WeightFormat { F32 = 0, F16 = 1, Bf16 = 2, Int8 = 3, Int16 = 4, });
 
 word_enum_for!(CacheFormat { F32 = 0, F16 = 1, });
 
@@ -81,10 +81,9 @@ record! {
         pub x: Span,
         /// How `w` is stored.
         pub format: WeightFormat,
-        /// `[k, n]` in panels of 64 outputs: `lads_kernels::packed_len(k, n)` elements of `format`, ordered by
-        /// `lads_kernels::pack`.
+        /// `[k, n]` in panels of 64 outputs: `lads_kernels::packed_len` elements of `format`, ordered by `lads_kernels::pack`.
         pub w: WeightSpan,
-        /// `[n]`, with `Int8` only: multiplies each output of `x·W`.
+        /// `[n]`, with integers only: multiplies each output of `x·W`.
         pub scales: Option<WeightSpan>,
         /// `[n]`
         pub bias: Option<WeightSpan>,

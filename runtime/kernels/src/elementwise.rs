@@ -1,6 +1,7 @@
 //! Functions of one element.
 
 use crate::dispatch::{Isa, Kernel};
+use crate::lanes::{Block, LANES};
 use crate::math;
 use crate::simd::Simd;
 
@@ -77,25 +78,32 @@ impl Kernel for Elements<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
         #[inline(always)]
-        fn each(y: &mut [f32], f: impl Fn(f32) -> f32) {
-            for y in y {
-                *y = f(*y);
+        fn each(block: &mut Block, f: impl Fn(f32) -> f32) {
+            for x in block {
+                *x = f(*x);
             }
         }
-        match self.kind {
-            UnaryKind::Relu => each(self.y, math::relu),
-            UnaryKind::LeakyRelu => each(self.y, |x| math::leaky_relu(x, self.alpha)),
-            UnaryKind::Tanh => each(self.y, math::tanh),
-            UnaryKind::Sigmoid => each(self.y, math::sigmoid),
-            UnaryKind::Exp => each(self.y, math::exp),
-            UnaryKind::Log => each(self.y, math::log),
-            UnaryKind::Sqrt => each(self.y, math::sqrt),
-            UnaryKind::Rsqrt => each(self.y, |x| 1.0 / math::sqrt(x)),
-            UnaryKind::Neg => each(self.y, |x| -x),
-            UnaryKind::Abs => each(self.y, f32::abs),
-            UnaryKind::Recip => each(self.y, |x| 1.0 / x),
-            UnaryKind::Erf => each(self.y, math::erf),
-            UnaryKind::Square => each(self.y, |x| x * x),
+        // In whole blocks, so that a few elements take no longer than a vector of them, and code for what is left is there once.
+        for y in self.y.chunks_mut(LANES) {
+            let mut block = [0.0; LANES];
+            assign(&mut block, y);
+            let x = &mut block;
+            match self.kind {
+                UnaryKind::Relu => each(x, math::relu),
+                UnaryKind::LeakyRelu => each(x, |x| math::leaky_relu(x, self.alpha)),
+                UnaryKind::Tanh => each(x, math::tanh),
+                UnaryKind::Sigmoid => each(x, math::sigmoid),
+                UnaryKind::Exp => each(x, math::exp),
+                UnaryKind::Log => each(x, math::log),
+                UnaryKind::Sqrt => each(x, math::sqrt),
+                UnaryKind::Rsqrt => each(x, |x| 1.0 / math::sqrt(x)),
+                UnaryKind::Neg => each(x, |x| -x),
+                UnaryKind::Abs => each(x, f32::abs),
+                UnaryKind::Recip => each(x, |x| 1.0 / x),
+                UnaryKind::Erf => each(x, math::erf),
+                UnaryKind::Square => each(x, |x| x * x),
+            }
+            assign(y, &block);
         }
     }
 }

@@ -10,46 +10,61 @@
 //! sweep over its bytes, from whichever cache they come. That prefetcher stops at the end of a page, so each panel asks for one line
 //! of every page of the next: measured at a robot's pace, when weights are in memory, this takes a fifth off `low_level/act`, and
 //! nothing off or on where they are in a cache. (To ask for every line costs a third there and gains nothing here.) Rows of `x` go
-//! through a panel in pairs: the two tokens of a control step read each weight once. A target with few registers takes a
+//! through the panels in pairs: the two tokens of a control step read each weight once. A target with few registers takes a
 //! panel in parts. Each output is one sum in the order of `k`, then the scale, then the bias, whatever the number of rows or parts.
+//!
+//! How a panel is summed up is in `floats` and, for weights that are integers, in `integers`.
 
 use core::hint::black_box;
+use core::ops::Range;
 
 use crate::dispatch::{Isa, Kernel};
-use crate::elementwise::assign;
+use crate::elementwise::{Unary, UnaryKind, assign};
+use crate::floats;
+use crate::integers::{self, PART, Part};
 use crate::lanes::{Block, LANES};
 use crate::math;
-use crate::simd::{Simd, prefetch};
-use crate::stored::{Bf16, F16, F32, Int8, Panels, Stored};
+use crate::simd::Simd;
+use crate::stored::{Bf16, F16, F32, Panels, WeightFormat};
 
 /// Blocks of sixteen outputs in a whole panel.
-const PANEL_BLOCKS: usize = 4;
-
-/// Bytes of a page.
-const PAGE: usize = 4096;
+pub(crate) const PANEL_BLOCKS: usize = 4;
 
 /// Outputs of one whole weight panel.
 pub const PANEL: usize = PANEL_BLOCKS * LANES;
 
-/// Elements of a `[k, n]` weight matrix in panels: `k * n`, `n` rounded up to sixteen.
-pub const fn packed_len(k: usize, n: usize) -> usize {
-    n.div_ceil(LANES) * k * LANES
+/// Rows of a `[k, n]` weight matrix in panels: `k`, with integers rounded up to sixteen.
+pub const fn packed_rows(format: WeightFormat, k: usize) -> usize {
+    if format.is_scaled() {
+        k.next_multiple_of(LANES)
+    } else {
+        k
+    }
 }
 
-/// Packs `w`, `[k, n]` row-major, into panels `[n / 64][k][64]`. What is left of `n` is a last panel, `[k][..]`, its width padded
-/// with zeros to a multiple of sixteen. Offline work.
+/// Elements of a `[k, n]` weight matrix in panels: rows times `n` rounded up to sixteen.
+pub const fn packed_len(format: WeightFormat, [k, n]: [usize; 2]) -> usize {
+    n.div_ceil(LANES) * LANES * packed_rows(format, k)
+}
+
+/// Packs `w`, `[k, n]` row-major, into panels `[n / 64][k][64]`, of integers `[n / 64][k / 2][64][2]`. What is left of `n` is a last,
+/// narrower panel. Rows and columns are rounded up to sixteen with zeros. Offline work.
 ///
 /// # Panics
 /// When `w` is not `k * n` or `out` not [`packed_len`] elements long.
-pub fn pack<T: Copy + Default>(w: &[T], k: usize, n: usize, out: &mut [T]) {
+pub fn pack<T: Copy + Default>(format: WeightFormat, w: &[T], [k, n]: [usize; 2], out: &mut [T]) {
     assert_eq!(w.len(), k * n, "w is [k, n]");
-    assert_eq!(out.len(), packed_len(k, n), "out is packed_len(k, n)");
+    assert_eq!(out.len(), packed_len(format, [k, n]), "out is packed_len");
     out.fill(T::default());
+    let together = if format.is_scaled() { 2 } else { 1 };
     for (l, row) in w.chunks_exact(n.max(1)).enumerate() {
         for (p, part) in row.chunks(PANEL).enumerate() {
-            let start = p * PANEL * k + l * part.len().next_multiple_of(LANES);
-            if let Some(to) = out.get_mut(start..start + part.len()) {
-                to.copy_from_slice(part);
+            let width = part.len().next_multiple_of(LANES);
+            let start =
+                p * PANEL * packed_rows(format, k) + l / together * together * width + l % together;
+            let to = out.get_mut(start..).unwrap_or(&mut []);
+            for (to, &w) in to.iter_mut().step_by(together).zip(part) {
+                *to = w;
             }
         }
     }
@@ -71,23 +86,36 @@ pub enum Activation {
 }
 
 impl Activation {
+    /// The operation on each element that a layer may leave for the end: long code, which is compiled once.
+    fn for_the_end(self) -> Option<UnaryKind> {
+        match self {
+            Self::None | Self::Relu | Self::LeakyRelu(_) => None,
+            Self::Tanh => Some(UnaryKind::Tanh),
+            Self::Sigmoid => Some(UnaryKind::Sigmoid),
+        }
+    }
+
     #[inline(always)]
     fn apply<S: Simd>(self, simd: S, x: S::V) -> S::V {
-        #[inline(always)]
-        fn each<S: Simd>(simd: S, x: S::V, f: impl Fn(f32) -> f32) -> S::V {
-            let mut block = [0.0; LANES];
-            simd.store(x, &mut block);
-            for x in &mut block {
+        /// Where a result is added to what is there; the same code for all instruction sets.
+        #[inline(never)]
+        fn each(block: &mut Block, f: fn(f32) -> f32) {
+            for x in block {
                 *x = f(*x);
             }
-            simd.load(&block)
         }
+        let slow = |f| {
+            let mut block = [0.0; LANES];
+            simd.store(x, &mut block);
+            each(&mut block, f);
+            simd.load(&block)
+        };
         match self {
             Self::None => x,
             Self::Relu => simd.where_negative(x, simd.splat(0.0)),
             Self::LeakyRelu(alpha) => simd.where_negative(x, simd.mul(simd.splat(alpha), x)),
-            Self::Tanh => each(simd, x, math::tanh),
-            Self::Sigmoid => each(simd, x, math::sigmoid),
+            Self::Tanh => slow(math::tanh),
+            Self::Sigmoid => slow(math::sigmoid),
         }
     }
 }
@@ -99,7 +127,7 @@ pub struct Linear<'w> {
     pub k: usize,
     /// Outputs.
     pub n: usize,
-    /// [`packed_len`]`(k, n)` elements, ordered by [`pack`].
+    /// [`packed_len`] elements, ordered by [`pack`].
     pub w: Panels<'w>,
     /// `[n]`, or empty for none.
     pub bias: &'w [f32],
@@ -115,39 +143,79 @@ impl Linear<'_> {
         if self.k == 0 || self.n == 0 {
             return;
         }
-        let layer = self;
+        let at_the_end = self.activation.for_the_end().filter(|_| !self.accumulate);
+        let layer = &Self {
+            activation: match at_the_end {
+                Some(_) => Activation::None,
+                None => self.activation,
+            },
+            ..*self
+        };
         match self.w {
-            Panels::F32(_) => isa.run(Rows::<false> { layer, x, y }),
-            _ => isa.run(Rows::<true> { layer, x, y }),
+            Panels::F32(_) => layer.wide(isa, x, y, &mut []),
+            Panels::Int8 { .. } | Panels::Int16 { .. } => layer.integers(isa, x, y),
+            Panels::F16(_) | Panels::Bf16(_) => isa.run(Rows::<true> {
+                layer,
+                parts: &mut [],
+                x,
+                y,
+            }),
+        }
+        if let Some(kind) = at_the_end {
+            let rows = |len: usize, of: usize| len.checked_div(of).unwrap_or(0);
+            let computed = rows(x.len(), self.k).min(rows(y.len(), self.n)) * self.n;
+            Unary { kind, alpha: 0.0 }.run_in_place(isa, y.get_mut(..computed).unwrap_or(&mut []));
         }
     }
 
-    /// The sums of `R` rows with the panel of so many blocks that begins at weight `start`.
+    /// With weights that are integers. Not inlined: others need no memory for the inputs as integers.
+    #[inline(never)]
+    fn integers(&self, isa: Isa, x: &[f32], y: &mut [f32]) {
+        self.wide(isa, x, y, &mut [Part::EMPTY; 2]);
+    }
+
+    /// With weights that are no narrow floats. Not inlined: compiled once for all of them.
+    #[inline(never)]
+    fn wide(&self, isa: Isa, x: &[f32], y: &mut [f32], parts: &mut [Part]) {
+        let layer = self;
+        isa.run(Rows::<false> { layer, parts, x, y });
+    }
+
+    /// Whether the weights are integers.
+    #[inline(always)]
+    fn is_scaled(&self) -> bool {
+        matches!(self.w, Panels::Int8 { .. } | Panels::Int16 { .. })
+    }
+
+    /// The sums of `R` rows with the panel of so many blocks that is weights `at`; with integers those of part `i`, added to those
+    /// of earlier parts.
     #[inline(always)]
     fn panel<S: Simd, const R: usize, const NARROW: bool>(
         &self,
         simd: S,
-        (start, blocks): (usize, usize),
-        x: [&[f32]; R],
+        (at, blocks): (Range<usize>, usize),
+        (x, parts, i): ([&[f32]; R], &[Part], usize),
         sums: &mut Sums,
     ) {
         #[inline(always)]
-        fn part<T>(w: &[T], start: usize, len: usize) -> &[T] {
-            w.get(start..start + len).unwrap_or(&[])
+        fn part<T>(w: &[T], at: Range<usize>) -> &[T] {
+            w.get(at).unwrap_or(&[])
         }
-        let len = blocks * LANES * self.k;
         match self.w {
             Panels::F32(w) if !NARROW => {
-                panel::<S, F32, R>(simd, part(w, start, len), blocks, x, sums);
+                floats::panel::<S, F32, R>(simd, part(w, at), blocks, x, sums);
+            }
+            Panels::Int8 { panels: w, .. } if !NARROW => {
+                integers::panel::<S, i8, R>(simd, part(w, at), blocks, parts, i, sums);
+            }
+            Panels::Int16 { panels: w, .. } if !NARROW => {
+                integers::panel::<S, i16, R>(simd, part(w, at), blocks, parts, i, sums);
             }
             Panels::F16(w) if NARROW => {
-                panel::<S, F16, R>(simd, part(w, start, len), blocks, x, sums);
+                floats::panel::<S, F16, R>(simd, part(w, at), blocks, x, sums);
             }
             Panels::Bf16(w) if NARROW => {
-                panel::<S, Bf16, R>(simd, part(w, start, len), blocks, x, sums);
-            }
-            Panels::Int8 { panels: w, .. } if NARROW => {
-                panel::<S, Int8, R>(simd, part(w, start, len), blocks, x, sums);
+                floats::panel::<S, Bf16, R>(simd, part(w, at), blocks, x, sums);
             }
             // `run` chooses the kernel by the format.
             _ => {}
@@ -159,7 +227,7 @@ impl Linear<'_> {
     fn finish<S: Simd>(&self, simd: S, sums: &Block, first: usize, y: &mut [f32]) {
         let mut spare = [0.0; LANES];
         let mut v = simd.load(sums);
-        if let Panels::Int8 { scales, .. } = self.w {
+        if let Panels::Int8 { scales, .. } | Panels::Int16 { scales, .. } = self.w {
             v = simd.mul(v, simd.load(block(scales, first, &mut spare)));
         }
         v = simd.add(v, simd.load(block(self.bias, first, &mut spare)));
@@ -189,119 +257,76 @@ fn block<'b>(x: &'b [f32], first: usize, spare: &'b mut Block) -> &'b Block {
     spare
 }
 
-/// A layer at work, of 32-bit weights or `NARROW` ones, see [`Kernel::NARROW`].
+/// A layer at work, of wide weights or integers, or of `NARROW` ones, see [`Kernel::NARROW`].
 struct Rows<'a, const NARROW: bool> {
     layer: &'a Linear<'a>,
+    /// Two, or none where the weights are no integers.
+    parts: &'a mut [Part],
     x: &'a [f32],
     y: &'a mut [f32],
 }
 
 /// The sums of one panel for two rows.
-type Sums = [[Block; PANEL_BLOCKS]; 2];
+pub(crate) type Sums = [[Block; PANEL_BLOCKS]; 2];
 
 impl<const NARROW: bool> Kernel for Rows<'_, NARROW> {
     const NARROW: bool = NARROW;
 
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let (k, n) = (self.layer.k, self.layer.n);
+        let layer = self.layer;
+        let (k, n) = (layer.k, layer.n);
+        let (height, part_len) = if !NARROW && layer.is_scaled() {
+            (k.next_multiple_of(LANES), PART)
+        } else {
+            (k, k)
+        };
         let mut sums = [[[0.0; LANES]; PANEL_BLOCKS]; 2];
-        for first in (0..n).step_by(PANEL) {
-            let blocks = (n - first).div_ceil(LANES).min(PANEL_BLOCKS);
-            let place = (first * k, blocks);
-            let (mut x, mut y) = (self.x, &mut *self.y);
-            while let Some((x0, rest)) = x.split_at_checked(k)
-                && let Some((y0, others)) = y.split_at_mut_checked(n)
+        let parts = self.parts;
+        let (mut x, mut y) = (self.x, self.y);
+        while let Some((x0, rest)) = x.split_at_checked(k)
+            && let Some((y0, others)) = y.split_at_mut_checked(n)
+        {
+            let (rows, x1, y1) = if let Some((x1, rest)) = rest.split_at_checked(k)
+                && let Some((y1, others)) = others.split_at_mut_checked(n)
             {
-                let (rows, second) = if let Some((x1, rest)) = rest.split_at_checked(k)
-                    && let Some((y1, others)) = others.split_at_mut_checked(n)
-                {
-                    self.layer
-                        .panel::<S, 2, NARROW>(simd, place, [x0, x1], &mut sums);
-                    (x, y) = (rest, others);
-                    (2, y1)
-                } else {
-                    self.layer
-                        .panel::<S, 1, NARROW>(simd, place, [x0], &mut sums);
-                    (x, y) = (&[], &mut []);
-                    (1, Default::default())
+                (x, y) = (rest, others);
+                (2, x1, y1)
+            } else {
+                (x, y) = (&[], &mut []);
+                (1, &[][..], Default::default())
+            };
+            let mut y = [y0, y1];
+            let mut ready = None;
+            for first in (0..n).step_by(PANEL) {
+                let blocks = (n - first).div_ceil(LANES).min(PANEL_BLOCKS);
+                let place = || {
+                    let at = first * height..(first + blocks * LANES) * height;
+                    (at, blocks)
                 };
+                for i in 0..k.div_ceil(part_len.max(1)) {
+                    if !NARROW && layer.is_scaled() && ready != Some(i) {
+                        for (part, x) in parts.iter_mut().zip([x0, x1]).take(black_box(rows)) {
+                            part.take(simd, x.get(i * PART..).unwrap_or(&[]));
+                        }
+                        ready = Some(i);
+                    }
+                    if rows == 2 {
+                        let x = ([x0, x1], &*parts, i);
+                        layer.panel::<S, 2, NARROW>(simd, place(), x, &mut sums);
+                    } else {
+                        let x = ([x0], &*parts, i);
+                        layer.panel::<S, 1, NARROW>(simd, place(), x, &mut sums);
+                    }
+                }
                 // Written once for all widths and numbers of rows, and not unrolled by those who know them: activations are long.
-                for (y, sums) in [y0, second].iter_mut().zip(&sums).take(black_box(rows)) {
+                for (y, sums) in y.iter_mut().zip(&sums).take(black_box(rows)) {
                     let sums = black_box(sums.get(..blocks).unwrap_or(&[]));
                     for (block, sums) in sums.iter().enumerate() {
-                        self.layer.finish(simd, sums, first + block * LANES, y);
+                        layer.finish(simd, sums, first + block * LANES, y);
                     }
                 }
             }
         }
     }
-}
-
-/// One panel and `R` rows, in as many parts as the registers ask for.
-#[inline(always)]
-fn panel<S: Simd, W: Stored, const R: usize>(
-    simd: S,
-    w: &[W::Bits],
-    blocks: usize,
-    x: [&[f32]; R],
-    sums: &mut Sums,
-) {
-    // Behind this panel lies the next, or the next layer.
-    for page in (0..size_of_val(w)).step_by(PAGE) {
-        prefetch(w.as_ptr_range().end.wrapping_byte_add(page));
-    }
-    let mut at = 0;
-    while at < blocks {
-        let (place, left) = ([at, blocks], blocks - at);
-        at += if S::SUMS >= PANEL_BLOCKS * R && left >= PANEL_BLOCKS {
-            sweep::<S, W, PANEL_BLOCKS, R>(simd, w, place, x, sums)
-        } else if S::SUMS >= 2 * R && left >= 2 {
-            sweep::<S, W, 2, R>(simd, w, place, x, sums)
-        } else {
-            sweep::<S, W, 1, R>(simd, w, place, x, sums)
-        };
-    }
-}
-
-/// The sums of `R` rows of `k` elements with `P` blocks, from block `at` on, of a panel of `blocks`; returns `P`.
-#[inline(always)]
-#[expect(
-    clippy::indexing_slicing,
-    reason = "arrays whose length is a constant, as is every index"
-)]
-#[expect(
-    unsafe_code,
-    reason = "the sums stay in registers only without a branch in the loop, and compilers keep some of the bounds checks"
-)]
-fn sweep<S: Simd, W: Stored, const P: usize, const R: usize>(
-    simd: S,
-    w: &[W::Bits],
-    [at, blocks]: [usize; 2],
-    x: [&[f32]; R],
-    out: &mut Sums,
-) -> usize {
-    let (w, _) = w.as_chunks::<LANES>();
-    let w = w.chunks_exact(blocks.max(1));
-    if x.iter().any(|x| x.len() != w.len()) || at + P > blocks {
-        return P;
-    }
-    let mut sums = [[simd.splat(0.0); P]; R];
-    for (l, row) in w.enumerate() {
-        // SAFETY: each `x[r]` is as long as `w`, as compared above, and `l` is an index of `w`.
-        let x: [S::V; R] = x.map(|x| simd.splat(unsafe { *x.get_unchecked(l) }));
-        for p in 0..P {
-            // SAFETY: `row` has `blocks` elements, `at + P <= blocks`, as compared above, and `p < P`.
-            let w = W::load(simd, unsafe { row.get_unchecked(at + p) });
-            for (sums, &x) in sums.iter_mut().zip(&x) {
-                sums[p] = simd.add_product(sums[p], x, w);
-            }
-        }
-    }
-    for (out, sums) in out.iter_mut().zip(sums) {
-        for (out, sum) in out.iter_mut().skip(at).zip(sums) {
-            simd.store(sum, out);
-        }
-    }
-    P
 }

@@ -15,6 +15,10 @@ use crate::stored;
 pub(crate) trait Simd: Copy {
     /// Sixteen lanes.
     type V: Copy;
+    /// Sixteen lanes of two 16-bit integers.
+    type Pairs: Copy;
+    /// Sixteen lanes of a 32-bit integer.
+    type Integers: Copy;
 
     /// How many sums of sixteen lanes stay in registers, beside the operands.
     const SUMS: usize;
@@ -39,13 +43,35 @@ pub(crate) trait Simd: Copy {
     fn round_to_f16(self, v: Self::V) -> [u16; LANES];
     /// Sixteen brain floats, [`stored::from_bf16`].
     fn load_bf16(self, from: &[u16; LANES]) -> Self::V;
-    /// Sixteen integers.
-    fn load_i8(self, from: &[i8; LANES]) -> Self::V;
+    /// The same two integers in every lane.
+    fn splat_pair(self, pair: [i16; 2]) -> Self::Pairs;
+    /// Sixteen pairs of memory.
+    fn load_i16(self, from: &[i16; 2 * LANES]) -> Self::Pairs;
+    /// The same of 8-bit integers.
+    fn load_i8(self, from: &[i8; 2 * LANES]) -> Self::Pairs;
+    /// No sum yet.
+    fn zeros(self) -> Self::Integers;
+    /// `sum + a[0] * b[0] + a[1] * b[1]`; what overflows wraps around.
+    fn add_products(self, sum: Self::Integers, a: Self::Pairs, b: Self::Pairs) -> Self::Integers;
+    /// The nearest floats, ties to even.
+    fn floats(self, integers: Self::Integers) -> Self::V;
+    /// The nearest integers, ties to even, of magnitudes up to 32767; any integers of what is larger or no number.
+    fn whole(self, v: Self::V) -> [i16; LANES];
+    /// The larger of each integer, not negative, and the bits of a float without its sign.
+    fn larger(self, largest: Self::Integers, v: Self::V) -> Self::Integers;
+    /// The largest of sixteen integers that are not negative.
+    fn largest(self, integers: Self::Integers) -> u32;
 }
+
+/// Numbers to which this is added end in their nearest integer, ties to even, as the low bits of a float: 3 * 2^22.
+const ROUND: f32 = 12_582_912.0;
+
+/// All bits of a float but its sign.
+const MAGNITUDE: i32 = i32::MAX;
 
 /// Asks for the cache line at an address, where the target has an instruction for it. A hint: nothing need be there.
 #[inline(always)]
-pub(crate) fn prefetch<T>(at: *const T) {
+fn prefetch<T>(at: *const T) {
     #[cfg(target_arch = "x86_64")]
     // SAFETY: part of SSE, which every x86-64 CPU has; it reads nothing.
     unsafe {
@@ -56,12 +82,26 @@ pub(crate) fn prefetch<T>(at: *const T) {
     let _ = at;
 }
 
+/// Asks for one line of each page behind a panel of weights: there lies the next, or the next layer.
+#[inline(never)]
+pub(crate) fn prefetch_behind<T>(panel: &[T]) {
+    let behind = panel.as_ptr_range().end;
+    for page in (0..size_of_val(panel)).step_by(PAGE) {
+        prefetch(behind.wrapping_byte_add(page));
+    }
+}
+
+/// Bytes of a page.
+const PAGE: usize = 4096;
+
 /// What the build's target has in any case: arrays, which compilers put into its registers.
 #[derive(Clone, Copy)]
 pub(crate) struct Portable;
 
 impl Simd for Portable {
     type V = Block;
+    type Pairs = [i16; 2 * LANES];
+    type Integers = [i32; LANES];
 
     const SUMS: usize = 2;
 
@@ -114,7 +154,7 @@ impl Simd for Portable {
 
     #[inline(always)]
     fn load_f16(self, from: &[u16; LANES]) -> Block {
-        from.map(stored::from_f16)
+        stored::all_from_f16(from)
     }
 
     #[inline(always)]
@@ -128,26 +168,88 @@ impl Simd for Portable {
     }
 
     #[inline(always)]
-    fn load_i8(self, from: &[i8; LANES]) -> Block {
-        from.map(f32::from)
+    fn splat_pair(self, pair: [i16; 2]) -> Self::Pairs {
+        let mut pairs = [0; 2 * LANES];
+        pairs.as_chunks_mut().0.fill(pair);
+        pairs
+    }
+
+    #[inline(always)]
+    fn load_i16(self, from: &[i16; 2 * LANES]) -> Self::Pairs {
+        *from
+    }
+
+    #[inline(always)]
+    fn load_i8(self, from: &[i8; 2 * LANES]) -> Self::Pairs {
+        from.map(i16::from)
+    }
+
+    #[inline(always)]
+    fn zeros(self) -> Self::Integers {
+        [0; LANES]
+    }
+
+    #[inline(always)]
+    fn add_products(
+        self,
+        mut sum: Self::Integers,
+        a: Self::Pairs,
+        b: Self::Pairs,
+    ) -> Self::Integers {
+        let pairs = a.as_chunks().0.iter().zip(b.as_chunks().0);
+        for (sum, (&[a0, a1], &[b0, b1])) in sum.iter_mut().zip(pairs) {
+            let product = |a, b| i32::from(a) * i32::from(b);
+            *sum = sum.wrapping_add(product(a0, b0).wrapping_add(product(a1, b1)));
+        }
+        sum
+    }
+
+    #[inline(always)]
+    fn floats(self, integers: Self::Integers) -> Block {
+        integers.map(|integer| integer as f32)
+    }
+
+    #[inline(always)]
+    fn whole(self, v: Block) -> [i16; LANES] {
+        v.map(|x| (x + ROUND).to_bits() as i16)
+    }
+
+    #[inline(always)]
+    fn larger(self, mut largest: Self::Integers, v: Block) -> Self::Integers {
+        for (largest, x) in largest.iter_mut().zip(v) {
+            *largest = (x.to_bits().cast_signed() & MAGNITUDE).max(*largest);
+        }
+        largest
+    }
+
+    #[inline(always)]
+    fn largest(self, integers: Self::Integers) -> u32 {
+        integers.into_iter().fold(0, i32::max).cast_unsigned()
     }
 }
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod x86_64 {
     use core::arch::x86_64::{
-        __m256, __m512, _CMP_LT_OQ, _MM_FROUND_TO_NEAREST_INT, _mm_loadl_epi64, _mm_loadu_si128,
-        _mm_storeu_si128, _mm256_add_ps, _mm256_blendv_ps, _mm256_castsi256_ps, _mm256_cmp_ps,
-        _mm256_cvtepi8_epi32, _mm256_cvtepi32_ps, _mm256_cvtepu16_epi32, _mm256_cvtph_ps,
-        _mm256_cvtps_ph, _mm256_loadu_ps, _mm256_loadu_si256, _mm256_mul_ps, _mm256_set1_ps,
-        _mm256_setzero_ps, _mm256_slli_epi32, _mm256_storeu_ps, _mm256_storeu_si256, _mm512_add_ps,
-        _mm512_castsi512_ps, _mm512_cmp_ps_mask, _mm512_cvtepi8_epi32, _mm512_cvtepi32_ps,
-        _mm512_cvtepu16_epi32, _mm512_cvtph_ps, _mm512_cvtps_ph, _mm512_loadu_ps,
-        _mm512_mask_blend_ps, _mm512_mul_ps, _mm512_set1_ps, _mm512_setzero_ps, _mm512_slli_epi32,
+        __m256, __m256i, __m512, __m512i, _CMP_LT_OQ, _MM_FROUND_TO_NEAREST_INT, _mm_cvtsi128_si32,
+        _mm_loadu_si128, _mm_max_epi32, _mm_shuffle_epi32, _mm_storeu_si128, _mm256_add_epi32,
+        _mm256_add_ps, _mm256_and_si256, _mm256_blendv_ps, _mm256_castps_si256,
+        _mm256_castsi256_ps, _mm256_castsi256_si128, _mm256_cmp_ps, _mm256_cvtepi8_epi16,
+        _mm256_cvtepi32_ps, _mm256_cvtepu16_epi32, _mm256_cvtph_ps, _mm256_cvtps_ph,
+        _mm256_extracti128_si256, _mm256_loadu_ps, _mm256_loadu_si256, _mm256_madd_epi16,
+        _mm256_max_epi32, _mm256_mul_ps, _mm256_packs_epi32, _mm256_permute4x64_epi64,
+        _mm256_set1_epi32, _mm256_set1_ps, _mm256_setzero_ps, _mm256_setzero_si256,
+        _mm256_slli_epi32, _mm256_srai_epi32, _mm256_storeu_ps, _mm256_storeu_si256,
+        _mm512_add_epi32, _mm512_add_ps, _mm512_and_si512, _mm512_castps_si512,
+        _mm512_castsi512_ps, _mm512_cmp_ps_mask, _mm512_cvtepi8_epi16, _mm512_cvtepi32_epi16,
+        _mm512_cvtepi32_ps, _mm512_cvtepu16_epi32, _mm512_cvtph_ps, _mm512_cvtps_ph,
+        _mm512_loadu_ps, _mm512_loadu_si512, _mm512_madd_epi16, _mm512_mask_blend_ps,
+        _mm512_max_epi32, _mm512_mul_ps, _mm512_reduce_max_epi32, _mm512_set1_epi32,
+        _mm512_set1_ps, _mm512_setzero_ps, _mm512_setzero_si512, _mm512_slli_epi32,
         _mm512_storeu_ps,
     };
 
-    use super::Simd;
+    use super::{MAGNITUDE, ROUND, Simd};
     use crate::lanes::{Block, LANES};
 
     /// A block in two registers. `NARROW` is whether AVX-512 doubles their number.
@@ -182,6 +284,8 @@ pub(crate) mod x86_64 {
 
     impl<const NARROW: bool> Simd for Halves<NARROW> {
         type V = [__m256; 2];
+        type Pairs = [__m256i; 2];
+        type Integers = [__m256i; 2];
 
         const SUMS: usize = if NARROW { 8 } else { 4 };
 
@@ -276,19 +380,105 @@ pub(crate) mod x86_64 {
         }
 
         #[inline(always)]
-        fn load_i8(self, from: &[i8; LANES]) -> Self::V {
+        fn splat_pair(self, pair: [i16; 2]) -> Self::Pairs {
+            // SAFETY: whoever made `self` has AVX2.
+            [unsafe { _mm256_set1_epi32(whole(pair)) }; 2]
+        }
+
+        #[inline(always)]
+        fn load_i16(self, from: &[i16; 2 * LANES]) -> Self::Pairs {
             let from = from.as_ptr();
-            // SAFETY: whoever made `self` has AVX2; both halves, of eight bytes each, lie inside the block.
+            // SAFETY: whoever made `self` has AVX2; both halves, of sixteen integers each, lie inside the array.
+            unsafe { [from, from.add(16)].map(|from| _mm256_loadu_si256(from.cast())) }
+        }
+
+        #[inline(always)]
+        fn load_i8(self, from: &[i8; 2 * LANES]) -> Self::Pairs {
+            let from = from.as_ptr();
+            // SAFETY: whoever made `self` has AVX2; both halves, of sixteen bytes each, lie inside the array.
             unsafe {
-                [from, from.add(8)].map(|from| {
-                    _mm256_cvtepi32_ps(_mm256_cvtepi8_epi32(_mm_loadl_epi64(from.cast())))
-                })
+                [from, from.add(16)].map(|from| _mm256_cvtepi8_epi16(_mm_loadu_si128(from.cast())))
+            }
+        }
+
+        #[inline(always)]
+        fn zeros(self) -> Self::Integers {
+            // SAFETY: whoever made `self` has AVX2.
+            [unsafe { _mm256_setzero_si256() }; 2]
+        }
+
+        #[inline(always)]
+        fn add_products(
+            self,
+            sum: Self::Integers,
+            a: Self::Pairs,
+            b: Self::Pairs,
+        ) -> Self::Integers {
+            // SAFETY: whoever made `self` has AVX2.
+            unsafe {
+                [
+                    _mm256_add_epi32(sum[0], _mm256_madd_epi16(a[0], b[0])),
+                    _mm256_add_epi32(sum[1], _mm256_madd_epi16(a[1], b[1])),
+                ]
+            }
+        }
+
+        #[inline(always)]
+        fn floats(self, integers: Self::Integers) -> Self::V {
+            // SAFETY: whoever made `self` has AVX2.
+            integers.map(|integers| unsafe { _mm256_cvtepi32_ps(integers) })
+        }
+
+        #[inline(always)]
+        fn whole(self, v: Self::V) -> [i16; LANES] {
+            let mut to = [0; LANES];
+            // SAFETY: whoever made `self` has AVX2; the array is sixteen numbers of sixteen bits.
+            unsafe {
+                let [low, high] = v.map(|v| {
+                    let bits = _mm256_castps_si256(_mm256_add_ps(v, _mm256_set1_ps(ROUND)));
+                    _mm256_srai_epi32::<16>(_mm256_slli_epi32::<16>(bits))
+                });
+                // Quarters 0 and 2 of either, then 1 and 3.
+                let packed =
+                    _mm256_permute4x64_epi64::<0b11_01_10_00>(_mm256_packs_epi32(low, high));
+                _mm256_storeu_si256(to.as_mut_ptr().cast(), packed);
+            }
+            to
+        }
+
+        #[inline(always)]
+        fn larger(self, largest: Self::Integers, v: Self::V) -> Self::Integers {
+            // SAFETY: whoever made `self` has AVX2.
+            unsafe {
+                let magnitude =
+                    |v| _mm256_and_si256(_mm256_castps_si256(v), _mm256_set1_epi32(MAGNITUDE));
+                [
+                    _mm256_max_epi32(largest[0], magnitude(v[0])),
+                    _mm256_max_epi32(largest[1], magnitude(v[1])),
+                ]
+            }
+        }
+
+        #[inline(always)]
+        fn largest(self, [low, high]: Self::Integers) -> u32 {
+            // SAFETY: whoever made `self` has AVX2.
+            unsafe {
+                let eight = _mm256_max_epi32(low, high);
+                let four = _mm_max_epi32(
+                    _mm256_castsi256_si128(eight),
+                    _mm256_extracti128_si256::<1>(eight),
+                );
+                let two = _mm_max_epi32(four, _mm_shuffle_epi32::<0b11_10_11_10>(four));
+                let one = _mm_max_epi32(two, _mm_shuffle_epi32::<0b01_01_01_01>(two));
+                _mm_cvtsi128_si32(one).cast_unsigned()
             }
         }
     }
 
     impl Simd for Avx512 {
         type V = __m512;
+        type Pairs = __m512i;
+        type Integers = __m512i;
 
         const SUMS: usize = 16;
 
@@ -363,11 +553,79 @@ pub(crate) mod x86_64 {
         }
 
         #[inline(always)]
-        fn load_i8(self, from: &[i8; LANES]) -> Self::V {
-            // SAFETY: whoever made `self` has AVX-512; a block is sixteen bytes.
+        fn splat_pair(self, pair: [i16; 2]) -> Self::Pairs {
+            // SAFETY: whoever made `self` has AVX-512.
+            unsafe { _mm512_set1_epi32(whole(pair)) }
+        }
+
+        #[inline(always)]
+        fn load_i16(self, from: &[i16; 2 * LANES]) -> Self::Pairs {
+            // SAFETY: whoever made `self` has AVX-512; the array is sixteen pairs.
+            unsafe { _mm512_loadu_si512(from.as_ptr().cast()) }
+        }
+
+        #[inline(always)]
+        fn load_i8(self, from: &[i8; 2 * LANES]) -> Self::Pairs {
+            // SAFETY: whoever made `self` has AVX-512; the array is sixteen pairs.
+            unsafe { _mm512_cvtepi8_epi16(_mm256_loadu_si256(from.as_ptr().cast())) }
+        }
+
+        #[inline(always)]
+        fn zeros(self) -> Self::Integers {
+            // SAFETY: whoever made `self` has AVX-512.
+            unsafe { _mm512_setzero_si512() }
+        }
+
+        #[inline(always)]
+        fn add_products(
+            self,
+            sum: Self::Integers,
+            a: Self::Pairs,
+            b: Self::Pairs,
+        ) -> Self::Integers {
+            // SAFETY: whoever made `self` has AVX-512.
+            unsafe { _mm512_add_epi32(sum, _mm512_madd_epi16(a, b)) }
+        }
+
+        #[inline(always)]
+        fn floats(self, integers: Self::Integers) -> Self::V {
+            // SAFETY: whoever made `self` has AVX-512.
+            unsafe { _mm512_cvtepi32_ps(integers) }
+        }
+
+        #[inline(always)]
+        fn whole(self, v: Self::V) -> [i16; LANES] {
+            let mut to = [0; LANES];
+            // SAFETY: whoever made `self` has AVX-512; the array is sixteen numbers of sixteen bits.
             unsafe {
-                _mm512_cvtepi32_ps(_mm512_cvtepi8_epi32(_mm_loadu_si128(from.as_ptr().cast())))
+                let bits = _mm512_castps_si512(_mm512_add_ps(v, _mm512_set1_ps(ROUND)));
+                _mm256_storeu_si256(to.as_mut_ptr().cast(), _mm512_cvtepi32_epi16(bits));
+            }
+            to
+        }
+
+        #[inline(always)]
+        fn larger(self, largest: Self::Integers, v: Self::V) -> Self::Integers {
+            // SAFETY: whoever made `self` has AVX-512.
+            unsafe {
+                let bits = _mm512_castps_si512(v);
+                _mm512_max_epi32(
+                    largest,
+                    _mm512_and_si512(bits, _mm512_set1_epi32(MAGNITUDE)),
+                )
             }
         }
+
+        #[inline(always)]
+        fn largest(self, integers: Self::Integers) -> u32 {
+            // SAFETY: whoever made `self` has AVX-512.
+            unsafe { _mm512_reduce_max_epi32(integers) }.cast_unsigned()
+        }
+    }
+
+    /// Two integers as the one of their bytes.
+    #[inline(always)]
+    fn whole([low, high]: [i16; 2]) -> i32 {
+        i32::from(low.cast_unsigned()) | i32::from(high) << 16
     }
 }

@@ -1,11 +1,13 @@
-//! How weights are stored: 32-bit floats, or fewer bits that are decoded in registers while they are read. Sums are always 32-bit.
+//! How weights are stored: 32-bit floats, shorter ones that are decoded in registers while they are read, or integers, with which
+//! the inputs of a layer become integers too (see `integers`).
 //!
-//! | format | bits | error of a weight |
-//! |---|---|---|
-//! | `F32` | 32 | none |
-//! | `F16` | 16 | half a unit of 11 bits (relative 2^-11), or 2^-25 below 2^-14; magnitudes up to 65504 |
-//! | `Bf16` | 16 | half a unit of 8 bits (relative 2^-8) |
-//! | `Int8` | 8, and one `f32` scale per output | half of the scale: the output's largest weight / 254 |
+//! | format | bits | error of a weight | error of an input |
+//! |---|---|---|---|
+//! | `F32` | 32 | none | none |
+//! | `Int16` | 16, and one `f32` scale per output | half of the scale: the output's largest weight / 32766 | the largest of 256 inputs / 16382 |
+//! | `F16` | 16 | half a unit of 11 bits (relative 2^-11), or 2^-25 below 2^-14; magnitudes up to 65504 | none |
+//! | `Bf16` | 16 | half a unit of 8 bits (relative 2^-8) | none |
+//! | `Int8` | 8, and one `f32` scale per output | half of the scale: the output's largest weight / 254 | the largest of 256 inputs / 16382 |
 //!
 //! Conversions round to the nearest, ties to even, and are exact the other way, so every instruction set decodes the same bits.
 //! Encoding is offline work and can fail: [`to_f16`] has no number for what is too large.
@@ -25,28 +27,36 @@ pub enum WeightFormat {
     Bf16,
     /// Integers from -127 to 127, times a scale per output.
     Int8,
+    /// Integers from -16383 to 16383, times a scale per output.
+    Int16,
 }
 
 impl WeightFormat {
     /// All of them, the most exact first.
-    pub const ALL: [Self; 4] = [Self::F32, Self::F16, Self::Bf16, Self::Int8];
+    pub const ALL: [Self; 5] = [Self::F32, Self::Int16, Self::F16, Self::Bf16, Self::Int8];
 
     /// Bytes of a weight.
     pub const fn bytes(self) -> usize {
         match self {
             Self::F32 => 4,
-            Self::F16 | Self::Bf16 => 2,
+            Self::F16 | Self::Bf16 | Self::Int16 => 2,
             Self::Int8 => 1,
         }
     }
 
-    /// Its name: `f32`, `f16`, `bf16` or `int8`.
+    /// Whether weights are integers, times a scale per output.
+    pub const fn is_scaled(self) -> bool {
+        matches!(self, Self::Int8 | Self::Int16)
+    }
+
+    /// Its name: `f32`, `int16`, `f16`, `bf16` or `int8`.
     pub const fn name(self) -> &'static str {
         match self {
             Self::F32 => "f32",
             Self::F16 => "f16",
             Self::Bf16 => "bf16",
             Self::Int8 => "int8",
+            Self::Int16 => "int16",
         }
     }
 }
@@ -67,9 +77,16 @@ pub enum Panels<'w> {
         /// `[n]`: multiplies each output's sum.
         scales: &'w [f32],
     },
+    /// [`WeightFormat::Int16`]
+    Int16 {
+        /// The integers.
+        panels: &'w [i16],
+        /// `[n]`: multiplies each output's sum.
+        scales: &'w [f32],
+    },
 }
 
-/// A format at work: how sixteen stored weights become a vector.
+/// A format of floats at work: how sixteen stored weights become a vector.
 pub(crate) trait Stored {
     /// One weight as it is stored.
     type Bits;
@@ -80,7 +97,6 @@ pub(crate) trait Stored {
 pub(crate) struct F32;
 pub(crate) struct F16;
 pub(crate) struct Bf16;
-pub(crate) struct Int8;
 
 impl Stored for F32 {
     type Bits = f32;
@@ -103,14 +119,6 @@ impl Stored for Bf16 {
     #[inline(always)]
     fn load<S: Simd>(simd: S, from: &[u16; LANES]) -> S::V {
         simd.load_bf16(from)
-    }
-}
-
-impl Stored for Int8 {
-    type Bits = i8;
-    #[inline(always)]
-    fn load<S: Simd>(simd: S, from: &[i8; LANES]) -> S::V {
-        simd.load_i8(from)
     }
 }
 
@@ -138,6 +146,12 @@ pub fn from_f16(bits: u16) -> f32 {
         found
     };
     f32::from_bits(found | u32::from(bits & 0x8000) << 16)
+}
+
+/// Sixteen of them; compiled once, because it is long, which a call is not.
+#[inline(never)]
+pub(crate) fn all_from_f16(bits: &[u16; LANES]) -> Block {
+    bits.map(from_f16)
 }
 
 /// The nearest half-precision number, ties to even; infinite from 65520 on, the midpoint between 65504 and what would come next.
@@ -193,18 +207,38 @@ pub fn to_bf16(x: f32) -> Option<u16> {
     (x.is_finite() && rounded & 0x7f80 != 0x7f80).then_some(rounded as u16)
 }
 
-/// The scale of one output's weights: its largest magnitude / 127; 1 where all are zero.
+/// Of the magnitudes of `Int16`.
+const INT16_LARGEST: f32 = 16383.0;
+
+/// Of the magnitudes of `Int8`.
+const INT8_LARGEST: f32 = 127.0;
+
+/// The scale of one output's weights in `Int8`: its largest magnitude / 127; 1 where all are zero.
 pub fn int8_scale(weights: impl Iterator<Item = f32>) -> f32 {
+    scale(weights, INT8_LARGEST)
+}
+
+/// The same in `Int16`: its largest magnitude / 16383.
+pub fn int16_scale(weights: impl Iterator<Item = f32>) -> f32 {
+    scale(weights, INT16_LARGEST)
+}
+
+fn scale(weights: impl Iterator<Item = f32>, steps: f32) -> f32 {
     let largest = weights.fold(0.0, |largest: f32, w| largest.max(w.abs()));
     // A scale below the normal numbers would lose digits, and be flushed in a control step.
-    if largest / 127.0 < f32::MIN_POSITIVE {
+    if largest / steps < f32::MIN_POSITIVE {
         1.0
     } else {
-        largest / 127.0
+        largest / steps
     }
 }
 
 /// The nearest multiple of the scale, ties to even; between -127 and 127.
 pub fn to_int8(x: f32, scale: f32) -> i8 {
-    libm::rintf(x / scale).clamp(-127.0, 127.0) as i8
+    libm::rintf(x / scale).clamp(-INT8_LARGEST, INT8_LARGEST) as i8
+}
+
+/// The nearest multiple of the scale, ties to even; between -16383 and 16383.
+pub fn to_int16(x: f32, scale: f32) -> i16 {
+    libm::rintf(x / scale).clamp(-INT16_LARGEST, INT16_LARGEST) as i16
 }

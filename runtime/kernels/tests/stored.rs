@@ -1,7 +1,7 @@
 //! The formats of stored weights against their definitions, over all bit patterns or a dense sample of all `f32`.
 
 use lads_kernels::stored::{
-    from_bf16, from_f16, int8_scale, round_to_f16, to_bf16, to_f16, to_int8,
+    from_bf16, from_f16, int8_scale, int16_scale, round_to_f16, to_bf16, to_f16, to_int8, to_int16,
 };
 
 /// IEEE 754-2019, section 3.4, with 5 bits of exponent and 10 of fraction.
@@ -108,6 +108,12 @@ fn integers_are_the_nearest_multiples_of_the_scale() {
     assert_eq!(w.map(|w| to_int8(w, scale)), [50, -127, 0, 0, 100, 2]);
     for w in w {
         assert!((f32::from(to_int8(w, scale)) * scale - w).abs() <= scale / 2.0);
+    }
+    let scale = int16_scale(w.into_iter());
+    assert_eq!(scale, 1.27 / 16383.0);
+    assert_eq!(to_int16(-1.27, scale), -16383);
+    for w in w {
+        assert!((f32::from(to_int16(w, scale)) * scale - w).abs() <= scale * 0.501);
     }
     assert_eq!(int8_scale([0.0, -0.0].into_iter()), 1.0);
     assert_eq!(int8_scale([f32::from_bits(3)].into_iter()), 1.0);

@@ -1,5 +1,7 @@
 //! Every kernel against its naive twin, on random shapes and values, and bit for bit on every instruction set that the CPU offers.
 
+mod support;
+
 use lads_kernels::reference as naive;
 use lads_kernels::{
     Activation, Append, Attention, Axis, BinaryKind, Cache, CacheFormat, CacheMut, Input, Isa,
@@ -9,6 +11,7 @@ use lads_kernels::{
 };
 use proptest::prelude::*;
 use proptest::sample::select;
+use support::{close_up_to, digest, on_all, values};
 
 const UNARY: [UnaryKind; 13] = [
     UnaryKind::Relu,
@@ -44,112 +47,10 @@ const REDUCE: [ReduceKind; 5] = [
     ReduceKind::Prod,
 ];
 
-/// Values in -1..1 from a seed: long vectors would make proptest slow, and shrinking their elements says nothing.
-fn values(len: usize, seed: u64) -> Vec<f32> {
-    let mut state = seed;
-    let next = || {
-        state = state
-            .wrapping_mul(6364136223846793005)
-            .wrapping_add(1442695040888963407);
-        (state >> 40) as f32 / (1_u64 << 23) as f32 - 1.0
-    };
-    std::iter::repeat_with(next).take(len).collect()
-}
-
 /// Equal up to `bound` times the size of what was added up.
 #[track_caller]
 fn close(got: &[f32], expected: &[f32], bound: f32) {
-    assert_eq!(got.len(), expected.len());
-    for (i, (&got, &expected)) in got.iter().zip(expected).enumerate() {
-        let equal = got == expected || got.is_nan() && expected.is_nan();
-        let near = (got - expected).abs() <= bound * expected.abs().max(1.0);
-        assert!(equal || near, "element {i}: {got} against {expected}");
-    }
-}
-
-/// Runs a kernel on every instruction set; its results, which have to have the same bits, and not a number in the same places.
-#[track_caller]
-fn on_all<const N: usize>(kernel: impl Fn(Isa) -> [Vec<f32>; N]) -> [Vec<f32>; N] {
-    let portable = kernel(Isa::portable());
-    for isa in Isa::all() {
-        for (got, expected) in kernel(isa).iter().zip(&portable) {
-            assert_eq!(got.len(), expected.len());
-            for (i, (got, expected)) in got.iter().zip(expected).enumerate() {
-                // Which of its bit patterns not a number has is left open by Rust.
-                let same = got.to_bits() == expected.to_bits() || got.is_nan() && expected.is_nan();
-                assert!(same, "{isa:?}, element {i}: {got:e} against {expected:e}");
-            }
-        }
-    }
-    portable
-}
-
-/// A matrix as it is stored, and the numbers that it then means.
-struct Matrix {
-    format: WeightFormat,
-    singles: Vec<f32>,
-    halves: Vec<u16>,
-    integers: Vec<i8>,
-    scales: Vec<f32>,
-    meant: Vec<f32>,
-}
-
-impl Matrix {
-    fn new(w: &[f32], [k, n]: [usize; 2], format: WeightFormat) -> Self {
-        fn packed<T: Copy + Default>(w: &[T], [k, n]: [usize; 2]) -> Vec<T> {
-            let mut out = vec![T::default(); packed_len(k, n)];
-            pack(w, k, n, &mut out);
-            out
-        }
-        let column = |j: usize| w.iter().skip(j).step_by(n).copied();
-        let scales: Vec<f32> = (0..n).map(|j| stored::int8_scale(column(j))).collect();
-        let bits: Vec<u16> = match format {
-            WeightFormat::F16 => w.iter().map(|&w| stored::to_f16(w).unwrap()).collect(),
-            _ => w.iter().map(|&w| stored::to_bf16(w).unwrap()).collect(),
-        };
-        let integers: Vec<i8> = (w.iter().enumerate())
-            .map(|(i, &w)| stored::to_int8(w, scales[i % n]))
-            .collect();
-        let meant = match format {
-            WeightFormat::F32 => w.to_vec(),
-            WeightFormat::F16 => bits.iter().map(|&bits| stored::from_f16(bits)).collect(),
-            WeightFormat::Bf16 => bits.iter().map(|&bits| stored::from_bf16(bits)).collect(),
-            WeightFormat::Int8 => (integers.iter().enumerate())
-                .map(|(i, &q)| f32::from(q) * scales[i % n])
-                .collect(),
-        };
-        Self {
-            format,
-            singles: packed(w, [k, n]),
-            halves: packed(&bits, [k, n]),
-            integers: packed(&integers, [k, n]),
-            scales,
-            meant,
-        }
-    }
-
-    fn panels(&self) -> Panels<'_> {
-        match self.format {
-            WeightFormat::F32 => Panels::F32(&self.singles),
-            WeightFormat::F16 => Panels::F16(&self.halves),
-            WeightFormat::Bf16 => Panels::Bf16(&self.halves),
-            WeightFormat::Int8 => Panels::Int8 {
-                panels: &self.integers,
-                scales: &self.scales,
-            },
-        }
-    }
-}
-
-fn activation() -> impl Strategy<Value = Activation> {
-    let all = [
-        Activation::None,
-        Activation::Relu,
-        Activation::LeakyRelu(0.2),
-        Activation::Tanh,
-        Activation::Sigmoid,
-    ];
-    select(all.to_vec())
+    close_up_to(got, expected, bound, &vec![0.0; got.len()]);
 }
 
 /// A number as a cache of this format holds it.
@@ -203,37 +104,6 @@ impl Stored {
 }
 
 proptest! {
-    #[test]
-    fn linear_equals_its_twin(
-        (m, k, n) in (1_usize..6, 1_usize..70, 1_usize..180),
-        (format, activation) in (select(WeightFormat::ALL.to_vec()), activation()),
-        (with_bias, accumulate) in any::<(bool, bool)>(),
-        seed in any::<u64>(),
-    ) {
-        let (x, w) = (values(m * k, seed), values(k * n, seed ^ 1));
-        let bias = if with_bias { values(n, seed ^ 2) } else { Vec::new() };
-        let before = values(m * n, seed ^ 3);
-        let matrix = Matrix::new(&w, [k, n], format);
-        let layer = Linear { k, n, w: matrix.panels(), bias: &bias, activation, accumulate };
-        let [y] = on_all(|isa| {
-            let mut y = before.clone();
-            layer.run(isa, &x, &mut y);
-            [y]
-        });
-        let mut expected = vec![0.0; m * n];
-        naive::linear(&x, &matrix.meant, &bias, activation, [k, n], &mut expected);
-        if accumulate {
-            expected.iter_mut().zip(&before).for_each(|(y, before)| *y += before);
-        }
-        close(&y, &expected, 1e-5);
-        // Each row alone gives the same bits as the rows together.
-        for (row, x) in x.chunks(k).enumerate() {
-            let mut alone = before[row * n..(row + 1) * n].to_vec();
-            layer.run(Isa::detect(), x, &mut alone);
-            prop_assert_eq!(&alone, &y[row * n..(row + 1) * n]);
-        }
-    }
-
     #[test]
     fn layer_norm_equals_its_twin(rows in 1_usize..4, cols in 1_usize..150, seed in any::<u64>()) {
         let (x, gamma, beta) = (values(rows * cols, seed), values(cols, seed ^ 1), values(cols, seed ^ 2));
@@ -491,32 +361,13 @@ fn what_is_not_a_number_is_passed_over_by_the_best_element() {
     assert_eq!((arg_max(&[f32::NAN]), arg_max(&[])), (0, 0));
 }
 
-#[test]
-fn weights_are_packed_in_panels_of_sixty_four_outputs() {
-    // [k, n] = [2, 82]: a whole panel, and one of thirty-two of which eighteen are used.
-    let w: Vec<f32> = (1..=164_u8).map(f32::from).collect();
-    let mut packed = vec![f32::NAN; packed_len(2, 82)];
-    pack(&w, 2, 82, &mut packed);
-    assert_eq!(packed.len(), 2 * 96);
-    assert_eq!(packed[..64], w[..64]);
-    assert_eq!(packed[64..128], w[82..146]);
-    assert_eq!(packed[128..146], w[64..82]);
-    assert_eq!(packed[160..178], w[146..]);
-    let padding = packed[146..160].iter().chain(&packed[178..]);
-    assert!(padding.into_iter().all(|&w| w == 0.0));
-}
-
 /// Bits that must never change, on any target or at any optimisation level.
 #[test]
 fn results_have_the_same_bits_everywhere() {
-    fn digest(x: &[f32]) -> u64 {
-        x.iter().fold(0xcbf2_9ce4_8422_2325, |hash, x| {
-            (hash ^ u64::from(x.to_bits())).wrapping_mul(0x0100_0000_01b3)
-        })
-    }
     let (k, n) = (128, 40);
-    let mut packed = vec![0.0; packed_len(k, n)];
-    pack(&values(k * n, 1), k, n, &mut packed);
+    let mut packed = vec![0.0; packed_len(WeightFormat::F32, [k, n])];
+    let w = values(k * n, 1);
+    pack(WeightFormat::F32, &w, [k, n], &mut packed);
     let bias = values(n, 2);
     let layer = Linear {
         k,

@@ -21,7 +21,7 @@ const ALIGN: usize = 16;
 enum Form {
     Plain,
     Packed(WeightFormat),
-    Scales,
+    Scales(WeightFormat),
 }
 
 /// A packed matrix.
@@ -29,7 +29,7 @@ enum Form {
 pub(crate) struct Packed {
     pub format: WeightFormat,
     pub w: WeightSpan,
-    /// Of `Int8` only.
+    /// Of integers only.
     pub scales: Option<WeightSpan>,
 }
 
@@ -59,57 +59,66 @@ impl Weights {
         let &[k, n] = &tensor.shape[..] else {
             return Err("has weights that are no matrix".into());
         };
-        let format = self.format;
+        // One step for inputs of any size would be too coarse for the small ones.
+        let format = if self.format.is_scaled() && is_uneven(data, n) {
+            WeightFormat::F32
+        } else {
+            self.format
+        };
+        let column = |j: usize| data.iter().skip(j).step_by(n).copied();
         let mut scales = None;
         let w = match format {
-            WeightFormat::F32 => self.once(tensor, Form::Packed(format), |this| {
-                this.store_panels(data, [k, n])
-            })?,
+            WeightFormat::F32 => self.panels(tensor, format, [k, n], data)?,
             WeightFormat::F16 => {
                 let halves = converted(data, format, stored::to_f16)?;
-                self.once(tensor, Form::Packed(format), |this| {
-                    this.store_panels(&halves, [k, n])
-                })?
+                self.panels(tensor, format, [k, n], &halves)?
             }
             WeightFormat::Bf16 => {
                 let halves = converted(data, format, stored::to_bf16)?;
-                self.once(tensor, Form::Packed(format), |this| {
-                    this.store_panels(&halves, [k, n])
-                })?
+                self.panels(tensor, format, [k, n], &halves)?
             }
             WeightFormat::Int8 => {
-                let column = |j: usize| data.iter().skip(j).step_by(n).copied();
-                let columns: Vec<f32> = (0..n).map(|j| stored::int8_scale(column(j))).collect();
-                let mut at = (0..n).cycle();
-                let integers = converted(data, format, |w| {
-                    let scale = columns[at.next().unwrap_or(0)];
-                    w.is_finite().then(|| stored::to_int8(w, scale))
-                })?;
+                let columns = (0..n)
+                    .map(|j| stored::int8_scale(column(j)))
+                    .collect::<Vec<_>>();
+                let integers = scaled(data, format, &columns, stored::to_int8)?;
                 // The scales come first, next to the bias: both are read once per panel.
-                scales = Some(self.once(tensor, Form::Scales, |this| this.store(&columns))?);
-                self.once(tensor, Form::Packed(format), |this| {
-                    this.store_panels(&integers, [k, n])
-                })?
+                scales =
+                    Some(self.once(tensor, Form::Scales(format), |this| this.store(&columns))?);
+                self.panels(tensor, format, [k, n], &integers)?
+            }
+            WeightFormat::Int16 => {
+                let columns = (0..n)
+                    .map(|j| stored::int16_scale(column(j)))
+                    .collect::<Vec<_>>();
+                let integers = scaled(data, format, &columns, stored::to_int16)?;
+                scales =
+                    Some(self.once(tensor, Form::Scales(format), |this| this.store(&columns))?);
+                self.panels(tensor, format, [k, n], &integers)?
             }
         };
         Ok(Packed { format, w, scales })
     }
 
     /// Panels as words; of a matrix of which another program needs some columns only, the columns' panels are found again.
-    fn store_panels<T: NoUninit + Default>(
+    fn panels<T: NoUninit + Default>(
         &mut self,
-        data: &[T],
+        tensor: &Arc<Tensor>,
+        format: WeightFormat,
         [k, n]: [usize; 2],
+        data: &[T],
     ) -> Result<WeightSpan, String> {
-        let mut panels = vec![T::default(); packed_len(k, n)];
-        pack(data, k, n, &mut panels);
-        let words: Vec<f32> = bytemuck::cast_slice(&panels)
-            .as_chunks::<4>()
-            .0
-            .iter()
-            .map(|&word| f32::from_bits(u32::from_le_bytes(word)))
-            .collect();
-        self.store_blocks(&words, k * PANEL * size_of::<T>() / 4)
+        self.once(tensor, Form::Packed(format), |this| {
+            let mut panels = vec![T::default(); packed_len(format, [k, n])];
+            pack(format, data, [k, n], &mut panels);
+            let words: Vec<f32> = bytemuck::cast_slice(&panels)
+                .as_chunks::<4>()
+                .0
+                .iter()
+                .map(|&word| f32::from_bits(u32::from_le_bytes(word)))
+                .collect();
+            this.store_blocks(&words, packed_len(format, [k, PANEL]) * size_of::<T>() / 4)
+        })
     }
 
     fn once(
@@ -175,6 +184,32 @@ impl Weights {
     }
 }
 
+/// Whether a `[k, n]` matrix weighs its inputs very differently, as the first layer does whose inputs are sensors, each in its
+/// own unit: some input has four times the root mean square of the median one.
+fn is_uneven(data: &[f32], n: usize) -> bool {
+    let squares = |row: &[f32]| row.iter().map(|w| w * w).sum::<f32>();
+    let mut inputs: Vec<f32> = data.chunks(n.max(1)).map(squares).collect();
+    inputs.sort_by(f32::total_cmp);
+    let median = inputs.get(inputs.len() / 2).copied().unwrap_or(0.0);
+    inputs
+        .last()
+        .is_some_and(|&largest| largest > 16.0 * median)
+}
+
+/// Every weight as an integer, by the scale of its column.
+fn scaled<T>(
+    data: &[f32],
+    format: WeightFormat,
+    scales: &[f32],
+    to: impl Fn(f32, f32) -> T,
+) -> Result<Vec<T>, String> {
+    let mut at = scales.iter().cycle();
+    converted(data, format, |w| {
+        let &scale = at.next()?;
+        w.is_finite().then(|| to(w, scale))
+    })
+}
+
 /// Every weight in another format.
 fn converted<T>(
     data: &[f32],
@@ -194,4 +229,37 @@ fn converted<T>(
 /// The bits of elements, so that zeros of different sign differ.
 fn bytes(data: &[f32]) -> &[u8] {
     bytemuck::cast_slice(data)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::{WeightFormat, Weights};
+    use crate::tensor::Tensor;
+
+    /// The format that a `[k, 20]` matrix gets, whose inputs have these weights.
+    fn format(wanted: WeightFormat, inputs: &[f32]) -> WeightFormat {
+        let data = inputs.iter().flat_map(|&w| [w; 20]).collect();
+        let mut weights = Weights {
+            format: wanted,
+            ..Weights::default()
+        };
+        let matrix = Arc::new(Tensor::f32(&[inputs.len(), 20], data));
+        weights.packed(&matrix).unwrap().format
+    }
+
+    #[test]
+    fn inputs_of_very_different_weight_keep_their_bits() {
+        let (even, uneven) = ([0.1, -0.3, 0.2, 0.0, 0.39], [0.1, -0.3, 0.2, 0.0, 0.9]);
+        for wanted in WeightFormat::ALL {
+            assert_eq!(format(wanted, &even), wanted);
+            let expected = if wanted.is_scaled() {
+                WeightFormat::F32
+            } else {
+                wanted
+            };
+            assert_eq!(format(wanted, &uneven), expected);
+        }
+    }
 }

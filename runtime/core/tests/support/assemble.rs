@@ -31,8 +31,13 @@ struct Pool(Vec<f32>);
 
 impl Pool {
     fn dense(&mut self, dense: &Dense) -> Packed {
-        let mut panels = vec![0.0; packed_len(dense.k, dense.n)];
-        pack(&dense.w, dense.k, dense.n, &mut panels);
+        let mut panels = vec![0.0; packed_len(op::WeightFormat::F32, [dense.k, dense.n])];
+        pack(
+            op::WeightFormat::F32,
+            &dense.w,
+            [dense.k, dense.n],
+            &mut panels,
+        );
         Packed {
             k: dense.k as u32,
             n: dense.n as u32,

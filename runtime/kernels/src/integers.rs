@@ -1,0 +1,223 @@
+//! Panels of integer weights: products and sums of integers, which no instruction set rounds.
+//!
+//! ```text
+//! for each part of up to 256 inputs:           x as integers of 14 bits, times one scale for the part
+//!     for each sixteen inputs:                 as eight pairs
+//!         integers[0..64] = sum over pairs of  x[2l] * panel[l][0..64][0] + x[2l + 1] * panel[l][0..64][1]
+//!         sum[0..64] += integers
+//!     y[0..64] += sum * scale of the part
+//! ```
+//!
+//! A processor multiplies two pairs of 16-bit integers and adds the products in one instruction for each 32-bit lane: twice the weights
+//! of a multiplication of floats, and nothing to decode. Sixteen products of 14 and 15 bits are the most that a 32-bit
+//! sum holds, so nothing overflows; the sums go on as floats, in the order of the inputs.
+//!
+//! The integers of a part of `x` differ from `x * 8191 / largest` by half a unit: an error of an input of 2^-14 of the largest
+//! magnitude in its part. A part with an infinite number, or one that is none, has sums that are none; a part whose magnitudes
+//! are all below 2^-100 is read as zero.
+
+use core::hint::black_box;
+use core::{array, slice};
+
+use crate::elementwise::assign;
+use crate::lanes::{Block, LANES};
+use crate::linear::{PANEL_BLOCKS, Sums};
+use crate::simd::{Portable, Simd, prefetch_behind};
+
+/// Inputs that are made integers at a time.
+pub(crate) const PART: usize = 256;
+
+/// Pairs of inputs whose products are added before they become floats: `2 * PAIRS * 16383 * 8191 < 2^31`.
+const PAIRS: usize = 8;
+
+/// Of the magnitudes of inputs as integers.
+const LARGEST: f32 = 8191.0;
+
+/// Two inputs.
+type Pair = [i16; 2];
+
+/// How integer weights are stored.
+pub(crate) trait Integer: Copy {
+    /// Two weights of each of sixteen outputs, as 16-bit integers.
+    fn load<S: Simd>(simd: S, from: &[Self; 2 * LANES]) -> S::Pairs;
+}
+
+impl Integer for i16 {
+    #[inline(always)]
+    fn load<S: Simd>(simd: S, from: &[Self; 2 * LANES]) -> S::Pairs {
+        simd.load_i16(from)
+    }
+}
+
+impl Integer for i8 {
+    #[inline(always)]
+    fn load<S: Simd>(simd: S, from: &[Self; 2 * LANES]) -> S::Pairs {
+        simd.load_i8(from)
+    }
+}
+
+/// A part of a row as integers, followed by zeros.
+pub(crate) struct Part {
+    pairs: [Pair; PART / 2],
+    /// What one of them means.
+    scale: f32,
+}
+
+impl Part {
+    /// Of no inputs.
+    pub const EMPTY: Self = Self {
+        pairs: [[0; 2]; PART / 2],
+        scale: 0.0,
+    };
+
+    /// Takes the first part of a row.
+    #[inline(always)]
+    pub fn take<S: Simd>(&mut self, simd: S, x: &[f32]) {
+        const INFINITE: u32 = f32::INFINITY.to_bits();
+        /// 2^-100
+        const SMALLEST: u32 = (127 - 100) << 23;
+        // All ones, for masks: a selection may be compiled to a branch.
+        let all = |condition: bool| u32::from(condition).wrapping_neg();
+        let x = x.get(..PART).unwrap_or(x);
+        let (blocks, tail) = x.as_chunks::<LANES>();
+        let mut last = [0.0; LANES];
+        assign(&mut last, tail);
+        // Loops, because iterators that take closures are not compiled for the instruction set.
+        let mut largest = simd.larger(simd.zeros(), simd.load(&last));
+        for x in blocks {
+            largest = simd.larger(largest, simd.load(x));
+        }
+        let largest = simd.largest(largest);
+        let (usable, finite) = (all(largest >= SMALLEST), all(largest < INFINITE));
+        let magnitude = f32::from_bits(largest);
+        let inverse = f32::from_bits((LARGEST / magnitude).to_bits() & usable & finite);
+        let scale = (magnitude / LARGEST).to_bits() & usable;
+        // Ones all through are not a number.
+        self.scale = f32::from_bits(scale | !finite);
+        let inverse = simd.splat(inverse);
+        let (to, _) = self.pairs.as_flattened_mut().as_chunks_mut::<LANES>();
+        for (to, x) in to.iter_mut().zip(blocks) {
+            *to = simd.whole(simd.mul(simd.load(x), inverse));
+        }
+        if let Some(to) = to.get_mut(blocks.len()) {
+            *to = simd.whole(simd.mul(simd.load(&last), inverse));
+        }
+    }
+}
+
+/// Adds the sums of parts `i` of `R` rows with one panel of so many blocks.
+#[inline(always)]
+pub(crate) fn panel<S: Simd, W: Integer, const R: usize>(
+    simd: S,
+    w: &[W],
+    blocks: usize,
+    parts: &[Part],
+    i: usize,
+    sums: &mut Sums,
+) {
+    let Some(rows) = parts.first_chunk::<R>() else {
+        return;
+    };
+    if i == 0 {
+        prefetch_behind(w);
+        for sums in sums.iter_mut().take(R) {
+            *sums = [[0.0; LANES]; PANEL_BLOCKS];
+        }
+    }
+    let (w, _) = w.as_chunks::<{ 2 * LANES }>();
+    let w = w.get(i * PART / 2 * blocks..).unwrap_or(&[]);
+    if S::SUMS < 4 {
+        for (row, sums) in rows.iter().zip(sums) {
+            one_row(w, blocks, row, sums);
+        }
+        return;
+    }
+    let mut at = 0;
+    while at < blocks {
+        let (place, left) = ([at, blocks], blocks - at);
+        // Each sum takes two registers, one of integers and one of floats.
+        at += if S::SUMS >= 2 * PANEL_BLOCKS * R {
+            // Narrower panels are few, and code is not free either.
+            if left >= PANEL_BLOCKS {
+                sweep::<S, W, PANEL_BLOCKS, R>(simd, w, place, rows, sums)
+            } else {
+                sweep::<S, W, 1, R>(simd, w, place, rows, sums)
+            }
+        } else if S::SUMS >= 4 * R && left >= 2 {
+            sweep::<S, W, 2, R>(simd, w, place, rows, sums)
+        } else {
+            sweep::<S, W, 1, R>(simd, w, place, rows, sums)
+        };
+    }
+}
+
+/// The same for one row where registers are few, block by block: compiled once for any number of rows.
+#[inline(never)]
+fn one_row<W: Integer>(
+    w: &[[W; 2 * LANES]],
+    blocks: usize,
+    row: &Part,
+    sums: &mut [Block; PANEL_BLOCKS],
+) {
+    for at in 0..blocks {
+        let (rows, sums) = (array::from_ref(row), slice::from_mut(sums));
+        sweep::<Portable, W, 1, 1>(Portable, w, [at, blocks], rows, sums);
+    }
+}
+
+/// Adds the sums of `R` rows with `P` blocks, from block `at` on, of a panel of `blocks`; returns `P`.
+#[inline(always)]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "arrays whose length is a constant, as is every index"
+)]
+#[expect(
+    unsafe_code,
+    reason = "the sums stay in registers only without a branch in the loop, and compilers keep some of the bounds checks"
+)]
+fn sweep<S: Simd, W: Integer, const P: usize, const R: usize>(
+    simd: S,
+    w: &[[W; 2 * LANES]],
+    [at, blocks]: [usize; 2],
+    rows: &[Part; R],
+    out: &mut [[Block; PANEL_BLOCKS]],
+) -> usize {
+    if at + P > blocks {
+        return P;
+    }
+    let x = rows.each_ref().map(|row| row.pairs.as_chunks::<PAIRS>().0);
+    // Not unrolled: that would double the code for nothing.
+    let pairs = black_box(PAIRS);
+    let mut sums = [[simd.splat(0.0); P]; R];
+    for (l, w) in w
+        .chunks_exact(PAIRS * blocks)
+        .take(PART / 2 / PAIRS)
+        .enumerate()
+    {
+        let mut integers = [[simd.zeros(); P]; R];
+        for pair in 0..pairs {
+            // SAFETY: `l` is below the number of groups in a part, which is how many `x[r]` has, and `pair` below `PAIRS`,
+            // which is how many pairs a group has.
+            let x = x.map(|x| simd.splat_pair(unsafe { *x.get_unchecked(l).get_unchecked(pair) }));
+            for p in 0..P {
+                // SAFETY: `w` has `PAIRS * blocks` elements, `pair < PAIRS`, `at + P <= blocks`, as compared above, and `p < P`.
+                let w = W::load(simd, unsafe { w.get_unchecked(pair * blocks + at + p) });
+                for (integers, &x) in integers.iter_mut().zip(&x) {
+                    integers[p] = simd.add_products(integers[p], w, x);
+                }
+            }
+        }
+        for (sums, integers) in sums.iter_mut().zip(integers) {
+            for (sum, integers) in sums.iter_mut().zip(integers) {
+                *sum = simd.add(*sum, simd.floats(integers));
+            }
+        }
+    }
+    for (out, (sums, row)) in out.iter_mut().zip(sums.into_iter().zip(rows)) {
+        let scale = simd.splat(row.scale);
+        for (out, sum) in out.iter_mut().skip(at).zip(sums) {
+            simd.store(simd.add_product(simd.load(out), sum, scale), out);
+        }
+    }
+    P
+}
