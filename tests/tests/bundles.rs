@@ -110,11 +110,8 @@ fn one_element_less_of_memory_is_refused() {
     for path in bundles() {
         let image = compiled(&path);
         let policy = Policy::new_checked(image.as_bytes()).unwrap();
-        let Memory {
-            mut arena,
-            mut state,
-        } = Memory::of(&policy).expect("there is memory");
-        let (arena_len, state_len) = (arena.len(), state.len());
+        let (arena_len, state_len) = (policy.arena_len(), policy.state_len());
+        let (mut arena, mut state) = (vec![0.0; arena_len], vec![0.0; state_len]);
         let short = Workspace::new(&policy, &mut arena[1..], &mut state).unwrap_err();
         assert_eq!(
             short,

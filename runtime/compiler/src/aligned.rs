@@ -1,32 +1,24 @@
 //! Bytes of an image at an address as weights want it.
 
-use lads_core::image::WEIGHTS_ALIGN;
+use std::alloc::{Layout, handle_alloc_error};
 
-/// Bytes whose address is a multiple of 64.
+use crate::pages::Pages;
+
+/// Bytes whose address is a multiple of a cache line and of a page.
 #[derive(Debug)]
-pub struct Aligned {
-    /// The bytes start at `start`.
-    memory: Vec<u8>,
-    start: usize,
-    len: usize,
-}
+pub struct Aligned(Pages);
 
 impl Aligned {
-    /// A copy of `bytes`.
+    /// A copy of `bytes`; without memory for it, the program ends as it does where a `Vec` gets none.
     pub fn new(bytes: &[u8]) -> Self {
-        let mut memory = vec![0; bytes.len() + WEIGHTS_ALIGN];
-        let start = memory.as_ptr().align_offset(WEIGHTS_ALIGN);
-        let start = start.min(WEIGHTS_ALIGN);
-        memory[start..start + bytes.len()].copy_from_slice(bytes);
-        Self {
-            memory,
-            start,
-            len: bytes.len(),
-        }
+        let mut pages = Pages::zeroed(bytes.len())
+            .unwrap_or_else(|_| handle_alloc_error(Layout::for_value(bytes)));
+        pages.as_mut().copy_from_slice(bytes);
+        Self(pages)
     }
 
     /// The bytes.
     pub fn as_bytes(&self) -> &[u8] {
-        &self.memory[self.start..self.start + self.len]
+        self.0.as_bytes()
     }
 }

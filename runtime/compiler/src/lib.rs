@@ -35,6 +35,7 @@ mod import;
 mod lower;
 mod memory;
 mod onnx;
+mod pages;
 mod plan;
 mod report;
 mod tensor;

@@ -4,13 +4,15 @@
 
 use lads_core::{Controller, Isa, Policy, Workspace, WorkspaceTooSmall};
 
+use crate::pages::Pages;
+
 /// What one controller works in, allocated once.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct Memory {
-    /// Scratch, in f32 elements.
-    pub arena: Vec<f32>,
-    /// What survives a control step, in f32 elements.
-    pub state: Vec<f32>,
+    /// Scratch, then what survives a control step.
+    pages: Pages,
+    /// Elements of the scratch.
+    arena: usize,
 }
 
 impl Memory {
@@ -22,18 +24,8 @@ impl Memory {
     pub fn of(policy: &Policy<'_>) -> Result<Self, MemoryError> {
         let (arena, state) = (policy.arena_len(), policy.state_len());
         let bytes = Self::bytes_of(arena.saturating_add(state))?;
-        let zeros = |len| -> Result<Vec<f32>, MemoryError> {
-            let mut elements = Vec::new();
-            elements
-                .try_reserve_exact(len)
-                .map_err(|_| MemoryError::Exhausted { bytes })?;
-            elements.resize(len, 0.0);
-            Ok(elements)
-        };
-        Ok(Self {
-            arena: zeros(arena)?,
-            state: zeros(state)?,
-        })
+        let pages = Pages::zeroed(bytes).map_err(|_| MemoryError::Exhausted { bytes })?;
+        Ok(Self { pages, arena })
     }
 
     /// Bytes of so many f32 elements, if that is not more than a policy gets.
@@ -59,7 +51,8 @@ impl Memory {
         policy: &Policy<'p>,
         isa: Isa,
     ) -> Result<Controller<'p, 'm>, MemoryError> {
-        let workspace = Workspace::new(policy, &mut self.arena, &mut self.state)?;
+        let (arena, state) = self.pages.as_mut().split_at_mut(self.arena);
+        let workspace = Workspace::new(policy, arena, state)?;
         Ok(Controller::with_isa(*policy, workspace, isa))
     }
 }
