@@ -1,5 +1,6 @@
 //! The work of a control step does not depend on what is observed: under `callgrind`, the same number of instructions for a hundred
-//! random observations at the same context. Skipped where `valgrind` is missing.
+//! random observations at the same context, of an ordinary step and of one that decides, with 32-bit weights and with integers.
+//! Skipped where `valgrind` is missing.
 //!
 //! The test runs its own binary once more under `callgrind`, which counts what [`one_control_step`] executes and writes one file
 //! for each call. Valgrind knows no AVX-512, so what is counted are the AVX2 kernels, or on older processors the portable ones.
@@ -9,11 +10,20 @@ use std::collections::BTreeSet;
 use std::hint::black_box;
 use std::process::Command;
 
-use lads_compiler::Memory;
+use lads_compiler::{Bundle, Memory, Options, WeightFormat, compile_with};
 use lads_core::{Controller, Instruction, Policy, StepReport};
-use lads_tests::{compiled, project_path};
+use lads_tests::project_path;
 
+/// Names the case to the program under `callgrind`.
 const CHILD: &str = "LADS_STEPS_UNDER_CALLGRIND";
+
+/// Steps before the one that is counted, of an episode that decides in every tenth.
+const CASES: [(WeightFormat, usize); 4] = [
+    (WeightFormat::F32, 1),
+    (WeightFormat::F32, 10),
+    (WeightFormat::Int16, 1),
+    (WeightFormat::Int16, 10),
+];
 
 /// Observations of which the steps are counted.
 const OBSERVATIONS: usize = 100;
@@ -33,9 +43,15 @@ fn one_control_step(
     controller.step(black_box(observation), action).unwrap()
 }
 
-/// The second step of an episode, which does not decide, with observations from all over the contract's limits.
-fn steps() {
-    let image = compiled(&project_path("models/kitchen.onnx"));
+/// A step of an episode, with observations from all over the contract's limits.
+fn steps((weights, before): (WeightFormat, usize)) {
+    let bundle = Bundle::open(&project_path("models/kitchen.onnx")).unwrap();
+    let options = Options {
+        weights,
+        tolerance: Some(0.1),
+        ..Options::default()
+    };
+    let image = compile_with(&bundle, options).unwrap();
     let policy = Policy::new_checked(image.as_bytes()).unwrap();
     let mut memory = Memory::of(&policy).expect("there is memory");
     let mut controller = memory.controller(&policy).unwrap();
@@ -51,7 +67,9 @@ fn steps() {
     };
     for _ in 0..OBSERVATIONS {
         controller.reset();
-        controller.step(first, &mut action).unwrap();
+        for _ in 0..before {
+            controller.step(first, &mut action).unwrap();
+        }
         // Limits may be as wide as all numbers; a machine's are not.
         let observation: Vec<f32> = (policy.contract().observations())
             .map(|element| {
@@ -60,15 +78,28 @@ fn steps() {
             })
             .collect();
         let report = one_control_step(&mut controller, &observation, &mut action);
-        assert!(!report.decided);
+        assert_eq!(report.decided, before % 10 == 0);
     }
 }
 
 #[test]
 fn a_step_executes_the_same_number_of_instructions_whatever_it_observes() {
-    if std::env::var_os(CHILD).is_some() {
-        return steps();
+    if let Some(case) = std::env::var_os(CHILD) {
+        let case: usize = case.to_str().and_then(|case| case.parse().ok()).unwrap();
+        return steps(CASES[case]);
     }
+    for (number, case) in CASES.iter().enumerate() {
+        let Some(different) = counts(number) else {
+            println!("skipped: valgrind is not installed");
+            return;
+        };
+        println!("instructions of a step, {case:?}: {different:?}");
+        assert_eq!(different.len(), 1, "{case:?}: {different:?}");
+    }
+}
+
+/// The numbers of instructions that steps of a case took; `None` without `valgrind`.
+fn counts(case: usize) -> Option<BTreeSet<u64>> {
     let folder = tempfile::tempdir().unwrap();
     let counted = Command::new("valgrind")
         .args(["--tool=callgrind", "--toggle-collect=one_control_step"])
@@ -82,12 +113,9 @@ fn a_step_executes_the_same_number_of_instructions_whatever_it_observes() {
             "--exact",
             "a_step_executes_the_same_number_of_instructions_whatever_it_observes",
         ])
-        .env(CHILD, "1")
+        .env(CHILD, case.to_string())
         .output();
-    let Ok(output) = counted else {
-        println!("skipped: valgrind is not installed");
-        return;
-    };
+    let output = counted.ok()?;
     assert!(output.status.success(), "{output:?}");
     // One file per call, and a last one when the program ends, in which nothing was counted.
     let counts: Vec<u64> = std::fs::read_dir(folder.path())
@@ -102,7 +130,5 @@ fn a_step_executes_the_same_number_of_instructions_whatever_it_observes() {
         .filter(|&count| count > 0)
         .collect();
     assert_eq!(counts.len(), OBSERVATIONS);
-    let different: BTreeSet<u64> = counts.into_iter().collect();
-    println!("instructions of a step: {different:?}");
-    assert_eq!(different.len(), 1, "{different:?}");
+    Some(counts.into_iter().collect())
 }

@@ -78,11 +78,9 @@ impl Decider {
 pub(crate) fn margin(logits: &[f32]) -> f32 {
     let (mut first, mut second) = (f32::NEG_INFINITY, f32::NEG_INFINITY);
     for &logit in logits {
-        if logit > first {
-            (first, second) = (logit, first);
-        } else if logit > second {
-            second = logit;
-        }
+        // No branch that depends on the logits.
+        second = second.max(first.min(logit));
+        first = first.max(logit);
     }
     first - second
 }

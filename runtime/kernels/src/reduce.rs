@@ -75,20 +75,38 @@ fn fold(x: &[f32], y: &mut [f32], f: impl Fn(f32, f32) -> f32) {
 
 /// Index of the largest element, the first of equal ones; elements that are not a number are passed over. 0 if there is none.
 pub fn arg_max(x: &[f32]) -> usize {
-    best(x, |x, best| x > best)
+    first_largest(x, |rank| rank)
 }
 
 /// Index of the smallest element, the first of equal ones; elements that are not a number are passed over. 0 if there is none.
 pub fn arg_min(x: &[f32]) -> usize {
-    best(x, |x, best| x < best)
+    first_largest(x, |rank| -rank)
 }
 
-fn best(x: &[f32], better: impl Fn(f32, f32) -> bool) -> usize {
-    let mut found: Option<(usize, f32)> = None;
-    for (i, &x) in x.iter().enumerate().filter(|(_, x)| !x.is_nan()) {
-        if found.is_none_or(|(_, best)| better(x, best)) {
-            found = Some((i, x));
-        }
+/// Arithmetic of integers without a comparison, which may be compiled to a branch: a decision executes the same instructions
+/// whichever plan is the best.
+#[inline(always)]
+fn first_largest(x: &[f32], rank: impl Fn(i64) -> i64) -> usize {
+    /// Below the rank of every number, and its negation too.
+    const NONE: i64 = i64::MIN / 4;
+    /// Ones where it is negative, else zeros.
+    #[inline(always)]
+    fn negative(x: i64) -> i64 {
+        x >> 63
     }
-    found.map_or(0, |(i, _)| i)
+    let (mut found, mut largest) = (0, NONE);
+    for (i, &x) in x.iter().enumerate() {
+        // Zero has one sign now.
+        let bits = i64::from((x + 0.0).to_bits());
+        let magnitude = bits & 0x7fff_ffff;
+        let sign = negative(0x7fff_ffff - bits);
+        // Sign and magnitude as one number, in the order of the floats.
+        let ordered = (magnitude ^ sign) - sign;
+        let none = negative(i64::from(f32::INFINITY.to_bits()) - magnitude);
+        let rank = rank(ordered) & !none | NONE & none;
+        let larger = negative(largest - rank);
+        largest = largest & !larger | rank & larger;
+        found = found & !(larger as usize) | i & larger as usize;
+    }
+    found
 }
