@@ -136,8 +136,8 @@ fn images(bundle: &Bundle) -> Result<Vec<(&'static str, Image)>, BenchError> {
     Ok(images)
 }
 
-/// Images that the paced run for the tails measures: full and half precision.
-const FOR_TAILS: usize = 2;
+/// Images that the paced run for the tails measures: weights of 32 and of 16 bits.
+const FOR_TAILS: usize = 3;
 
 #[expect(clippy::too_many_lines, reason = "the order of the run, step by step")]
 fn run(arguments: &Arguments) -> Result<(), BenchError> {

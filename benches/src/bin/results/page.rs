@@ -52,7 +52,7 @@ fn head(measured: &Measured) -> String {
     format!(
         "# Results\n{warning}\nWritten by `make bench` in {:.0} s on {} (commit {}), {machine} with {} cores of {} ({}; {}), Linux {}, load average {} \
          when the run ended. {}, lads {}. Paced runs: {}.\n\n\
-         One thread everywhere, 32-bit weights and KV cache unless it says f16, which means both, the shipped kitchen policy, control steps with {CONTEXT} tokens in the context. Times move with the \
+         One thread everywhere, 32-bit weights and KV cache unless it names a format of the weights, to which belongs a KV cache of f16, the shipped kitchen policy, control steps with {CONTEXT} tokens in the context. Times move with the \
          machine: trust the ratios, which come from contenders that took turns within a second or two.",
         measured.seconds,
         text(&m["date"]),

@@ -107,6 +107,9 @@ fn number(id: &str, label: &str, value: &Value, target: Option<f64>, unit: &'sta
 
 const ORT: &str = "ONNX Runtime";
 
+/// Weights of half the bytes: the contender, and how they are stored.
+const HALVED: [[&str; 2]; 2] = [["lads int16", "int16"], ["lads f16", "f16"]];
+
 /// All rows, in the order of the page.
 #[expect(clippy::too_many_lines, reason = "a list: every row of the page, once")]
 pub fn rows(measured: &Measured) -> Vec<Row> {
@@ -135,25 +138,11 @@ pub fn rows(measured: &Measured) -> Vec<Row> {
             Some(1.3),
         ),
         paired(
-            "act_hot_f16",
-            "`low_level/act`, hot: f16 / ONNX Runtime f32",
-            (hot, "lads f16", act, 0.5),
-            (hot, ORT, act, 0.5),
-            Some(0.25),
-        ),
-        paired(
             "step_hot_f32",
             "ordinary step, hot: f32 / ONNX Runtime",
             (hot, "lads f32", ordinary, 0.5),
             (hot, ORT, ordinary, 0.5),
             third,
-        ),
-        paired(
-            "step_hot_f16",
-            "ordinary step, hot: f16 / ONNX Runtime f32",
-            (hot, "lads f16", ordinary, 0.5),
-            (hot, ORT, ordinary, 0.5),
-            None,
         ),
         paired(
             "decision_hot",
@@ -170,11 +159,24 @@ pub fn rows(measured: &Measured) -> Vec<Row> {
             Some(1.25),
         ),
     ];
-    for (kind, name, short) in [
+    let kinds = [
         (act, "`low_level/act`", "act"),
         (ordinary, "ordinary step", "step"),
-    ] {
-        for (ours, weights, target) in [("lads f32", "f32", 0.2), ("lads f16", "f16", 0.125)] {
+    ];
+    for (kind, name, short) in kinds {
+        for [ours, weights] in HALVED {
+            rows.push(paired(
+                &format!("{short}_hot_{weights}"),
+                &format!("{name}, hot: {weights} / ONNX Runtime f32"),
+                (hot, ours, kind, 0.5),
+                (hot, ORT, kind, 0.5),
+                (kind == act).then_some(0.25),
+            ));
+        }
+    }
+    for (kind, name, short) in kinds {
+        let full = ["lads f32", "f32"];
+        for ([ours, weights], target) in [(full, 0.2), (HALVED[0], 0.125), (HALVED[1], 0.125)] {
             let (id, label) = (
                 format!("{short}_paced_{weights}"),
                 format!("{name}, 50 Hz: {weights} / ONNX Runtime f32"),
@@ -196,21 +198,16 @@ pub fn rows(measured: &Measured) -> Vec<Row> {
         }
     }
     for (run, name, short) in [(hot, "hot", "hot"), (paced, "50 Hz", "paced")] {
-        for (kind, what, part) in [
-            (act, "`low_level/act`", "act"),
-            (ordinary, "ordinary step", "step"),
-        ] {
-            let (id, label) = (
-                format!("f16_{part}_{short}"),
-                format!("{what}, {name}: f16 / f32"),
-            );
-            rows.push(paired(
-                &id,
-                &label,
-                (run, "lads f16", kind, 0.5),
-                (run, "lads f32", kind, 0.5),
-                Some(0.7),
-            ));
+        for (kind, what, part) in kinds {
+            for [ours, weights] in HALVED {
+                rows.push(paired(
+                    &format!("{weights}_{part}_{short}"),
+                    &format!("{what}, {name}: {weights} / f32"),
+                    (run, ours, kind, 0.5),
+                    (run, "lads f32", kind, 0.5),
+                    Some(0.7),
+                ));
+            }
         }
     }
     rows.push(paired(
