@@ -57,8 +57,8 @@ enum Command {
         /// A Rust source to write: the image as a constant, aligned byte array
         #[arg(long, value_name = "FILE")]
         emit_rust: Option<PathBuf>,
-        /// How the weights are stored: f32; int16, the fastest; f16 or bf16, which leave the inputs of a layer as they are;
-        /// int8. Fewer bits than 32 have to pass a gate: the golden episode replays with the same plans, and with actions inside
+        /// How the weights are stored: f32; int16 or int8, with which the inputs of a layer are rounded too, and which are faster
+        /// than f32 with AVX2 or wider instructions; f16 or bf16, which are decoded. Fewer bits than 32 have to pass a gate: the golden episode replays with the same plans, and with actions inside
         /// the tolerance
         #[arg(long, value_name = "FORMAT", default_value = "f32", value_parser = weight_format)]
         weights: WeightFormat,

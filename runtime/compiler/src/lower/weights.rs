@@ -65,36 +65,23 @@ impl Weights {
         } else {
             self.format
         };
-        let column = |j: usize| data.iter().skip(j).step_by(n).copied();
-        let mut scales = None;
-        let w = match format {
-            WeightFormat::F32 => self.panels(tensor, format, [k, n], data)?,
+        let (w, scales) = match format {
+            WeightFormat::F32 => (self.panels(tensor, format, [k, n], data)?, None),
             WeightFormat::F16 => {
                 let halves = converted(data, format, stored::to_f16)?;
-                self.panels(tensor, format, [k, n], &halves)?
+                (self.panels(tensor, format, [k, n], &halves)?, None)
             }
             WeightFormat::Bf16 => {
                 let halves = converted(data, format, stored::to_bf16)?;
-                self.panels(tensor, format, [k, n], &halves)?
+                (self.panels(tensor, format, [k, n], &halves)?, None)
             }
             WeightFormat::Int8 => {
-                let columns = (0..n)
-                    .map(|j| stored::int8_scale(column(j)))
-                    .collect::<Vec<_>>();
-                let integers = scaled(data, format, &columns, stored::to_int8)?;
-                // The scales come first, next to the bias: both are read once per panel.
-                scales =
-                    Some(self.once(tensor, Form::Scales(format), |this| this.store(&columns))?);
-                self.panels(tensor, format, [k, n], &integers)?
+                let scales: Vec<f32> = columns(data, n).map(stored::int8_scale).collect();
+                self.scaled(tensor, format, [k, n], data, &scales, stored::to_int8)?
             }
             WeightFormat::Int16 => {
-                let columns = (0..n)
-                    .map(|j| stored::int16_scale(column(j)))
-                    .collect::<Vec<_>>();
-                let integers = scaled(data, format, &columns, stored::to_int16)?;
-                scales =
-                    Some(self.once(tensor, Form::Scales(format), |this| this.store(&columns))?);
-                self.panels(tensor, format, [k, n], &integers)?
+                let scales: Vec<f32> = columns(data, n).map(stored::int16_scale).collect();
+                self.scaled(tensor, format, [k, n], data, &scales, stored::to_int16)?
             }
         };
         Ok(Packed { format, w, scales })
@@ -119,6 +106,27 @@ impl Weights {
                 .collect();
             this.store_blocks(&words, packed_len(format, [k, PANEL]) * size_of::<T>() / 4)
         })
+    }
+
+    /// Integers, by the scales of the columns.
+    fn scaled<T: NoUninit + Default>(
+        &mut self,
+        tensor: &Arc<Tensor>,
+        format: WeightFormat,
+        [k, n]: [usize; 2],
+        data: &[f32],
+        scales: &[f32],
+        to: impl Fn(f32, f32) -> T,
+    ) -> Result<(WeightSpan, Option<WeightSpan>), String> {
+        let mut at = scales.iter().cycle();
+        let integers = converted(data, format, |w| {
+            let &scale = at.next()?;
+            w.is_finite().then(|| to(w, scale))
+        })?;
+        // The scales come first, next to the bias: both are read once per panel.
+        let scales = self.once(tensor, Form::Scales(format), |this| this.store(scales))?;
+        let w = self.panels(tensor, format, [k, n], &integers)?;
+        Ok((w, Some(scales)))
     }
 
     fn once(
@@ -196,18 +204,9 @@ fn is_uneven(data: &[f32], n: usize) -> bool {
         .is_some_and(|&largest| largest > 16.0 * median)
 }
 
-/// Every weight as an integer, by the scale of its column.
-fn scaled<T>(
-    data: &[f32],
-    format: WeightFormat,
-    scales: &[f32],
-    to: impl Fn(f32, f32) -> T,
-) -> Result<Vec<T>, String> {
-    let mut at = scales.iter().cycle();
-    converted(data, format, |w| {
-        let &scale = at.next()?;
-        w.is_finite().then(|| to(w, scale))
-    })
+/// The columns of a matrix of `n` of them.
+fn columns(data: &[f32], n: usize) -> impl Iterator<Item = impl Iterator<Item = f32>> {
+    (0..n).map(move |j| data.iter().skip(j).step_by(n).copied())
 }
 
 /// Every weight in another format.
