@@ -6,8 +6,7 @@
 //!     y[panel] = activation(sum * scale + bias)
 //! ```
 //!
-//! Memory is read strictly in order, once: then the processor's own prefetcher keeps up, and a layer takes the time of a bare
-//! sweep over its bytes, from whichever cache they come. That prefetcher stops at the end of a page, so each panel asks for one line
+//! Memory is read strictly in order, once: then the processor's own prefetcher keeps up. That prefetcher stops at the end of a page, so each panel asks for one line
 //! of every page of the next: measured at a robot's pace, when weights are in memory, this takes a fifth off `low_level/act`, and
 //! nothing off or on where they are in a cache. (To ask for every line costs a third there and gains nothing here.) Rows of `x` go
 //! through the panels in pairs: the two tokens of a control step read each weight once. A target with few registers takes a
