@@ -60,6 +60,7 @@ impl Field for u32 {
     fn put(&self, out: &mut Writer) {
         out.word(*self);
     }
+    #[inline(always)]
     fn take(from: &mut Reader) -> Option<Self> {
         from.word()
     }
@@ -70,6 +71,7 @@ impl Field for i32 {
     fn put(&self, out: &mut Writer) {
         out.word(self.cast_unsigned());
     }
+    #[inline(always)]
     fn take(from: &mut Reader) -> Option<Self> {
         from.word().map(u32::cast_signed)
     }
@@ -80,6 +82,7 @@ impl Field for f32 {
     fn put(&self, out: &mut Writer) {
         out.word(self.to_bits());
     }
+    #[inline(always)]
     fn take(from: &mut Reader) -> Option<Self> {
         from.word().map(f32::from_bits)
     }
@@ -91,6 +94,7 @@ impl Field for u64 {
         out.word(*self as u32);
         out.word((*self >> 32) as u32);
     }
+    #[inline(always)]
     fn take(from: &mut Reader) -> Option<Self> {
         let low = u64::from(from.word()?);
         Some(low | u64::from(from.word()?) << 32)
@@ -102,6 +106,7 @@ impl Field for bool {
     fn put(&self, out: &mut Writer) {
         out.word(u32::from(*self));
     }
+    #[inline(always)]
     fn take(from: &mut Reader) -> Option<Self> {
         match from.word()? {
             0 => Some(false),
@@ -124,6 +129,7 @@ impl<T: Field> Field for Option<T> {
             }
         }
     }
+    #[inline(always)]
     fn take(from: &mut Reader) -> Option<Self> {
         if bool::take(from)? {
             return T::take(from).map(Some);
@@ -144,6 +150,7 @@ impl<T: Field + Default, const N: usize> Field for [T; N] {
             value.put(out);
         }
     }
+    #[inline(always)]
     fn take(from: &mut Reader) -> Option<Self> {
         let mut values = [T::default(); N];
         for value in &mut values {
@@ -191,6 +198,7 @@ macro_rules! word_enum {
             fn put(&self, out: &mut $crate::codec::Writer) {
                 out.word(*self as u32);
             }
+            #[inline(always)]
             fn take(from: &mut $crate::codec::Reader) -> Option<Self> {
                 match from.word()? {
                     $($value => Some(Self::$variant),)*
@@ -209,6 +217,7 @@ macro_rules! word_enum_for {
             fn put(&self, out: &mut $crate::codec::Writer) {
                 out.word(match self { $(Self::$variant => $value,)* });
             }
+            #[inline(always)]
             fn take(from: &mut $crate::codec::Reader) -> Option<Self> {
                 match from.word()? {
                     $($value => Some(Self::$variant),)*
