@@ -14,7 +14,7 @@ use crate::cache::{Cache, Cached, keys_len};
 use crate::dispatch::{Isa, Kernel};
 use crate::lanes::{Block, LANES};
 use crate::norm::exponentials;
-use crate::simd::Simd;
+use crate::simd::{Simd, prefetch_ahead};
 use crate::stored::{F16, F32};
 
 /// Queries that go through the cache together.
@@ -284,6 +284,7 @@ fn dots<C: Cached, S: Simd, const R: usize>(
         return sums;
     }
     for (d, key) in keys.iter().enumerate() {
+        prefetch_ahead(d, key);
         let key = C::load(simd, key);
         for r in 0..R {
             // SAFETY: `q[r]` is as long as `keys`, as compared above, and `d` is an index of `keys`.
@@ -324,6 +325,7 @@ fn weigh<'p, C: Cached, S: Simd, const P: usize, const R: usize>(
             None => return P,
         };
         for b in 0..P {
+            prefetch_ahead(b, &v[b]);
             let v = C::load(simd, &v[b]);
             for r in 0..R {
                 // SAFETY: each `p[r][b]` has at least `rows` elements, as compared above, and `row < rows`.

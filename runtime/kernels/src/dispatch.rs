@@ -32,7 +32,7 @@ enum Level {
     /// AVX, AVX2 and F16C.
     #[cfg(target_arch = "x86_64")]
     Avx2,
-    /// AVX-512 F, BW, DQ and VL, and the above.
+    /// AVX-512 F, BW, DQ, VL and VNNI, and the above: Cascade Lake, Zen 4 and later.
     #[cfg(target_arch = "x86_64")]
     Avx512,
 }
@@ -87,7 +87,7 @@ impl Isa {
             // and operating system.
             Level::Avx2 => unsafe { x86_64::avx2(kernel) },
             #[cfg(target_arch = "x86_64")]
-            // SAFETY: `Isa`'s constructors make this level only where `x86_64::widest` found AVX2, F16C and all four
+            // SAFETY: `Isa`'s constructors make this level only where `x86_64::widest` found AVX2, F16C and all five
             // parts of AVX-512 in CPU and operating system.
             Level::Avx512 => unsafe { x86_64::avx512(kernel) },
         }
@@ -130,8 +130,8 @@ mod x86_64 {
     }
 
     /// # Safety
-    /// The CPU and the operating system offer AVX2, F16C and the four parts of AVX-512.
-    #[target_feature(enable = "avx2,f16c,avx512f,avx512bw,avx512dq,avx512vl")]
+    /// The CPU and the operating system offer AVX2, F16C and the five parts of AVX-512.
+    #[target_feature(enable = "avx2,f16c,avx512f,avx512bw,avx512dq,avx512vl,avx512vnni")]
     pub unsafe fn avx512<K: Kernel>(kernel: K) {
         // SAFETY: the caller's promise is these constructors'.
         unsafe {
@@ -160,10 +160,12 @@ mod x86_64 {
         }
         // SAFETY: OSXSAVE, read from the CPU above, says that the operating system has enabled `xgetbv`.
         let saved = unsafe { _xgetbv(0) };
-        // Leaf 7, EBX: 5 AVX2, 16 AVX512F, 17 AVX512DQ, 30 AVX512BW, 31 AVX512VL.
-        let extended = __cpuid_count(7, 0).ebx;
-        let avx2 = has(extended, &[5]) && saved & YMM_STATE == YMM_STATE;
-        let avx512 = has(extended, &[16, 17, 30, 31]) && saved & ZMM_STATE == ZMM_STATE;
+        // Leaf 7, EBX: 5 AVX2, 16 AVX512F, 17 AVX512DQ, 30 AVX512BW, 31 AVX512VL; ECX: 11 AVX512_VNNI.
+        let extended = __cpuid_count(7, 0);
+        let avx2 = has(extended.ebx, &[5]) && saved & YMM_STATE == YMM_STATE;
+        let avx512 = has(extended.ebx, &[16, 17, 30, 31])
+            && has(extended.ecx, &[11])
+            && saved & ZMM_STATE == ZMM_STATE;
         match (avx2, avx512) {
             (true, true) => Level::Avx512,
             (true, false) => Level::Avx2,
@@ -195,7 +197,8 @@ mod tests {
             && std::arch::is_x86_feature_detected!("avx512f")
             && std::arch::is_x86_feature_detected!("avx512bw")
             && std::arch::is_x86_feature_detected!("avx512dq")
-            && std::arch::is_x86_feature_detected!("avx512vl");
+            && std::arch::is_x86_feature_detected!("avx512vl")
+            && std::arch::is_x86_feature_detected!("avx512vnni");
         let expected = match (avx2, avx512) {
             (_, true) => "avx512",
             (true, _) => "avx2",

@@ -2,7 +2,7 @@
 
 use crate::lanes::LANES;
 use crate::linear::{PANEL_BLOCKS, Sums};
-use crate::simd::{Simd, prefetch_behind};
+use crate::simd::{Simd, prefetch_ahead};
 use crate::stored::Stored;
 
 /// One panel and `R` rows, in as many parts as the registers ask for.
@@ -14,7 +14,6 @@ pub(crate) fn panel<S: Simd, W: Stored, const R: usize>(
     x: [&[f32]; R],
     sums: &mut Sums,
 ) {
-    prefetch_behind(w);
     let mut at = 0;
     while at < blocks {
         let (place, left) = ([at, blocks], blocks - at);
@@ -56,7 +55,9 @@ fn sweep<S: Simd, W: Stored, const P: usize, const R: usize>(
         let x: [S::V; R] = x.map(|x| simd.splat(unsafe { *x.get_unchecked(l) }));
         for p in 0..P {
             // SAFETY: `row` has `blocks` elements, `at + P <= blocks`, as compared above, and `p < P`.
-            let w = W::load(simd, unsafe { row.get_unchecked(at + p) });
+            let w = unsafe { row.get_unchecked(at + p) };
+            prefetch_ahead(p, w);
+            let w = W::load(simd, w);
             for (sums, &x) in sums.iter_mut().zip(&x) {
                 sums[p] = simd.add_product(sums[p], x, w);
             }

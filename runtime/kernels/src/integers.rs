@@ -22,7 +22,7 @@ use core::{array, slice};
 use crate::elementwise::assign;
 use crate::lanes::{Block, LANES};
 use crate::linear::{PANEL_BLOCKS, Sums};
-use crate::simd::{Portable, Simd, prefetch_behind};
+use crate::simd::{Portable, Simd, prefetch_ahead};
 
 /// Inputs that are made integers at a time.
 pub(crate) const PART: usize = 256;
@@ -119,7 +119,6 @@ pub(crate) fn panel<S: Simd, W: Integer, const R: usize>(
         return;
     };
     if i == 0 {
-        prefetch_behind(w);
         for sums in sums.iter_mut().take(R) {
             *sums = [[0.0; LANES]; PANEL_BLOCKS];
         }
@@ -187,23 +186,38 @@ fn sweep<S: Simd, W: Integer, const P: usize, const R: usize>(
     }
     let x = rows.each_ref().map(|row| row.pairs.as_chunks::<PAIRS>().0);
     // Not unrolled: that would double the code for nothing.
-    let pairs = black_box(PAIRS);
+    let rounds = black_box(PAIRS / S::CHAINS);
     let mut sums = [[simd.splat(0.0); P]; R];
     for (l, w) in w
         .chunks_exact(PAIRS * blocks)
         .take(PART / 2 / PAIRS)
         .enumerate()
     {
-        let mut integers = [[simd.zeros(); P]; R];
-        for pair in 0..pairs {
-            // SAFETY: `l` is below the number of groups in a part, which is how many `x[r]` has, and `pair` below `PAIRS`,
-            // which is how many pairs a group has.
-            let x = x.map(|x| simd.splat_pair(unsafe { *x.get_unchecked(l).get_unchecked(pair) }));
-            for p in 0..P {
-                // SAFETY: `w` has `PAIRS * blocks` elements, `pair < PAIRS`, `at + P <= blocks`, as compared above, and `p < P`.
-                let w = W::load(simd, unsafe { w.get_unchecked(pair * blocks + at + p) });
-                for (integers, &x) in integers.iter_mut().zip(&x) {
-                    integers[p] = simd.add_products(integers[p], w, x);
+        let mut integers = [[[simd.zeros(); P]; R]; 2];
+        for i in 0..rounds {
+            for (chain, integers) in integers.iter_mut().take(S::CHAINS).enumerate() {
+                let pair = i * S::CHAINS + chain;
+                // SAFETY: `l` is below the number of groups in a part, which is how many `x[r]` has, and `pair` below `PAIRS`,
+                // which is how many pairs a group has.
+                let x =
+                    x.map(|x| simd.splat_pair(unsafe { *x.get_unchecked(l).get_unchecked(pair) }));
+                for p in 0..P {
+                    // SAFETY: `w` has `PAIRS * blocks` elements, `pair < PAIRS`, `at + P <= blocks`, as compared above, and
+                    // `p < P`.
+                    let w = unsafe { w.get_unchecked(pair * blocks + at + p) };
+                    prefetch_ahead(p, w);
+                    let w = W::load(simd, w);
+                    for (integers, &x) in integers.iter_mut().zip(&x) {
+                        integers[p] = simd.add_products(integers[p], w, x);
+                    }
+                }
+            }
+        }
+        let [mut integers, others] = integers;
+        if S::CHAINS == 2 {
+            for (integers, others) in integers.iter_mut().zip(others) {
+                for (integers, others) in integers.iter_mut().zip(others) {
+                    *integers = simd.add_integers(*integers, others);
                 }
             }
         }

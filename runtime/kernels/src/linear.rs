@@ -6,11 +6,9 @@
 //!     y[panel] = activation(sum * scale + bias)
 //! ```
 //!
-//! Memory is read strictly in order, once: then the processor's own prefetcher keeps up. That prefetcher stops at the end of a page, so each panel asks for one line
-//! of every page of the next: measured at a robot's pace, when weights are in memory, this takes a fifth off `low_level/act`, and
-//! nothing off or on where they are in a cache. (To ask for every line costs a third there and gains nothing here.) Rows of `x` go
-//! through the panels in pairs: the two tokens of a control step read each weight once. A target with few registers takes a
-//! panel in parts. Each output is one sum in the order of `k`, then the scale, then the bias, whatever the number of rows or parts.
+//! Memory is read strictly in order, once. Rows of `x` go through the panels in pairs: the two tokens of a control step read each
+//! weight once. A target with few registers takes a panel in parts. Each output is one sum in the order of `k`, then the scale,
+//! then the bias, whatever the number of rows or parts.
 //!
 //! How a panel is summed up is in `floats` and, for weights that are integers, in `integers`.
 

@@ -25,6 +25,8 @@ pub(crate) trait Simd: Copy {
 
     /// How many sums of sixteen lanes stay in registers, beside the operands.
     const SUMS: usize;
+    /// How many sums of products take turns, one or two, so that one need not wait for the other.
+    const CHAINS: usize;
 
     /// The same number in every lane.
     fn splat(self, x: f32) -> Self::V;
@@ -56,6 +58,8 @@ pub(crate) trait Simd: Copy {
     fn zeros(self) -> Self::Integers;
     /// `sum + a[0] * b[0] + a[1] * b[1]`; what overflows wraps around.
     fn add_products(self, sum: Self::Integers, a: Self::Pairs, b: Self::Pairs) -> Self::Integers;
+    /// `a + b`; what overflows wraps around.
+    fn add_integers(self, a: Self::Integers, b: Self::Integers) -> Self::Integers;
     /// The nearest floats, ties to even.
     fn floats(self, integers: Self::Integers) -> Self::V;
     /// The nearest integers, ties to even, of magnitudes up to 32767; any integers of what is larger or no number.
@@ -72,30 +76,34 @@ const ROUND: f32 = 12_582_912.0;
 /// All bits of a float but its sign.
 const MAGNITUDE: i32 = i32::MAX;
 
-/// Asks for the cache line at an address, where the target has an instruction for it. A hint: nothing need be there.
+/// Asks for the cache line that will be read [`AHEAD`] bytes after the `i`th of blocks that lie one after the other, once for each
+/// line, where the target has an instruction for it. A hint: nothing need be there.
+///
+/// Weights and KV cache are read strictly in order, so the processor's own prefetcher follows them; but it stops at the end of a page,
+/// and does not ask for as many lines at a time as memory could give.
 #[inline(always)]
-fn prefetch<T>(at: *const T) {
+pub(crate) fn prefetch_ahead<T>(i: usize, block: &T) {
     #[cfg(target_arch = "x86_64")]
-    // SAFETY: part of SSE, which every x86-64 CPU has; it reads nothing.
-    unsafe {
-        use core::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        _mm_prefetch::<_MM_HINT_T0>(at.cast());
+    if (i * size_of::<T>()).is_multiple_of(LINE) {
+        let at = (&raw const *block).wrapping_byte_add(AHEAD);
+        // SAFETY: part of SSE, which every x86-64 CPU has; it reads nothing.
+        unsafe {
+            use core::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+            _mm_prefetch::<_MM_HINT_T0>(at.cast());
+        }
     }
     #[cfg(not(target_arch = "x86_64"))]
-    let _ = at;
+    let _ = (i, block);
 }
 
-/// Asks for one line of each page behind a panel of weights: there lies the next, or the next layer.
-#[inline(never)]
-pub(crate) fn prefetch_behind<T>(panel: &[T]) {
-    let behind = panel.as_ptr_range().end;
-    for page in (0..size_of_val(panel)).step_by(PAGE) {
-        prefetch(behind.wrapping_byte_add(page));
-    }
-}
+/// Bytes of a cache line.
+#[cfg(target_arch = "x86_64")]
+const LINE: usize = 64;
 
-/// Bytes of a page.
-const PAGE: usize = 4096;
+/// Far enough for memory to answer, near enough for the first-level cache: of 0.5 to 64 KiB, two generations of Xeon took least time
+/// with 8, in memory (a control step 25 % less than without) as in caches (up to 10 % less).
+#[cfg(target_arch = "x86_64")]
+const AHEAD: usize = 8192;
 
 /// What the build's target has in any case: arrays, which compilers put into its registers.
 #[derive(Clone, Copy)]
@@ -107,6 +115,7 @@ impl Simd for Portable {
     type Integers = [i32; LANES];
 
     const SUMS: usize = 2;
+    const CHAINS: usize = 1;
 
     #[inline(always)]
     fn splat(self, x: f32) -> Block {
@@ -205,6 +214,14 @@ impl Simd for Portable {
             *sum = sum.wrapping_add(product(a0, b0).wrapping_add(product(a1, b1)));
         }
         sum
+    }
+
+    #[inline(always)]
+    fn add_integers(self, mut a: Self::Integers, b: Self::Integers) -> Self::Integers {
+        for (a, b) in a.iter_mut().zip(b) {
+            *a = a.wrapping_add(b);
+        }
+        a
     }
 
     #[inline(always)]

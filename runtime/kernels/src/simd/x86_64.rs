@@ -14,9 +14,10 @@ use core::arch::x86_64::{
     _mm256_storeu_ps, _mm256_storeu_si256, _mm512_add_epi32, _mm512_add_ps, _mm512_and_si512,
     _mm512_castps_si512, _mm512_castsi512_ps, _mm512_cmp_ps_mask, _mm512_cvtepi8_epi16,
     _mm512_cvtepi32_epi16, _mm512_cvtepi32_ps, _mm512_cvtepu16_epi32, _mm512_cvtph_ps,
-    _mm512_cvtps_ph, _mm512_loadu_ps, _mm512_loadu_si512, _mm512_madd_epi16, _mm512_mask_blend_ps,
-    _mm512_max_epi32, _mm512_mul_ps, _mm512_reduce_max_epi32, _mm512_set1_epi32, _mm512_set1_ps,
-    _mm512_setzero_ps, _mm512_setzero_si512, _mm512_slli_epi32, _mm512_storeu_ps,
+    _mm512_cvtps_ph, _mm512_dpwssd_epi32, _mm512_loadu_ps, _mm512_loadu_si512,
+    _mm512_mask_blend_ps, _mm512_max_epi32, _mm512_mul_ps, _mm512_reduce_max_epi32,
+    _mm512_set1_epi32, _mm512_set1_ps, _mm512_setzero_ps, _mm512_setzero_si512, _mm512_slli_epi32,
+    _mm512_storeu_ps,
 };
 
 use super::{MAGNITUDE, ROUND, Simd};
@@ -45,7 +46,7 @@ impl<const NARROW: bool> Halves<NARROW> {
 
 impl Avx512 {
     /// # Safety
-    /// The CPU and the operating system offer AVX-512 F, BW, DQ and VL.
+    /// The CPU and the operating system offer AVX-512 F, BW, DQ, VL and VNNI.
     #[inline(always)]
     pub(crate) unsafe fn new() -> Self {
         Self(())
@@ -58,6 +59,7 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
     type Integers = [__m256i; 2];
 
     const SUMS: usize = if NARROW { 8 } else { 4 };
+    const CHAINS: usize = 1;
 
     #[inline(always)]
     fn splat(self, x: f32) -> Self::V {
@@ -189,6 +191,12 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
     }
 
     #[inline(always)]
+    fn add_integers(self, a: Self::Integers, b: Self::Integers) -> Self::Integers {
+        // SAFETY: whoever made `self` has AVX2.
+        unsafe { [_mm256_add_epi32(a[0], b[0]), _mm256_add_epi32(a[1], b[1])] }
+    }
+
+    #[inline(always)]
     fn floats(self, integers: Self::Integers) -> Self::V {
         // SAFETY: whoever made `self` has AVX2.
         integers.map(|integers| unsafe { _mm256_cvtepi32_ps(integers) })
@@ -245,6 +253,7 @@ impl Simd for Avx512 {
     type Integers = __m512i;
 
     const SUMS: usize = 16;
+    const CHAINS: usize = 2;
 
     #[inline(always)]
     fn splat(self, x: f32) -> Self::V {
@@ -343,7 +352,13 @@ impl Simd for Avx512 {
     #[inline(always)]
     fn add_products(self, sum: Self::Integers, a: Self::Pairs, b: Self::Pairs) -> Self::Integers {
         // SAFETY: whoever made `self` has AVX-512.
-        unsafe { _mm512_add_epi32(sum, _mm512_madd_epi16(a, b)) }
+        unsafe { _mm512_dpwssd_epi32(sum, a, b) }
+    }
+
+    #[inline(always)]
+    fn add_integers(self, a: Self::Integers, b: Self::Integers) -> Self::Integers {
+        // SAFETY: whoever made `self` has AVX-512.
+        unsafe { _mm512_add_epi32(a, b) }
     }
 
     #[inline(always)]
