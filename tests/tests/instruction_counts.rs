@@ -1,6 +1,6 @@
 //! The work of a control step does not depend on what is observed: under `callgrind`, the same number of instructions for a hundred
-//! random observations at the same context, of an ordinary step and of one that decides, with 32-bit weights and with integers.
-//! Skipped where `valgrind` is missing.
+//! random observations at the same context, of an ordinary step and of one that decides or draws its plan, with 32-bit weights and
+//! with integers. Skipped where `valgrind` is missing.
 //!
 //! The test runs its own binary once more under `callgrind`, which counts what [`one_control_step`] executes and writes one file
 //! for each call. Valgrind knows no AVX-512, so what is counted are the AVX2 kernels, or on older processors the portable ones.
@@ -11,18 +11,25 @@ use std::hint::black_box;
 use std::process::Command;
 
 use lads_compiler::{Bundle, Memory, Options, WeightFormat, compile_with};
-use lads_core::{Controller, Instruction, Policy, StepReport};
+use lads_core::{Controller, Decision, Instruction, Policy, StepReport};
 use lads_tests::project_path;
 
 /// Names the case to the program under `callgrind`.
 const CHILD: &str = "LADS_STEPS_UNDER_CALLGRIND";
 
+/// How plans are drawn, where they are.
+const DRAWN: Decision = Decision::Sample {
+    temperature: 1.0,
+    seed: 5,
+};
+
 /// Steps before the one that is counted, of an episode that decides in every tenth.
-const CASES: [(WeightFormat, usize); 4] = [
-    (WeightFormat::F32, 1),
-    (WeightFormat::F32, 10),
-    (WeightFormat::Int16, 1),
-    (WeightFormat::Int16, 10),
+const CASES: [(WeightFormat, Decision, usize); 5] = [
+    (WeightFormat::F32, Decision::Argmax, 1),
+    (WeightFormat::F32, Decision::Argmax, 10),
+    (WeightFormat::F32, DRAWN, 10),
+    (WeightFormat::Int16, Decision::Argmax, 1),
+    (WeightFormat::Int16, Decision::Argmax, 10),
 ];
 
 /// Observations of which the steps are counted.
@@ -44,7 +51,7 @@ fn one_control_step(
 }
 
 /// A step of an episode, with observations from all over the contract's limits.
-fn steps((weights, before): (WeightFormat, usize)) {
+fn steps((weights, decision, before): (WeightFormat, Decision, usize)) {
     let bundle = Bundle::open(&project_path("models/kitchen.onnx")).unwrap();
     let options = Options {
         weights,
@@ -55,6 +62,7 @@ fn steps((weights, before): (WeightFormat, usize)) {
     let policy = Policy::new_checked(image.as_bytes()).unwrap();
     let mut memory = Memory::of(&policy).expect("there is memory");
     let mut controller = memory.controller(&policy).unwrap();
+    controller.set_decision(decision);
     let mut action = vec![0.0; policy.contract().action_len()];
     let (first, _, _) = policy.golden().unwrap().steps().next().unwrap();
     controller.set_instruction(Instruction::Id(0)).unwrap();

@@ -60,7 +60,7 @@ impl Field for u32 {
     fn put(&self, out: &mut Writer) {
         out.word(*self);
     }
-    #[inline(always)]
+    #[inline]
     fn take(from: &mut Reader) -> Option<Self> {
         from.word()
     }
@@ -71,7 +71,7 @@ impl Field for i32 {
     fn put(&self, out: &mut Writer) {
         out.word(self.cast_unsigned());
     }
-    #[inline(always)]
+    #[inline]
     fn take(from: &mut Reader) -> Option<Self> {
         from.word().map(u32::cast_signed)
     }
@@ -82,7 +82,7 @@ impl Field for f32 {
     fn put(&self, out: &mut Writer) {
         out.word(self.to_bits());
     }
-    #[inline(always)]
+    #[inline]
     fn take(from: &mut Reader) -> Option<Self> {
         from.word().map(f32::from_bits)
     }
@@ -94,7 +94,7 @@ impl Field for u64 {
         out.word(*self as u32);
         out.word((*self >> 32) as u32);
     }
-    #[inline(always)]
+    #[inline]
     fn take(from: &mut Reader) -> Option<Self> {
         let low = u64::from(from.word()?);
         Some(low | u64::from(from.word()?) << 32)
@@ -106,7 +106,7 @@ impl Field for bool {
     fn put(&self, out: &mut Writer) {
         out.word(u32::from(*self));
     }
-    #[inline(always)]
+    #[inline]
     fn take(from: &mut Reader) -> Option<Self> {
         match from.word()? {
             0 => Some(false),
@@ -129,7 +129,7 @@ impl<T: Field> Field for Option<T> {
             }
         }
     }
-    #[inline(always)]
+    #[inline]
     fn take(from: &mut Reader) -> Option<Self> {
         if bool::take(from)? {
             return T::take(from).map(Some);
@@ -150,7 +150,7 @@ impl<T: Field + Default, const N: usize> Field for [T; N] {
             value.put(out);
         }
     }
-    #[inline(always)]
+    #[inline]
     fn take(from: &mut Reader) -> Option<Self> {
         let mut values = [T::default(); N];
         for value in &mut values {

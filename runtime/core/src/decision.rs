@@ -64,13 +64,14 @@ impl Decider {
         // 53 random bits: every double in [0, 1) of that spacing is equally likely.
         let uniform = (self.random.next_u64() >> 11) as f64 / (1_u64 << 53) as f64;
         let mut left = uniform * total;
-        for (i, &logit) in logits.iter().enumerate() {
+        let mut passed = 0;
+        for &logit in logits {
+            // To the end, so that the time does not depend on the plan: once passed, always passed.
             left -= weight(logit);
-            if left < 0.0 {
-                return PlanIndex(i as u32);
-            }
+            passed = usize::from(left < 0.0).saturating_add(passed);
         }
-        PlanIndex(best as u32)
+        let index = logits.len().saturating_sub(passed);
+        PlanIndex(if passed == 0 { best } else { index } as u32)
     }
 }
 

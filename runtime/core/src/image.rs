@@ -259,7 +259,7 @@ impl Field for PortRecord {
         self.port.put(out);
         self.place.put(out);
     }
-    #[inline(always)]
+    #[inline]
     fn take(from: &mut Reader) -> Option<Self> {
         Some(Self {
             port: Port::take(from)?,

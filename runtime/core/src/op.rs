@@ -35,7 +35,7 @@ impl Field for Activation {
         out.word(kind);
         alpha.put(out);
     }
-    #[inline(always)]
+    #[inline]
     fn take(from: &mut Reader) -> Option<Self> {
         let kind = from.word()?;
         let alpha = f32::take(from)?;
@@ -337,11 +337,17 @@ macro_rules! ops {
             /// Reads an op; `None` for words that [`encode`](Self::encode) does not write.
             pub fn decode(words: &[u32; OP_WORDS]) -> Option<Self> {
                 let mut from = Reader::new(words);
-                let op = match from.word()? {
-                    $($code => Self::$name($name::take(&mut from)?),)*
-                    _ => return None,
-                };
+                let op = Self::take(&mut from)?;
                 from.rest_is_zero().then_some(op)
+            }
+
+            /// Reads an op and leaves the zeros behind it. Inlined: a run reads every op again.
+            #[inline(always)]
+            pub(crate) fn take(from: &mut Reader) -> Option<Self> {
+                Some(match from.word()? {
+                    $($code => Self::$name($name::take(from)?),)*
+                    _ => return None,
+                })
             }
 
             /// The op's name.

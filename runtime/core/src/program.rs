@@ -97,7 +97,10 @@ impl<'a> Program<'a> {
 
     /// The ops, in the order in which they run.
     pub fn ops(&self) -> impl Iterator<Item = Op> + 'a {
-        self.ops.iter().filter_map(Op::decode)
+        // Decoded once already, with the zeros behind each.
+        self.ops
+            .iter()
+            .filter_map(|words| Op::take(&mut Reader::new(words)))
     }
 
     /// The values that the caller sets before a run.

@@ -141,18 +141,16 @@ impl Linear<'_> {
             return;
         }
         let at_the_end = self.activation.for_the_end().filter(|_| !self.accumulate);
-        let layer = &Self {
-            activation: match at_the_end {
-                Some(_) => Activation::None,
-                None => self.activation,
-            },
-            ..*self
+        let activation = match at_the_end {
+            Some(_) => Activation::None,
+            None => self.activation,
         };
         match self.w {
-            Panels::F32(_) => layer.wide(isa, x, y, &mut []),
-            Panels::Int8 { .. } | Panels::Int16 { .. } => layer.integers(isa, x, y),
+            Panels::F32(_) => self.wide(isa, activation, x, y, &mut []),
+            Panels::Int8 { .. } | Panels::Int16 { .. } => self.integers(isa, activation, x, y),
             Panels::F16(_) | Panels::Bf16(_) => isa.run(Rows::<true> {
-                layer,
+                layer: self,
+                activation,
                 parts: &mut [],
                 x,
                 y,
@@ -167,15 +165,20 @@ impl Linear<'_> {
 
     /// With weights that are integers. Not inlined: others need no memory for the inputs as integers.
     #[inline(never)]
-    fn integers(&self, isa: Isa, x: &[f32], y: &mut [f32]) {
-        self.wide(isa, x, y, &mut [Part::EMPTY; 2]);
+    fn integers(&self, isa: Isa, activation: Activation, x: &[f32], y: &mut [f32]) {
+        self.wide(isa, activation, x, y, &mut [Part::EMPTY; 2]);
     }
 
     /// With weights that are no narrow floats. Not inlined: compiled once for all of them.
     #[inline(never)]
-    fn wide(&self, isa: Isa, x: &[f32], y: &mut [f32], parts: &mut [Part]) {
-        let layer = self;
-        isa.run(Rows::<false> { layer, parts, x, y });
+    fn wide(&self, isa: Isa, activation: Activation, x: &[f32], y: &mut [f32], parts: &mut [Part]) {
+        isa.run(Rows::<false> {
+            layer: self,
+            activation,
+            parts,
+            x,
+            y,
+        });
     }
 
     /// Whether the weights are integers.
@@ -221,14 +224,21 @@ impl Linear<'_> {
 
     /// Scale, bias, activation and store of sixteen outputs from `first` on, or of as many as there are.
     #[inline(always)]
-    fn finish<S: Simd>(&self, simd: S, sums: &Block, first: usize, y: &mut [f32]) {
+    fn finish<S: Simd>(
+        &self,
+        simd: S,
+        activation: Activation,
+        sums: &Block,
+        first: usize,
+        y: &mut [f32],
+    ) {
         let mut spare = [0.0; LANES];
         let mut v = simd.load(sums);
         if let Panels::Int8 { scales, .. } | Panels::Int16 { scales, .. } = self.w {
             v = simd.mul(v, simd.load(block(scales, first, &mut spare)));
         }
         v = simd.add(v, simd.load(block(self.bias, first, &mut spare)));
-        v = self.activation.apply(simd, v);
+        v = activation.apply(simd, v);
         if self.accumulate {
             v = simd.add(simd.load(block(y, first, &mut spare)), v);
         }
@@ -257,6 +267,8 @@ fn block<'b>(x: &'b [f32], first: usize, spare: &'b mut Block) -> &'b Block {
 /// A layer at work, of wide weights or integers, or of `NARROW` ones, see [`Kernel::NARROW`].
 struct Rows<'a, const NARROW: bool> {
     layer: &'a Linear<'a>,
+    /// The layer's, or none where it is applied at the end.
+    activation: Activation,
     /// Two, or none where the weights are no integers.
     parts: &'a mut [Part],
     x: &'a [f32],
@@ -320,7 +332,7 @@ impl<const NARROW: bool> Kernel for Rows<'_, NARROW> {
                 for (y, sums) in y.iter_mut().zip(&sums).take(black_box(rows)) {
                     let sums = black_box(sums.get(..blocks).unwrap_or(&[]));
                     for (block, sums) in sums.iter().enumerate() {
-                        layer.finish(simd, sums, first + block * LANES, y);
+                        layer.finish(simd, self.activation, sums, first + block * LANES, y);
                     }
                 }
             }

@@ -92,7 +92,7 @@ impl Field for IntSlot {
     fn put(&self, out: &mut Writer) {
         out.word(u32::from(self.0));
     }
-    #[inline(always)]
+    #[inline]
     fn take(from: &mut Reader) -> Option<Self> {
         u8::try_from(from.word()?)
             .ok()
@@ -160,7 +160,7 @@ impl Field for Place {
             }
         }
     }
-    #[inline(always)]
+    #[inline]
     fn take(from: &mut Reader) -> Option<Self> {
         match from.word()? {
             0 => Span::take(from).map(Self::Span),
