@@ -105,7 +105,7 @@ impl Part {
     }
 }
 
-/// Adds the sums of parts `i` of `R` rows with one panel of so many blocks.
+/// Adds the sums of parts `i` of `R` rows with one panel of so many blocks to those of the parts before.
 #[inline(always)]
 pub(crate) fn panel<S: Simd, W: Integer, const R: usize>(
     simd: S,
@@ -118,22 +118,17 @@ pub(crate) fn panel<S: Simd, W: Integer, const R: usize>(
     let Some(rows) = parts.first_chunk::<R>() else {
         return;
     };
-    if i == 0 {
-        for sums in sums.iter_mut().take(R) {
-            *sums = [[0.0; LANES]; PANEL_BLOCKS];
-        }
-    }
     let (w, _) = w.as_chunks::<{ 2 * LANES }>();
     let w = w.get(i * PART / 2 * blocks..).unwrap_or(&[]);
     if S::SUMS < 4 {
         for (row, sums) in rows.iter().zip(sums) {
-            one_row(w, blocks, row, sums);
+            one_row(w, [blocks, i], row, sums);
         }
         return;
     }
     let mut at = 0;
     while at < blocks {
-        let (place, left) = ([at, blocks], blocks - at);
+        let (place, left) = ([at, blocks, i], blocks - at);
         // Each sum takes two registers, one of integers and one of floats.
         at += if S::SUMS >= 2 * PANEL_BLOCKS * R {
             // Narrower panels are few, and code is not free either.
@@ -154,17 +149,17 @@ pub(crate) fn panel<S: Simd, W: Integer, const R: usize>(
 #[inline(never)]
 fn one_row<W: Integer>(
     w: &[[W; 2 * LANES]],
-    blocks: usize,
+    [blocks, i]: [usize; 2],
     row: &Part,
     sums: &mut [Block; PANEL_BLOCKS],
 ) {
     for at in 0..blocks {
         let (rows, sums) = (array::from_ref(row), slice::from_mut(sums));
-        sweep::<Portable, W, 1, 1>(Portable, w, [at, blocks], rows, sums);
+        sweep::<Portable, W, 1, 1>(Portable, w, [at, blocks, i], rows, sums);
     }
 }
 
-/// Adds the sums of `R` rows with `P` blocks, from block `at` on, of a panel of `blocks`; returns `P`.
+/// Adds the sums of parts `i` of `R` rows with `P` blocks, from block `at` on, of a panel of `blocks`; returns `P`.
 #[inline(always)]
 #[expect(
     clippy::indexing_slicing,
@@ -177,7 +172,7 @@ fn one_row<W: Integer>(
 fn sweep<S: Simd, W: Integer, const P: usize, const R: usize>(
     simd: S,
     w: &[[W; 2 * LANES]],
-    [at, blocks]: [usize; 2],
+    [at, blocks, i]: [usize; 3],
     rows: &[Part; R],
     out: &mut [[Block; PANEL_BLOCKS]],
 ) -> usize {
@@ -230,7 +225,12 @@ fn sweep<S: Simd, W: Integer, const P: usize, const R: usize>(
     for (out, (sums, row)) in out.iter_mut().zip(sums.into_iter().zip(rows)) {
         let scale = simd.splat(row.scale);
         for (out, sum) in out.iter_mut().skip(at).zip(sums) {
-            simd.store(simd.add_product(simd.load(out), sum, scale), out);
+            let before = if i == 0 {
+                simd.splat(0.0)
+            } else {
+                simd.load(out)
+            };
+            simd.store(simd.add_product(before, sum, scale), out);
         }
     }
     P
