@@ -39,7 +39,13 @@ pub fn describe() -> Value {
     let load = fs::read_to_string("/proc/loadavg").unwrap_or_default();
     let load: Vec<_> = load.split_whitespace().take(3).collect();
     let kernel = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
-    let vectors = ["avx2", "avx512f", "avx512_bf16", "avx512_fp16"];
+    let vectors = [
+        "avx2",
+        "avx512f",
+        "avx512_vnni",
+        "avx512_bf16",
+        "avx512_fp16",
+    ];
     let flags = cpu("flags").unwrap_or_default();
     let vectors: Vec<_> = vectors
         .into_iter()
