@@ -193,7 +193,12 @@ impl Simd for Portable {
 
     #[inline(always)]
     fn load_i8(self, from: &[i8; 2 * LANES]) -> Self::Pairs {
-        from.map(i16::from)
+        // A loop: mapped arrays are not always compiled in line.
+        let mut to = [0; 2 * LANES];
+        for (to, &from) in to.iter_mut().zip(from) {
+            *to = i16::from(from);
+        }
+        to
     }
 
     #[inline(always)]
@@ -202,18 +207,11 @@ impl Simd for Portable {
     }
 
     #[inline(always)]
-    fn add_products(
-        self,
-        mut sum: Self::Integers,
-        a: Self::Pairs,
-        b: Self::Pairs,
-    ) -> Self::Integers {
-        let pairs = a.as_chunks().0.iter().zip(b.as_chunks().0);
-        for (sum, (&[a0, a1], &[b0, b1])) in sum.iter_mut().zip(pairs) {
-            let product = |a, b| i32::from(a) * i32::from(b);
-            *sum = sum.wrapping_add(product(a0, b0).wrapping_add(product(a1, b1)));
-        }
-        sum
+    fn add_products(self, sum: Self::Integers, a: Self::Pairs, b: Self::Pairs) -> Self::Integers {
+        #[cfg(target_arch = "x86_64")]
+        return x86_64::add_products(sum, a, b);
+        #[cfg(not(target_arch = "x86_64"))]
+        return add_products(sum, a, b);
     }
 
     #[inline(always)]
@@ -245,5 +243,49 @@ impl Simd for Portable {
     #[inline(always)]
     fn largest(self, integers: Self::Integers) -> u32 {
         integers.into_iter().fold(0, i32::max).cast_unsigned()
+    }
+}
+
+/// [`Simd::add_products`] for arrays.
+#[cfg(any(test, not(target_arch = "x86_64")))]
+#[inline(always)]
+fn add_products(mut sum: [i32; LANES], a: [i16; 2 * LANES], b: [i16; 2 * LANES]) -> [i32; LANES] {
+    let pairs = a.as_chunks().0.iter().zip(b.as_chunks().0);
+    for (sum, (&[a0, a1], &[b0, b1])) in sum.iter_mut().zip(pairs) {
+        let product = |a, b| i32::from(a) * i32::from(b);
+        *sum = sum.wrapping_add(product(a0, b0).wrapping_add(product(a1, b1)));
+    }
+    sum
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{LANES, Portable, Simd, add_products};
+
+    #[test]
+    fn products_of_pairs_wrap_around_and_are_the_same_by_name_and_by_arrays() {
+        let extremes = [i16::MIN, -16_383, -1, 0, 1, 8191, i16::MAX];
+        for first in 0..extremes.len() {
+            let number = |i: usize, step: usize| {
+                let at = (first + i * step) % extremes.len();
+                extremes.get(at).copied().unwrap_or(0)
+            };
+            let a = core::array::from_fn::<_, { 2 * LANES }, _>(|i| number(i, 1));
+            let b = core::array::from_fn::<_, { 2 * LANES }, _>(|i| number(i, 3));
+            for sum in [0, i32::MAX, i32::MIN] {
+                let sums = [sum; LANES];
+                let products = Portable.add_products(sums, a, b);
+                assert_eq!(products, add_products(sums, a, b));
+                let in_64_bits = |i: usize| {
+                    i64::from(sum)
+                        + (0..2)
+                            .map(|j| {
+                                i64::from(number(2 * i + j, 1)) * i64::from(number(2 * i + j, 3))
+                            })
+                            .sum::<i64>()
+                };
+                assert_eq!(products, core::array::from_fn(|i| in_64_bits(i) as i32));
+            }
+        }
     }
 }

@@ -1,23 +1,24 @@
-//! Vectors of x86-64: AVX2 with F16C, and AVX-512, whole or as twice as many AVX2 registers.
+//! Vectors of x86-64: AVX2 with F16C, and AVX-512, whole or as twice as many AVX2 registers; and the one operation for which arrays
+//! need the baseline's instruction by name.
 //!
 //! Invariant: `dispatch` alone makes these values, inside a function that is compiled for their instructions.
 
 use core::arch::x86_64::{
-    __m256, __m256i, __m512, __m512i, _CMP_LT_OQ, _MM_FROUND_TO_NEAREST_INT, _mm_cvtsi128_si32,
-    _mm_loadu_si128, _mm_max_epi32, _mm_shuffle_epi32, _mm_storeu_si128, _mm256_add_epi32,
-    _mm256_add_ps, _mm256_and_si256, _mm256_blendv_ps, _mm256_castps_si256, _mm256_castsi256_ps,
-    _mm256_castsi256_si128, _mm256_cmp_ps, _mm256_cvtepi8_epi16, _mm256_cvtepi32_ps,
-    _mm256_cvtepu16_epi32, _mm256_cvtph_ps, _mm256_cvtps_ph, _mm256_extracti128_si256,
-    _mm256_loadu_ps, _mm256_loadu_si256, _mm256_madd_epi16, _mm256_max_epi32, _mm256_mul_ps,
-    _mm256_packs_epi32, _mm256_permute4x64_epi64, _mm256_set1_epi32, _mm256_set1_ps,
-    _mm256_setzero_ps, _mm256_setzero_si256, _mm256_slli_epi32, _mm256_srai_epi32,
-    _mm256_storeu_ps, _mm256_storeu_si256, _mm512_add_epi32, _mm512_add_ps, _mm512_and_si512,
-    _mm512_castps_si512, _mm512_castsi512_ps, _mm512_cmp_ps_mask, _mm512_cvtepi8_epi16,
-    _mm512_cvtepi32_epi16, _mm512_cvtepi32_ps, _mm512_cvtepu16_epi32, _mm512_cvtph_ps,
-    _mm512_cvtps_ph, _mm512_dpwssd_epi32, _mm512_loadu_ps, _mm512_loadu_si512,
-    _mm512_mask_blend_ps, _mm512_max_epi32, _mm512_mul_ps, _mm512_reduce_max_epi32,
-    _mm512_set1_epi32, _mm512_set1_ps, _mm512_setzero_ps, _mm512_setzero_si512, _mm512_slli_epi32,
-    _mm512_storeu_ps,
+    __m256, __m256i, __m512, __m512i, _CMP_LT_OQ, _MM_FROUND_TO_NEAREST_INT, _mm_add_epi32,
+    _mm_cvtsi128_si32, _mm_loadu_si128, _mm_madd_epi16, _mm_max_epi32, _mm_shuffle_epi32,
+    _mm_storeu_si128, _mm256_add_epi32, _mm256_add_ps, _mm256_and_si256, _mm256_blendv_ps,
+    _mm256_castps_si256, _mm256_castsi256_ps, _mm256_castsi256_si128, _mm256_cmp_ps,
+    _mm256_cvtepi8_epi16, _mm256_cvtepi32_ps, _mm256_cvtepu16_epi32, _mm256_cvtph_ps,
+    _mm256_cvtps_ph, _mm256_extracti128_si256, _mm256_loadu_ps, _mm256_loadu_si256,
+    _mm256_madd_epi16, _mm256_max_epi32, _mm256_mul_ps, _mm256_packs_epi32,
+    _mm256_permute4x64_epi64, _mm256_set1_epi32, _mm256_set1_ps, _mm256_setzero_ps,
+    _mm256_setzero_si256, _mm256_slli_epi32, _mm256_srai_epi32, _mm256_storeu_ps,
+    _mm256_storeu_si256, _mm512_add_epi32, _mm512_add_ps, _mm512_and_si512, _mm512_castps_si512,
+    _mm512_castsi512_ps, _mm512_cmp_ps_mask, _mm512_cvtepi8_epi16, _mm512_cvtepi32_epi16,
+    _mm512_cvtepi32_ps, _mm512_cvtepu16_epi32, _mm512_cvtph_ps, _mm512_cvtps_ph,
+    _mm512_dpwssd_epi32, _mm512_loadu_ps, _mm512_loadu_si512, _mm512_mask_blend_ps,
+    _mm512_max_epi32, _mm512_mul_ps, _mm512_reduce_max_epi32, _mm512_set1_epi32, _mm512_set1_ps,
+    _mm512_setzero_ps, _mm512_setzero_si512, _mm512_slli_epi32, _mm512_storeu_ps,
 };
 
 use super::{MAGNITUDE, ROUND, Simd};
@@ -401,4 +402,26 @@ impl Simd for Avx512 {
 #[inline(always)]
 fn joined([low, high]: [i16; 2]) -> i32 {
     i32::from(low.cast_unsigned()) | i32::from(high) << 16
+}
+
+/// [`Simd::add_products`] for arrays, with what every x86-64 CPU has: compilers do not find the instruction by themselves.
+#[inline(always)]
+pub(super) fn add_products(
+    mut sum: [i32; LANES],
+    a: [i16; 2 * LANES],
+    b: [i16; 2 * LANES],
+) -> [i32; LANES] {
+    let (sums, _) = sum.as_chunks_mut::<4>();
+    let ((a, _), (b, _)) = (a.as_chunks::<8>(), b.as_chunks::<8>());
+    for (sum, (a, b)) in sums.iter_mut().zip(a.iter().zip(b)) {
+        let at = sum.as_mut_ptr().cast();
+        // SAFETY: SSE2 is part of x86-64; each of the three is sixteen bytes.
+        unsafe {
+            let a = _mm_loadu_si128(a.as_ptr().cast());
+            let b = _mm_loadu_si128(b.as_ptr().cast());
+            let added = _mm_add_epi32(_mm_loadu_si128(at), _mm_madd_epi16(a, b));
+            _mm_storeu_si128(at, added);
+        }
+    }
+    sum
 }
