@@ -189,11 +189,11 @@ fn sweep<S: Simd, W: Integer, const P: usize, const R: usize>(
         .enumerate()
     {
         let mut integers = [[[simd.zeros(); P]; R]; 2];
-        for i in 0..rounds {
+        for round in 0..rounds {
             for (chain, integers) in integers.iter_mut().take(S::CHAINS).enumerate() {
-                let pair = i * S::CHAINS + chain;
+                let pair = round * S::CHAINS + chain;
                 // SAFETY: `l` is below the number of groups in a part, which is how many `x[r]` has, and `pair` below `PAIRS`,
-                // which is how many pairs a group has.
+                // which is how many pairs a group has: rounds times chains are no more.
                 let x =
                     x.map(|x| simd.splat_pair(unsafe { *x.get_unchecked(l).get_unchecked(pair) }));
                 for p in 0..P {
@@ -209,6 +209,7 @@ fn sweep<S: Simd, W: Integer, const P: usize, const R: usize>(
             }
         }
         let [mut integers, others] = integers;
+        // Sums of integers are exact, so chains change no bits.
         if S::CHAINS == 2 {
             for (integers, others) in integers.iter_mut().zip(others) {
                 for (integers, others) in integers.iter_mut().zip(others) {
