@@ -83,11 +83,8 @@ fn ratios(rows: &[Row]) -> String {
         );
         let target = row.target.map_or_else(
             || "–".into(),
-            |target| {
-                format!("≤ {} {}", plain(target), row.unit)
-                    .trim()
-                    .to_owned()
-            },
+            // As it was set, not rounded.
+            |target| format!("≤ {target} {}", row.unit).trim().to_owned(),
         );
         let met = match row.met() {
             Some(true) => "met",
