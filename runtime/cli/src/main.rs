@@ -58,8 +58,8 @@ enum Command {
         #[arg(long, value_name = "FILE")]
         emit_rust: Option<PathBuf>,
         /// How the weights are stored: f32; int16 or int8, with which the inputs of a layer are rounded too, and which are faster
-        /// than f32 with AVX2 or wider instructions; f16 or bf16, which are decoded. Fewer bits than 32 have to pass a gate: the golden episode replays with the same plans, and with actions inside
-        /// the tolerance
+        /// than f32 on x86-64; f16 or bf16, which are decoded. Fewer bits than 32 have to pass a gate: the golden episode replays
+        /// with the same plans, and with actions inside the tolerance
         #[arg(long, value_name = "FORMAT", default_value = "f32", value_parser = weight_format)]
         weights: WeightFormat,
         /// How the weights of the low level are stored, if otherwise: with f32 the actions of a plan keep their bits, and all

@@ -180,6 +180,7 @@ fn sweep<S: Simd, W: Integer, const P: usize, const R: usize>(
         return P;
     }
     let x = rows.each_ref().map(|row| row.pairs.as_chunks::<PAIRS>().0);
+    const { assert!(S::CHAINS == 1 || S::CHAINS == 2, "one sum, or two") };
     // Not unrolled: that would double the code for nothing.
     let rounds = black_box(PAIRS / S::CHAINS);
     let mut sums = [[simd.splat(0.0); P]; R];
