@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::fmt;
 
 use lads_core::Policy;
-use lads_core::op::{CacheFormat, Port, WeightFormat, WeightSpan};
+use lads_image::op::{CacheFormat, Port, WeightFormat, WeightSpan};
 
 use crate::bundle::Bundle;
 use crate::entries::{

@@ -3,13 +3,13 @@
 
 use std::collections::HashMap;
 
-use lads_core::codec::{Field, Writer};
 use lads_core::image::{
     self, Beyond, CRC_WORD, ContractRecord, DecisionRule, ElementRecord, GoldenRecord,
     InstructionRecord, Layout, PORTS, PolicyKind, PortRecord, ProgramRecord, QuaternionOrder,
     SECTIONS, Section, Text,
 };
-use lads_core::op::{Place, Port, WeightSpan};
+use lads_image::codec::{Field, Writer};
+use lads_image::op::{Place, Port, WeightSpan};
 
 use crate::aligned::Aligned;
 use crate::bundle::Bundle;
@@ -214,7 +214,7 @@ fn program_words(parts: &Parts) -> (Vec<u32>, Vec<u32>) {
             outputs: port_records(&program.outputs),
         };
         put(&mut programs, &record);
-        ops.extend(program.ops.iter().flat_map(lads_core::op::Op::encode));
+        ops.extend(program.ops.iter().flat_map(lads_image::op::Op::encode));
         first_op += program.ops.len() as u32;
     }
     (programs, ops)

@@ -19,7 +19,6 @@
 //! ```
 #![forbid(unsafe_code)]
 
-mod access;
 mod aligned;
 mod bundle;
 mod compile;
@@ -52,7 +51,7 @@ pub use digest::sha256;
 pub use error::{BundleError, CompileError, Line};
 pub use golden::Golden;
 pub use image::Image;
-pub use lads_core::op::{CacheFormat, WeightFormat};
+pub use lads_image::op::{CacheFormat, WeightFormat};
 pub use memory::{Memory, MemoryError};
 pub use report::{CompileReport, ProgramReport};
 pub use verify::PlanFault;

@@ -13,7 +13,7 @@ mod weights;
 
 use std::collections::{HashMap, HashSet};
 
-use lads_core::op::{self, CacheFormat, IntSlot, Operand, Place, Port, Space, Span, StateSpan};
+use lads_image::op::{self, CacheFormat, IntSlot, Operand, Place, Port, Space, Span, StateSpan};
 use lads_kernels::keys_len;
 
 use crate::contract::Contract;

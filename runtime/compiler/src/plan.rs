@@ -4,9 +4,8 @@
 //! from the largest to the smallest, each in the smallest gap that fits among those that live at the same time (greedy best
 //! fit). The result is not trusted: [`verify`](crate::verify) proves it.
 
-use lads_core::op::{Op, Place, Port, Span};
+use lads_image::op::{Op, Place, Port, Span};
 
-use crate::access::each_span;
 use crate::lower::Lowered;
 
 /// Buffers start at multiples of this many elements: a cache line.
@@ -47,7 +46,7 @@ pub(crate) fn plan(lowered: &Lowered) -> Placed {
     };
     let mut ops = lowered.ops.clone();
     for op in &mut ops {
-        each_span(op, &mut |span| moved(span));
+        op.each_span(&mut |span| moved(span));
     }
     let ports = |ports: &[(Port, Place)]| {
         let place = |place: Place| match place {
@@ -98,7 +97,7 @@ fn lives(lowered: &Lowered) -> Vec<Life> {
         touch(span, 0);
     }
     for (i, op) in lowered.ops.iter().enumerate() {
-        each_span(&mut op.clone(), &mut |span| touch(*span, i + 1));
+        op.clone().each_span(&mut |span| touch(*span, i + 1));
     }
     for span in spans(&lowered.outputs) {
         touch(span, lowered.ops.len() + 1);

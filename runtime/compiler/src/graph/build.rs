@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use lads_core::op::{BinaryKind, ReduceKind};
+use lads_image::op::{BinaryKind, ReduceKind};
 
 use super::{Dim, Graph, Id, Kind, MAX_FOLDING, Op, Type, Unary, cost, evaluate, show};
 use crate::tensor::{MAX_RANK, Tensor, elements};

@@ -3,7 +3,7 @@
 use std::f32::consts::{FRAC_1_SQRT_2, SQRT_2};
 use std::sync::Arc;
 
-use lads_core::op::{BinaryKind, ReduceKind, UnaryKind};
+use lads_image::op::{BinaryKind, ReduceKind, UnaryKind};
 
 use super::attributes::Attributes;
 use super::{Operands, recurrent, shapes};

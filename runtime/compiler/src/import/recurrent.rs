@@ -4,7 +4,7 @@
 //! `g = x_t·W^T + h·R^T + Wb + Rb`, `c = sigmoid(g_f) * c + sigmoid(g_i) * tanh(g_c)`, `h = sigmoid(g_o) * tanh(c)`.
 //! The input's share of all steps is one product.
 
-use lads_core::op::{BinaryKind, UnaryKind};
+use lads_image::op::{BinaryKind, UnaryKind};
 
 use super::Operands;
 use super::attributes::Attributes;

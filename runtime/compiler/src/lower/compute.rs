@@ -1,6 +1,6 @@
 //! The op or view of each kind of node.
 
-use lads_core::op::{
+use lads_image::op::{
     self, Activation, ArgMax, ArgMin, Binary, BinaryKind, Copy, GatherRow, LayerNorm, Linear,
     MatMul, Reduce, ReduceKind, Softmax, Span, UnaryKind, WeightSpan,
 };
@@ -345,7 +345,7 @@ impl Lowering<'_> {
         let table = self.plain(table)?;
         let y = self.allocate(id, &shape);
         let op = GatherRow {
-            table,
+            table: table.into(),
             row_len: product(&shape) as u32,
             rows,
             index: slot,

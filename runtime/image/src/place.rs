@@ -1,4 +1,9 @@
-//! Where the values of a program live: spans of the three spaces, integer slots, and the ports at a program's edge.
+//! Where the values of a program live: spans of the three spaces and integer slots.
+//!
+//! Every offset and length counts elements, 4-byte words where elements are smaller. A span that was read from an image may say
+//! anything; [`Program::new_checked`](crate::Program::new_checked) checks that it lies inside its space.
+
+use core::ops::Range;
 
 use crate::codec::{Field, Reader, Writer, record, word_enum};
 
@@ -82,8 +87,40 @@ impl From<WeightSpan> for Operand {
     }
 }
 
+impl Operand {
+    /// The span of an operand that lies in the arena.
+    #[inline]
+    pub fn arena(self) -> Option<Span> {
+        matches!(self.space, Space::Arena).then_some(Span {
+            offset: self.offset,
+            len: self.len,
+        })
+    }
+}
+
+#[inline]
+fn range(offset: u32, len: u32) -> Range<usize> {
+    let start = offset as usize;
+    start..start.saturating_add(len as usize)
+}
+
+/// Gives a kind of span its range.
+macro_rules! ranges {
+    ($($name:ident)*) => {
+        $(impl $name {
+            /// Where it lies in the slice of its space.
+            #[inline]
+            pub fn range(self) -> Range<usize> {
+                range(self.offset, self.len)
+            }
+        })*
+    };
+}
+
+ranges! { Span WeightSpan StateSpan Operand }
+
 /// One of the [`INT_SLOTS`] integers of a program: a timestep, an index. Set by the caller or
-/// by [`ArgMin`](super::ArgMin) and [`ArgMax`](super::ArgMax).
+/// by [`ArgMin`](crate::op::ArgMin) and [`ArgMax`](crate::op::ArgMax).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct IntSlot(pub u8);
 
@@ -98,41 +135,6 @@ impl Field for IntSlot {
             .ok()
             .filter(|&slot| usize::from(slot) < INT_SLOTS)
             .map(Self)
-    }
-}
-
-word_enum! {
-    /// What a value at the edge of a program is.
-    pub enum Port {
-        /// `[1, O]`, raw units.
-        Observation = 0,
-        /// `[1, A]`: the previous action as an input, the action as an output.
-        Action = 1,
-        /// `[L, E]` word embeddings, zero-padded to the contract's longest instruction.
-        Words = 2,
-        /// Integer: timestep in the context.
-        Timestep = 3,
-        /// `[1, D]`: a codebook entry.
-        Plan = 4,
-        /// Integer: which codebook entry.
-        PlanIndex = 5,
-        /// `[1, M]`: one score per codebook entry.
-        Logits = 6,
-        /// `[1, D]`: what the trajectory encoder gives before it is replaced by the nearest entry.
-        Latent = 7,
-        /// `[H, O]`: the observations of one horizon.
-        Observations = 8,
-        /// `[H, A]`: the actions of one horizon.
-        Actions = 9,
-        /// Integer: which of the contract's instructions.
-        InstructionId = 10,
-    }
-}
-
-impl Port {
-    /// True for a port that is an integer and lives in an [`IntSlot`].
-    pub const fn is_int(self) -> bool {
-        matches!(self, Self::Timestep | Self::PlanIndex | Self::InstructionId)
     }
 }
 
