@@ -13,7 +13,7 @@ COLLECT_lorel   := --episodes 50000
 # What lints and tests cover; one selection, because each is a build of its own, of tract too: the oracle and the language encoder's engine.
 FEATURES := lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language
 ALL      := --workspace --features $(FEATURES)
-RUNTIME := -p lads-core -p lads-kernels -p lads-compiler -p lads-ffi -p lads-cli
+RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-ffi -p lads-cli
 
 PREFIX  ?= /usr/local
 
@@ -69,7 +69,7 @@ test-rust: setup
 # and under valgrind, which also sees the use of memory that was never written. Debug assertions and the checks of the preconditions of
 # unsafe functions are on in both. valgrind has no AVX-512 and does not flush subnormal numbers; sweeps of safe arithmetic take it too long.
 HOST = $(shell rustc --print host-tuple)
-SANITIZED = --target $(HOST) --tests -p lads-kernels -p lads-core
+SANITIZED = --target $(HOST) --tests -p lads-kernels -p lads-image -p lads-core
 BOUNDARY = --target $(HOST) -p lads-ffi --test abi --test refusals
 MEMCHECK = CARGO_TARGET_$(shell echo $(HOST) | tr a-z- A-Z_)_RUNNER="valgrind --quiet --error-exitcode=99" PROPTEST_CASES=8
 

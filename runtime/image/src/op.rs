@@ -142,6 +142,9 @@ macro_rules! ops {
         pub enum Op { $($name($name),)* }
 
         impl Op {
+            /// The names of all operations, in the order of their opcodes.
+            pub const NAMES: &'static [&'static str] = &[$(stringify!($name),)*];
+
             /// The op as words of an image.
             pub fn encode(&self) -> [u32; OP_WORDS] {
                 let mut words = [0; OP_WORDS];
@@ -230,4 +233,52 @@ ops! {
     Copy = 10,
     ArgMin = 11,
     ArgMax = 12,
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use std::vec::Vec;
+
+    use super::{INT_SLOTS, Op};
+    use crate::machine::{ExecError, Machine};
+    use crate::place::Span;
+    use crate::{Checker, Isa, Spaces};
+
+    /// Checks an op and runs it on an arena and weights that are there for it alone.
+    pub fn run(
+        op: impl Into<Op>,
+        arena: &[f32],
+        weights: &[f32],
+        ints: [u32; INT_SLOTS],
+    ) -> Result<(Vec<f32>, [u32; INT_SLOTS]), ExecError> {
+        let op = op.into();
+        let spaces = Spaces {
+            weights_len: weights.len(),
+            cache_len: 0,
+            rows: 0,
+        };
+        let checked = op.check(&Checker::new(spaces, arena.len() as u32, 0));
+        assert_eq!(checked, Ok(()), "{op:?}");
+        let mut arena = arena.to_vec();
+        let mut machine = Machine {
+            arena: &mut arena,
+            cache: &mut [],
+            ints,
+            past: 0,
+            isa: Isa::detect(),
+        };
+        op.run(weights, &mut machine)?;
+        let ints = machine.ints;
+        Ok((arena, ints))
+    }
+
+    /// The arena after a run that cannot fail and knows no integers.
+    pub fn computed(op: impl Into<Op>, arena: &[f32], weights: &[f32]) -> Vec<f32> {
+        let (arena, _) = run(op, arena, weights, [0; INT_SLOTS]).expect("the op runs");
+        arena
+    }
+
+    pub const fn span(offset: u32, len: u32) -> Span {
+        Span { offset, len }
+    }
 }

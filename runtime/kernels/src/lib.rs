@@ -3,7 +3,7 @@
 //! Invariants:
 //! - No allocation, no `std`, no panic, and no unsafe code but in `dispatch`, `simd`, `subnormal` and the loops over weights and cache: a slice
 //!   that is too short leaves the rest of the result as it was.
-//!   Callers that want to be told check shapes beforehand; `lads-core` does so once per program.
+//!   Callers that want to be told check shapes beforehand; `lads-image` does so once per program.
 //! - The same bits on every target with IEEE 754 arithmetic: every sum has one fixed order (sixteen lanes, then a tree), no
 //!   multiply-add is fused, and `exp`, `tanh` and `sigmoid` are the polynomials of [`math`].
 //! - Inner loops run over blocks of sixteen elements: plain Rust that compilers vectorise, or the vectors of `simd` where a control

@@ -68,3 +68,24 @@ macro_rules! arg {
 
 arg! { ArgMin by kernels::arg_min }
 arg! { ArgMax by kernels::arg_max }
+
+#[cfg(test)]
+mod tests {
+    use super::{ArgMax, ArgMin};
+    use crate::op::tests::{run, span};
+    use crate::place::{INT_SLOTS, IntSlot};
+
+    #[test]
+    fn the_first_of_equal_ones_is_found() {
+        let (x, out) = (span(1, 4), IntSlot(3));
+        let arena = [-9.0, 2.0, -1.0, 2.0, -1.0, 9.0];
+        let mut ints = [7; INT_SLOTS];
+        for (found, expected) in [
+            (run(ArgMax { x, out }, &arena, &[], ints), 0),
+            (run(ArgMin { x, out }, &arena, &[], ints), 1),
+        ] {
+            ints[3] = expected;
+            assert_eq!(found, Ok((arena.to_vec(), ints)));
+        }
+    }
+}

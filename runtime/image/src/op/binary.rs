@@ -98,3 +98,32 @@ fn is_contiguous(dims: [u32; 4], strides: [u32; 4]) -> bool {
             fits
         })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::{Binary, BinaryKind, is_contiguous};
+    use crate::op::tests::{computed, span};
+    use crate::place::WeightSpan;
+
+    #[test]
+    fn in_place_and_broadcast() {
+        let op = Binary {
+            kind: BinaryKind::Sub,
+            a: WeightSpan { offset: 0, len: 2 }.into(),
+            b: span(0, 4).into(),
+            y: span(0, 4),
+            dims: [1, 1, 2, 2],
+            a_strides: [0, 0, 0, 1],
+            b_strides: [0, 0, 2, 1],
+        };
+        let y = computed(op, &[1.0, 2.0, 3.0, 4.0], &[10.0, 20.0]);
+        assert_eq!(y, [9.0, 18.0, 7.0, 16.0]);
+    }
+
+    #[test]
+    fn a_dimension_of_length_one_has_any_stride() {
+        assert!(is_contiguous([1, 2, 1, 3], [99, 3, 7, 1]));
+        assert!(!is_contiguous([1, 2, 1, 3], [99, 4, 7, 1]));
+        assert!(!is_contiguous([1, 1, 2, 2], [0, 0, 1, 2]));
+    }
+}

@@ -74,3 +74,23 @@ impl Operation for Copy {
         Work::default().with_operand(self.x)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::Copy;
+    use crate::op::tests::{computed, span};
+
+    #[test]
+    fn what_the_strides_do_not_reach_stays() {
+        let transposed = Copy {
+            x: span(0, 4).into(),
+            y: span(4, 5),
+            dims: [1, 1, 2, 2],
+            x_strides: [0, 0, 1, 2],
+            y_strides: [0, 0, 3, 1],
+        };
+        let arena = [1.0, 2.0, 3.0, 4.0, 0.0, 0.0, 9.0, 0.0, 0.0];
+        let expected = [1.0, 2.0, 3.0, 4.0, 1.0, 3.0, 9.0, 2.0, 4.0];
+        assert_eq!(computed(transposed, &arena, &[]), expected);
+    }
+}

@@ -74,3 +74,46 @@ impl Operation for GatherRow {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::vec::Vec;
+
+    use super::GatherRow;
+    use crate::machine::ExecError;
+    use crate::op::tests::{run, span};
+    use crate::place::{INT_SLOTS, IntSlot, Operand, WeightSpan};
+
+    const TABLE: [f32; 6] = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
+
+    fn row(table: Operand, index: u32, shift: i32) -> Result<Vec<f32>, ExecError> {
+        let op = GatherRow {
+            table,
+            row_len: 2,
+            rows: 3,
+            index: IntSlot(1),
+            shift,
+            y: span(6, 2),
+        };
+        let mut ints = [9; INT_SLOTS];
+        ints[1] = index;
+        let arena = [&TABLE[..], &[0.0; 2]].concat();
+        let (arena, _) = run(op, &arena, &TABLE, ints)?;
+        Ok(arena[6..].to_vec())
+    }
+
+    /// Tables of the image, and queues in the arena.
+    #[test]
+    fn rows_come_from_either_space() {
+        let weights = WeightSpan { offset: 0, len: 6 };
+        for table in [span(0, 6).into(), weights.into()] {
+            assert_eq!(row(table, 0, 0), Ok([1.0, 2.0].into()));
+            assert_eq!(row(table, 2, 0), Ok([5.0, 6.0].into()));
+            assert_eq!(row(table, 2, -1), Ok([3.0, 4.0].into()));
+            let beyond = |row| Err(ExecError::Index { row, rows: 3 });
+            assert_eq!(row(table, 3, 0), beyond(3));
+            assert_eq!(row(table, 0, -1), beyond(-1));
+            assert_eq!(row(table, u32::MAX, i32::MAX), beyond(6_442_450_942));
+        }
+    }
+}

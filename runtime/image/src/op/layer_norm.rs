@@ -68,3 +68,28 @@ impl Operation for LayerNorm {
         Work::elements(self.x.len).with_weights([self.gamma, self.beta])
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::LayerNorm;
+    use crate::op::tests::{computed, span};
+    use crate::place::WeightSpan;
+
+    #[test]
+    fn each_row_is_scaled_and_shifted() {
+        let norm = LayerNorm {
+            x: span(0, 4),
+            y: span(4, 4),
+            gamma: WeightSpan { offset: 0, len: 2 },
+            beta: WeightSpan { offset: 2, len: 2 },
+            rows: 2,
+            cols: 2,
+            eps: 0.0,
+        };
+        let arena = [1.0, 3.0, 8.0, 4.0, 0.0, 0.0, 0.0, 0.0];
+        let y = &computed(norm, &arena, &[2.0, 3.0, 10.0, 20.0])[4..];
+        for (y, expected) in y.iter().zip([8.0, 23.0, 12.0, 17.0]) {
+            assert!((y - expected).abs() < 1e-5, "{y} against {expected}");
+        }
+    }
+}

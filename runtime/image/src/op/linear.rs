@@ -151,3 +151,43 @@ impl Operation for Linear {
         Work::products([self.m, self.k, self.n]).with_weights([self.w].into_iter().chain(columns))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::vec;
+
+    use super::{Activation, Linear, WeightFormat};
+    use crate::op::tests::{computed, span};
+    use crate::place::WeightSpan;
+
+    #[test]
+    fn the_activation_comes_before_the_residual_connection() {
+        let mut weights = vec![0.0; lads_kernels::packed_len(WeightFormat::F32, [2, 1])];
+        lads_kernels::pack(WeightFormat::F32, &[1.0, -2.0], [2, 1], &mut weights);
+        let len = weights.len() as u32;
+        weights.push(0.5);
+        let layer = Linear {
+            x: span(0, 4),
+            format: WeightFormat::F32,
+            w: WeightSpan { offset: 0, len },
+            scales: None,
+            bias: Some(WeightSpan {
+                offset: len,
+                len: 1,
+            }),
+            y: span(4, 2),
+            m: 2,
+            k: 2,
+            n: 1,
+            activation: Activation::Relu,
+            accumulate: true,
+        };
+        let arena = [3.0, 1.0, 1.0, 3.0, 10.0, 20.0];
+        assert_eq!(computed(layer, &arena, &weights)[4..], [11.5, 20.0]);
+        let layer = Linear {
+            accumulate: false,
+            ..layer
+        };
+        assert_eq!(computed(layer, &arena, &weights)[4..], [1.5, 0.0]);
+    }
+}

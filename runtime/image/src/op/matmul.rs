@@ -83,3 +83,28 @@ impl Operation for MatMul {
             .with_operand(self.b)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::MatMul;
+    use crate::op::tests::{computed, span};
+    use crate::place::WeightSpan;
+
+    #[test]
+    fn a_product_with_a_transposed_operand() {
+        let product = MatMul {
+            a: span(0, 4).into(),
+            b: WeightSpan { offset: 1, len: 4 }.into(),
+            y: span(4, 4),
+            batch: 1,
+            m: 2,
+            k: 2,
+            n: 2,
+            a_strides: [0, 2, 1],
+            b_strides: [0, 1, 2],
+        };
+        let arena = [1.0, 2.0, 3.0, 4.0, 0.0, 0.0, 0.0, 0.0];
+        let computed = computed(product, &arena, &[9.0, 1.0, 0.5, 2.0, 4.0]);
+        assert_eq!(computed[4..], [2.0, 10.0, 5.0, 22.0]);
+    }
+}

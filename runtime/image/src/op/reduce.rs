@@ -63,3 +63,30 @@ impl Operation for Reduce {
         Work::elements(self.x.len).with_operand(self.x)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::{Reduce, ReduceKind};
+    use crate::op::tests::{computed, span};
+
+    #[test]
+    fn the_axis_in_the_middle_disappears() {
+        let reduced = |kind| {
+            let op = Reduce {
+                kind,
+                x: span(0, 8).into(),
+                y: span(8, 4),
+                outer: 2,
+                axis: 2,
+                inner: 2,
+            };
+            let arena = [1.0, 2.0, 3.0, 5.0, -4.0, 0.5, 2.0, 4.0, 0.0, 0.0, 0.0, 0.0];
+            computed(op, &arena, &[])[8..].to_vec()
+        };
+        assert_eq!(reduced(ReduceKind::Sum), [4.0, 7.0, -2.0, 4.5]);
+        assert_eq!(reduced(ReduceKind::Mean), [2.0, 3.5, -1.0, 2.25]);
+        assert_eq!(reduced(ReduceKind::Max), [3.0, 5.0, 2.0, 4.0]);
+        assert_eq!(reduced(ReduceKind::Min), [1.0, 2.0, -4.0, 0.5]);
+        assert_eq!(reduced(ReduceKind::Prod), [3.0, 10.0, -8.0, 2.0]);
+    }
+}

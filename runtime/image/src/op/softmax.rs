@@ -52,3 +52,24 @@ impl Operation for Softmax {
         Work::elements(self.x.len)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::Softmax;
+    use crate::op::tests::{computed, span};
+
+    #[test]
+    fn each_row_sums_to_one() {
+        let softmax = Softmax {
+            x: span(0, 4),
+            y: span(4, 4),
+            rows: 2,
+            cols: 2,
+        };
+        let arena = [3.0, 3.0, 0.0, 3.0_f32.ln(), 0.0, 0.0, 0.0, 0.0];
+        let y = &computed(softmax, &arena, &[])[4..];
+        for (y, expected) in y.iter().zip([0.5, 0.5, 0.25, 0.75]) {
+            assert!((y - expected).abs() < 1e-6, "{y} against {expected}");
+        }
+    }
+}

@@ -80,3 +80,26 @@ impl Operation for Unary {
         Work::elements(self.x.len).with_operand(self.x)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::{Unary, UnaryKind};
+    use crate::op::tests::{computed, span};
+
+    #[test]
+    fn in_place_and_beside() {
+        let op = Unary {
+            kind: UnaryKind::LeakyRelu,
+            alpha: 0.5,
+            x: span(0, 2).into(),
+            y: span(2, 2),
+        };
+        let arena = [-4.0, 3.0, 0.0, 0.0];
+        assert_eq!(computed(op, &arena, &[]), [-4.0, 3.0, -2.0, 3.0]);
+        let op = Unary {
+            y: span(0, 2),
+            ..op
+        };
+        assert_eq!(computed(op, &arena, &[]), [-2.0, 3.0, 0.0, 0.0]);
+    }
+}
