@@ -129,19 +129,20 @@ impl Machine<'_> {
         past: usize,
         inputs: &Inputs,
     ) -> Result<(), ExecError> {
-        let _flushed = kernels::Flushed::new();
-        for PortRecord { port, place } in program.inputs() {
-            match place {
-                Place::Span(span) => {
-                    let to = self.arena.get_mut(range(span)).ok_or(ExecError::Span)?;
-                    let from = inputs.slice(port);
-                    kernels::assign(to, from);
-                    to.get_mut(from.len()..).unwrap_or(&mut []).fill(0.0);
+        kernels::flushed(|| {
+            for PortRecord { port, place } in program.inputs() {
+                match place {
+                    Place::Span(span) => {
+                        let to = self.arena.get_mut(range(span)).ok_or(ExecError::Span)?;
+                        let from = inputs.slice(port);
+                        kernels::assign(to, from);
+                        to.get_mut(from.len()..).unwrap_or(&mut []).fill(0.0);
+                    }
+                    Place::Int(slot) => self.set(slot, inputs.int(port)),
                 }
-                Place::Int(slot) => self.set(slot, inputs.int(port)),
             }
-        }
-        program.ops().try_for_each(|op| self.op(&op, weights, past))
+            program.ops().try_for_each(|op| self.op(&op, weights, past))
+        })
     }
 
     /// An output of the last run; empty when the program has none of this name.
