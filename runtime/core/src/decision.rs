@@ -26,7 +26,7 @@ pub(crate) struct Decider {
 }
 
 /// Stream of the generator: the default of PCG's reference implementation.
-const STREAM: u128 = 0x0a02_bdbf_7bb3_c0a7_ac28_fa16_a64a_bf96;
+pub(crate) const STREAM: u128 = 0x0a02_bdbf_7bb3_c0a7_ac28_fa16_a64a_bf96;
 
 impl Decider {
     pub fn new(rule: Decision) -> Self {

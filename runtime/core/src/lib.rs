@@ -10,7 +10,8 @@
 //! Invariants: no `std`, no allocation, no unsafe code, no panic. Sizes (contract), weights (image) and mutable state
 //! (workspace) are three types. Everything about a model is checked when it is opened; afterwards only what the caller passes
 //! can be refused, with one small error enum per operation. The same image and the same calls give the same bits on every
-//! target and on every [`Isa`], which a controller chooses once, when it is made.
+//! target and on every [`Isa`], which a controller chooses once, when it is made; numbers too small for a normal `f32` are the
+//! one exception: x86-64 takes them as zero while a program runs, so that they cost no time, and other targets compute with them.
 //!
 //! ```no_run
 //! use lads_core::{Controller, Instruction, Policy, Workspace};
@@ -62,6 +63,7 @@ mod golden;
 mod guard;
 pub mod image;
 mod low_level;
+mod normal;
 pub mod op;
 mod policy;
 pub mod program;
