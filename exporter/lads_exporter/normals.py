@@ -6,6 +6,8 @@ order of the runtime's, so that a policy in PyTorch and its compiled program den
 tested against is runtime/core/tests/normals.txt.
 """
 
+import operator
+
 import numpy as np
 
 MULTIPLIER = 0x2360ED051FC65DA44385DF649FCCF645
@@ -77,6 +79,8 @@ class Normals:
     """The runtime's stream of a seed, 0 to 2^64 - 1, from its beginning."""
 
     def __init__(self, seed):
+        # Not a number of numpy, whose arithmetic ends at 64 bits.
+        seed = operator.index(seed)
         if not 0 <= seed < 1 << 64:
             raise ValueError(f"a seed is a whole number from 0 to 2^64 - 1, not {seed}")
         increment = (STREAM << 1 | 1) % (1 << 128)

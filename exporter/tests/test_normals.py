@@ -74,6 +74,7 @@ def test_a_draw_goes_on_where_the_last_one_ended():
     assert draws.dtype == np.float32
     assert (draws.ravel() == np.concatenate([parts.draw(5), parts.draw(0), parts.draw(7)])).all()
     assert (Normals(5).draw(3, 4) != draws).all()
+    assert (Normals(np.uint64(4)).draw(3, 4) == draws).all()
 
 
 @pytest.mark.parametrize("seed", [-1, 1 << 64])
