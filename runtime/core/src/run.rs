@@ -5,7 +5,7 @@
 //! takes all of it over at the end, or drops it. Values that leave a program are finite ([`RunError::NotFinite`] otherwise); what a
 //! program appends to a KV cache is not looked at.
 
-use lads_image::place::{Place, Span};
+use lads_image::place::{INT_SLOTS, Place, Span};
 use lads_image::records::{
     self, CallRecord, EntryRecord, Event, Fill, MAX_ROW_STATES, PortRecord, Repeat, Scope, Source,
     SourceKind, StateKind, StateRecord,
@@ -19,6 +19,9 @@ use crate::inputs::Data;
 use crate::normal::Normals;
 use crate::schedule::Chain;
 use crate::workspace::Workspace;
+
+/// The integers of a program.
+type Ints = [u32; INT_SLOTS];
 
 /// How many rows of a ring or a KV cache are valid, and where they start.
 #[derive(Debug, Clone, Copy, Default)]
@@ -82,6 +85,8 @@ pub(crate) struct Run<'r, 'a, 'm, 'd> {
     pub counters: Counters,
     /// Words of the instruction that is taken in.
     pub words: u32,
+    /// The index that an entry has given as an output.
+    pub given_index: Option<u32>,
 }
 
 /// Elements of a span.
@@ -131,8 +136,8 @@ impl Run<'_, '_, '_, '_> {
             Repeat::Rows => self.counters.rows(call.count).len,
         };
         for pass in 0..times {
-            self.entry(&entry, pass)?;
-            self.store(&entry)?;
+            let ints = self.entry(&entry, pass)?;
+            self.store(&entry, ints)?;
             if entry.cache != records::NONE {
                 let appended = match call.event {
                     Event::Instruct => self.words,
@@ -161,6 +166,18 @@ impl Run<'_, '_, '_, '_> {
         Ok(())
     }
 
+    /// The values of a plain state, as the step has left them so far.
+    #[inline]
+    pub fn plain(&self, state: u32) -> Result<&[f32], RunError> {
+        let record = self.state(state)?;
+        let memory = if record.scope == Scope::Step {
+            &*self.memory.scratch
+        } else {
+            &*self.memory.next.plain
+        };
+        part(memory, record.offset as usize, record.width as usize)
+    }
+
     #[inline]
     fn state(&self, state: u32) -> Result<StateRecord, RunError> {
         self.tables
@@ -170,8 +187,8 @@ impl Run<'_, '_, '_, '_> {
 
     /// Fills the inputs and runs the program; results are left in the arena.
     #[inline]
-    pub fn entry(&mut self, entry: &EntryRecord, pass: u32) -> Result<Ran, RunError> {
-        let mut ints = [0; lads_image::place::INT_SLOTS];
+    pub fn entry(&mut self, entry: &EntryRecord, pass: u32) -> Result<Ints, RunError> {
+        let mut ints = [0; INT_SLOTS];
         for PortRecord { source, place, .. } in self.tables.inputs(entry) {
             match place {
                 Place::Span(span) => self.read(source, span, pass)?,
@@ -203,7 +220,7 @@ impl Run<'_, '_, '_, '_> {
         Program::trusted(ops, entry.arena_len, entry.tokens, rows)
             .run(self.tables.weights(), &mut machine)
             .map_err(RunError::Program)?;
-        Ok(Ran { ints: machine.ints })
+        Ok(machine.ints)
     }
 
     fn int(&self, source: Source, pass: u32) -> u32 {
@@ -258,11 +275,11 @@ impl Run<'_, '_, '_, '_> {
                     return self.read_ring(source.of, &state, span);
                 }
                 let (at, len) = (state.offset as usize, state.width as usize);
-                let from = match state.scope {
-                    Scope::Step => part(self.memory.scratch, at, len)?,
-                    _ => part(self.memory.next.plain, at, len)?,
+                let memory = match state.scope {
+                    Scope::Step => &*self.memory.scratch,
+                    _ => &*self.memory.next.plain,
                 };
-                assign(elements(self.memory.arena, span)?, from);
+                assign(elements(self.memory.arena, span)?, part(memory, at, len)?);
                 Ok(())
             }
             SourceKind::Row => {
@@ -297,9 +314,15 @@ impl Run<'_, '_, '_, '_> {
 
     /// Takes the outputs of a program out of the arena.
     #[inline]
-    fn store(&mut self, entry: &EntryRecord) -> Result<(), RunError> {
+    fn store(&mut self, entry: &EntryRecord, ints: Ints) -> Result<(), RunError> {
         for PortRecord { source, place, .. } in self.tables.outputs(entry) {
-            let Place::Span(span) = place else { continue };
+            let span = match place {
+                Place::Span(span) => span,
+                Place::Int(slot) => {
+                    self.given_index = ints.get(usize::from(slot.0)).copied();
+                    continue;
+                }
+            };
             let from = {
                 let start = span.offset as usize;
                 part(self.memory.arena, start, span.len as usize)?
@@ -340,24 +363,6 @@ impl Run<'_, '_, '_, '_> {
             assign(to, from);
         }
         Ok(())
-    }
-}
-
-/// What is left of a run besides the arena.
-pub(crate) struct Ran {
-    ints: [u32; lads_image::place::INT_SLOTS],
-}
-
-impl Ran {
-    /// The index that an entry gives.
-    pub fn selected(&self, tables: &Tables, entry: &EntryRecord) -> Option<u32> {
-        let port = tables
-            .outputs(entry)
-            .find(|port| port.source.kind == SourceKind::Selected)?;
-        match port.place {
-            Place::Int(slot) => self.ints.get(usize::from(slot.0)).copied(),
-            Place::Span(_) => None,
-        }
     }
 }
 

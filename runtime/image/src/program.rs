@@ -8,7 +8,7 @@
 use core::error::Error;
 use core::fmt;
 
-use lads_kernels::Flushed;
+use lads_kernels::flushed;
 
 use crate::check::{Checker, Fault, Spaces};
 use crate::codec::Reader;
@@ -77,8 +77,7 @@ impl<'a> Program<'a> {
                 needed,
             });
         }
-        let _flushed = Flushed::new();
-        self.ops().try_for_each(|op| op.run(weights, machine))
+        flushed(|| self.ops().try_for_each(|op| op.run(weights, machine)))
     }
 
     /// Words of the KV cache up to the end of what the program reads or appends; 0 for a program that knows no cache.

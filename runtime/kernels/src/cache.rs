@@ -77,7 +77,7 @@ pub enum Cache<'c> {
     },
 }
 
-/// The same, to be written.
+/// Keys and values of a cache, to be written.
 #[derive(Debug)]
 pub enum CacheMut<'c> {
     /// [`CacheFormat::F32`]
@@ -97,7 +97,7 @@ pub enum CacheMut<'c> {
 }
 
 impl CacheMut<'_> {
-    /// The same, to be read.
+    /// The cache, to be read.
     pub fn as_ref(&self) -> Cache<'_> {
         match self {
             Self::F32 { keys, values } => Cache::F32 { keys, values },
@@ -110,7 +110,7 @@ impl CacheMut<'_> {
 pub(crate) trait Cached: Stored<Bits: Copy> {
     /// Sixteen numbers as they are stored.
     fn stored<S: Simd>(simd: S, from: &Block) -> [Self::Bits; LANES];
-    /// What is stored as a number.
+    /// The number that stored bits mean.
     fn number(bits: Self::Bits) -> f32;
 }
 

@@ -163,13 +163,13 @@ impl Linear<'_> {
         }
     }
 
-    /// With weights that are integers. Not inlined: others need no memory for the inputs as integers.
+    /// The layer with integer weights. Out of line, so float layers do not reserve this stack buffer.
     #[inline(never)]
     fn integers(&self, isa: Isa, activation: Activation, x: &[f32], y: &mut [f32]) {
         self.wide(isa, activation, x, y, &mut [Part::EMPTY; 2]);
     }
 
-    /// With weights that are no narrow floats. Not inlined: compiled once for all of them.
+    /// The layer with 32-bit floats or integers as weights. Out of line, so that these formats share one compiled body.
     #[inline(never)]
     fn wide(&self, isa: Isa, activation: Activation, x: &[f32], y: &mut [f32], parts: &mut [Part]) {
         isa.run(Rows::<false> {
@@ -269,7 +269,7 @@ struct Rows<'a, const NARROW: bool> {
     layer: &'a Linear<'a>,
     /// The layer's, or none where it is applied at the end.
     activation: Activation,
-    /// Two, or none where the weights are no integers.
+    /// Two for integer weights, else empty.
     parts: &'a mut [Part],
     x: &'a [f32],
     y: &'a mut [f32],
