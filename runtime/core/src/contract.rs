@@ -18,7 +18,7 @@ const MAX_CHANNEL_LEN: u64 = 1 << 26;
 /// A checked view on the contract of a policy.
 #[derive(Debug, Clone, Copy)]
 pub struct Contract<'a> {
-    tables: Tables<'a>,
+    pub(crate) tables: Tables<'a>,
     record: ContractRecord,
     /// The first observation channel.
     observation: u32,
@@ -453,7 +453,8 @@ impl<'a> Channel<'a> {
         let c = &self.record;
         let shape = self.shape();
         let len: u64 = shape.iter().fold(1, |len: u64, &dim| {
-            len.saturating_mul(u64::from(dim)).min(MAX_CHANNEL_LEN.saturating_add(1))
+            len.saturating_mul(u64::from(dim))
+                .min(MAX_CHANNEL_LEN.saturating_add(1))
         });
         let beyond = c.dims.get(shape.len()..).unwrap_or(&[]);
         let shaped = (1..=4).contains(&c.rank)
@@ -472,10 +473,7 @@ impl<'a> Channel<'a> {
                     && element.offset.is_finite()
             });
         let exact = self.dtype() == DType::F32 || c.elements_len == 0;
-        let others = self
-            .tables
-            .channels_len()
-            .min(self.id.0 as usize);
+        let others = self.tables.channels_len().min(self.id.0 as usize);
         let twice = (0..others).any(|i| {
             self.tables
                 .channel(i)
@@ -528,7 +526,10 @@ impl<'a> Channel<'a> {
 
     /// Elements.
     #[inline]
-    #[expect(clippy::len_without_is_empty, reason = "a channel has an element at least")]
+    #[expect(
+        clippy::len_without_is_empty,
+        reason = "a channel has an element at least"
+    )]
     pub fn len(&self) -> usize {
         let [a, b, c, d] = self.record.dims.map(|dim| dim as usize);
         a.saturating_mul(b).saturating_mul(c).saturating_mul(d)
@@ -625,13 +626,19 @@ impl fmt::Display for ContractError {
             Self::Channels => f.write_str(
                 "the channels are not observations and one action, each with a name of its own",
             ),
-            Self::Shape { channel } => write!(f, "the shape of channel {} makes no sense", channel.0),
+            Self::Shape { channel } => {
+                write!(f, "the shape of channel {} makes no sense", channel.0)
+            }
             Self::Limits { channel } => {
-                write!(f, "the limits of channel {} are not ordered numbers", channel.0)
+                write!(
+                    f,
+                    "the limits of channel {} are not ordered numbers",
+                    channel.0
+                )
             }
-            Self::Words => {
-                f.write_str("an instruction has no words, or more than the instruction channel holds")
-            }
+            Self::Words => f.write_str(
+                "an instruction has no words, or more than the instruction channel holds",
+            ),
         }
     }
 }

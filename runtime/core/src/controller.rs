@@ -217,7 +217,7 @@ impl<'a, 'm> Controller<'a, 'm> {
         self.workspace.now.plain.fill(0.0);
         self.workspace.next.plain.fill(0.0);
         let mut run = Run {
-            tables: &self.policy.tables,
+            tables: self.policy.tables(),
             memory: &mut self.workspace,
             action: self.policy.contract().action().id().0,
             given,
@@ -249,7 +249,7 @@ impl<'a, 'm> Controller<'a, 'm> {
         let first = counters.timestep == 0;
         // A table by timestep has no row for what only comes later.
         counters.timestep = counters.timestep.max(1);
-        let tables = self.policy.tables;
+        let tables = *self.policy.tables();
         for call in tables.calls().filter(|call| call.event == Event::Step) {
             let only_first = call.when == records::When::First;
             let Some(entry) = tables.entry(call.entry as usize) else {
@@ -283,7 +283,7 @@ impl<'a, 'm> Controller<'a, 'm> {
         self.counters = self.cleared(self.counters);
         self.counters.selected = 0;
         self.counters.margin = 0.0;
-        clear_plain(&self.policy.tables, self.workspace.now.plain);
+        clear_plain(self.policy.tables(), self.workspace.now.plain);
         self.workspace.now.action.fill(0.0);
         self.stepped = false;
     }
@@ -293,7 +293,7 @@ impl<'a, 'm> Controller<'a, 'm> {
         let mut cleared = counters;
         cleared.timestep = 0;
         for (i, (rows, &base)) in cleared.rows.iter_mut().zip(&self.base).enumerate() {
-            let state = self.policy.tables.state(i);
+            let state = self.policy.tables().state(i);
             if state.is_some_and(|state| state.scope == Scope::Episode) {
                 rows.len = base;
                 // The instruction's rows lie in the first half; a cache that calls clear has none.
@@ -448,7 +448,7 @@ impl<'a, 'm> Controller<'a, 'm> {
         let Workspace { now, next, .. } = &mut self.workspace;
         next.copy_from(now);
         let mut run = Run {
-            tables: &self.policy.tables,
+            tables: self.policy.tables(),
             memory: &mut self.workspace,
             action: self.policy.contract().action().id().0,
             given,
@@ -483,15 +483,12 @@ impl<'a, 'm> Controller<'a, 'm> {
         if !self.workspace.fits(&self.policy) {
             return Err(StepError::Run(RunError::Program(ExecError::Span)));
         }
-        let Begun {
-            counters,
-            restarts,
-        } = self.begin()?;
+        let Begun { counters, restarts } = self.begin()?;
         let timestep = counters.timestep;
         let Workspace { now, next, .. } = &mut self.workspace;
         next.copy_from(now);
         if restarts {
-            clear_plain(&self.policy.tables, next.plain);
+            clear_plain(self.policy.tables(), next.plain);
         }
         let mut decider = self.decider.clone();
         let draws = match (noise, &self.noise) {
@@ -500,7 +497,7 @@ impl<'a, 'm> Controller<'a, 'm> {
             (None, NoiseStream::Seeded { normals, .. }) => Draws::Seeded(normals.clone()),
         };
         let mut run = Run {
-            tables: &self.policy.tables,
+            tables: self.policy.tables(),
             memory: &mut self.workspace,
             action: self.policy.contract().action().id().0,
             given,
@@ -530,7 +527,8 @@ impl<'a, 'm> Controller<'a, 'm> {
 
         self.workspace.now.copy_from(&self.workspace.next);
         self.decider = decider;
-        if let (Draws::Seeded(drawn), NoiseStream::Seeded { normals, .. }) = (draws, &mut self.noise)
+        if let (Draws::Seeded(drawn), NoiseStream::Seeded { normals, .. }) =
+            (draws, &mut self.noise)
         {
             *normals = drawn;
         }
@@ -595,12 +593,10 @@ struct Begun {
 
 /// Whether a program can append to its KV cache behind the rows that count.
 fn has_room(tables: &Tables, entry: &records::EntryRecord, counters: &Counters) -> bool {
-    let rows = tables.state(entry.cache as usize).map_or(0, |state| state.rows);
-    counters
-        .rows(entry.cache)
-        .len
-        .saturating_add(entry.tokens)
-        <= rows
+    let rows = tables
+        .state(entry.cache as usize)
+        .map_or(0, |state| state.rows);
+    counters.rows(entry.cache).len.saturating_add(entry.tokens) <= rows
 }
 
 /// Sets the plain states of an episode to zero.
@@ -626,7 +622,10 @@ impl Contract<'_> {
             return Err(InputError::Type { channel: id.0 });
         }
         if self.observations_len() > 1 {
-            let other = self.observations().nth(1).map_or(id, |channel| channel.id());
+            let other = self
+                .observations()
+                .nth(1)
+                .map_or(id, |channel| channel.id());
             return Err(InputError::Missing { channel: other.0 });
         }
         Ok(id)

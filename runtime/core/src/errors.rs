@@ -82,7 +82,10 @@ impl fmt::Display for InputError {
         match self {
             Self::Missing { channel } => write!(f, "channel {channel} is not given"),
             Self::Unknown { channel } => {
-                write!(f, "channel {channel} is not one to be given here, or is given twice")
+                write!(
+                    f,
+                    "channel {channel} is not one to be given here, or is given twice"
+                )
             }
             Self::Type { channel } => write!(f, "channel {channel} has elements of another type"),
             Self::Length {

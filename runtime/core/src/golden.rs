@@ -1,6 +1,5 @@
 //! The recorded episode that a policy replays to test itself on its target.
 
-use lads_image::Tables;
 use lads_image::codec::{Field, Reader};
 use lads_image::records::{self, GoldenRecord};
 
@@ -57,12 +56,11 @@ impl<'a> GoldenStep<'a> {
 
 impl<'a> Golden<'a> {
     /// Checks the golden section; `None` when it contradicts the contract.
-    pub(crate) fn new_checked(
-        tables: &Tables<'a>,
-        contract: &Contract<'a>,
-        sizes: &Sizes,
-    ) -> Option<Self> {
-        let (record, mut rest) = tables.golden().split_at_checked(GoldenRecord::WORDS)?;
+    pub(crate) fn new_checked(contract: &Contract<'a>, sizes: &Sizes) -> Option<Self> {
+        let (record, mut rest) = contract
+            .tables
+            .golden()
+            .split_at_checked(GoldenRecord::WORDS)?;
         let record = GoldenRecord::take(&mut Reader::new(record))?;
         let steps = record.steps as usize;
         let mut take = |words: usize| {

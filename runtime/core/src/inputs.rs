@@ -20,7 +20,7 @@ pub enum Data<'d> {
     I32(&'d [i32]),
 }
 
-impl<'d> Data<'d> {
+impl Data<'_> {
     /// How many values there are.
     pub fn len(&self) -> usize {
         match self {

@@ -8,8 +8,8 @@
 use core::error::Error;
 use core::fmt;
 
-use lads_image::tables::TablesError;
 use lads_image::Tables;
+use lads_image::tables::TablesError;
 
 use crate::contract::{Contract, ContractError};
 use crate::golden::Golden;
@@ -18,10 +18,9 @@ use crate::schedule::{self, ScheduleError, Sizes};
 /// A checked view on a program image.
 #[derive(Debug, Clone, Copy)]
 pub struct Policy<'a> {
-    pub(crate) tables: Tables<'a>,
     pub(crate) sizes: Sizes,
     contract: Contract<'a>,
-    golden: Option<Golden<'a>>,
+    has_golden: bool,
 }
 
 impl<'a> Policy<'a> {
@@ -44,17 +43,14 @@ impl<'a> Policy<'a> {
                 limit: work_limit,
             });
         }
-        let golden = if tables.golden().is_empty() {
-            None
-        } else {
-            let golden = Golden::new_checked(&tables, &contract, &sizes);
-            Some(golden.ok_or(PolicyError::Golden)?)
-        };
+        let has_golden = !tables.golden().is_empty();
+        if has_golden && Golden::new_checked(&contract, &sizes).is_none() {
+            return Err(PolicyError::Golden);
+        }
         Ok(Self {
-            tables,
             sizes,
             contract,
-            golden,
+            has_golden,
         })
     }
 
@@ -66,12 +62,20 @@ impl<'a> Policy<'a> {
 
     /// The recorded episode of the self-test, if the image holds one.
     pub fn golden(&self) -> Option<Golden<'a>> {
-        self.golden
+        // Read again rather than kept: a view takes more memory than the policy, and only a self-test wants it.
+        self.has_golden
+            .then(|| Golden::new_checked(&self.contract, &self.sizes))
+            .flatten()
+    }
+
+    #[inline]
+    pub(crate) fn tables(&self) -> &Tables<'a> {
+        &self.contract.tables
     }
 
     /// The image, without what lies behind it.
     pub fn image(&self) -> &'a [u8] {
-        self.tables.image()
+        self.tables().image()
     }
 
     /// Bytes of the image.
@@ -87,7 +91,10 @@ impl<'a> Policy<'a> {
     /// Elements of memory that survive a control step: rings and KV caches, twice (those in force and the next ones) the plain
     /// states and the action, and what programs of one step hand to each other.
     pub fn state_len(&self) -> usize {
-        let bank = self.sizes.bank_len.saturating_add(self.contract.action_len());
+        let bank = self
+            .sizes
+            .bank_len
+            .saturating_add(self.contract.action_len());
         self.sizes
             .rows_len
             .saturating_add(bank.saturating_mul(2))
@@ -116,7 +123,7 @@ impl<'a> Policy<'a> {
 
     /// Reads the whole image and compares its checksum: true when not a bit of it has changed since it was compiled.
     pub fn checksum_matches(&self) -> bool {
-        self.tables.checksum_matches()
+        self.tables().checksum_matches()
     }
 }
 

@@ -146,7 +146,15 @@ fn entries(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked {
     for i in 0..tables.entries_len() {
         let at = i as u32;
         let entry = tables.entry(i).ok_or(ScheduleError::Entry { entry: at })?;
-        let cache = cache_of(tables, &entry).ok_or(ScheduleError::Entry { entry: at })?;
+        let cache = match entry.cache {
+            records::NONE => None,
+            state => Some(
+                tables
+                    .state(state as usize)
+                    .filter(|state| state.kind == StateKind::Kv)
+                    .ok_or(ScheduleError::Entry { entry: at })?,
+            ),
+        };
         let spaces = Spaces {
             weights_len: tables.weights().len(),
             cache_len: cache.map_or(0, |state| state.width as usize),
@@ -187,15 +195,6 @@ fn entries(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked {
     Ok(())
 }
 
-/// The KV cache of an entry, if it has one; `None` for an index of something else.
-fn cache_of(tables: &Tables, entry: &EntryRecord) -> Option<Option<StateRecord>> {
-    if entry.cache == records::NONE {
-        return Some(None);
-    }
-    let state = tables.state(entry.cache as usize)?;
-    (state.kind == StateKind::Kv).then_some(Some(state))
-}
-
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Side {
     Input,
@@ -218,11 +217,7 @@ fn port_is_sound(tables: &Tables, contract: &Contract, port: &PortRecord, side: 
         Place::Span(span) => Some(u64::from(span.len)),
         Place::Int(_) => None,
     };
-    let state = |kind: StateKind| {
-        tables
-            .state(of as usize)
-            .filter(|state| state.kind == kind)
-    };
+    let state = |kind: StateKind| tables.state(of as usize).filter(|state| state.kind == kind);
     let input = side == Side::Input;
     match kind {
         SourceKind::Channel => {
@@ -312,9 +307,7 @@ fn calls(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked {
                 SourceKind::Channel => contract
                     .channel(crate::ChannelId(port.source.of))
                     .is_some_and(|channel| event_reads(call.event, channel.role())),
-                SourceKind::Row => {
-                    call.repeat == Repeat::Rows && call.count == port.source.of
-                }
+                SourceKind::Row => call.repeat == Repeat::Rows && call.count == port.source.of,
                 SourceKind::Timestep | SourceKind::Phase | SourceKind::Pass => step,
                 SourceKind::Selected => step || call.event == Event::Follow,
                 SourceKind::State => true,
@@ -330,7 +323,9 @@ fn calls(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked {
             let fits = match port.source.kind {
                 SourceKind::Channel => step || call.event == Event::Follow,
                 SourceKind::Selected => call.event == Event::Encode,
-                SourceKind::State => !ring || (step && call.repeat == Repeat::Times && call.count == 1),
+                SourceKind::State => {
+                    !ring || (step && call.repeat == Repeat::Times && call.count == 1)
+                }
                 _ => false,
             };
             if !fits {
@@ -359,6 +354,10 @@ fn event_reads(event: Event, role: Role) -> bool {
 }
 
 /// The schedule on its way through a context.
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "facts about a step, independent of each other"
+)]
 struct Walk<'t, 'a> {
     tables: &'t Tables<'a>,
     contract: &'t Contract<'a>,
@@ -408,7 +407,10 @@ impl Walk<'_, '_> {
         }
         let most = match call.repeat {
             Repeat::Times => call.count,
-            Repeat::Rows => self.tables.state(call.count as usize).map_or(0, |ring| ring.rows),
+            Repeat::Rows => self
+                .tables
+                .state(call.count as usize)
+                .map_or(0, |ring| ring.rows),
         };
         let times = match call.repeat {
             Repeat::Rows if self.bounded => self.rows(call.count).map_or(0, |rows| *rows),
@@ -424,7 +426,9 @@ impl Walk<'_, '_> {
             .work()
             .multiply_adds
             .saturating_add(u64::from(entry.ops_len));
-        self.work = self.work.saturating_add(run.saturating_mul(u64::from(most)));
+        self.work = self
+            .work
+            .saturating_add(run.saturating_mul(u64::from(most)));
         self.writes(&entry, refused)?;
         if call.select != records::NONE {
             let state = self.tables.state(call.select as usize).ok_or(refused)?;
@@ -440,7 +444,9 @@ impl Walk<'_, '_> {
     fn reads(&mut self, entry: &EntryRecord, times: u32, refused: ScheduleError) -> Checked {
         for PortRecord { source, .. } in self.tables.inputs(entry) {
             match source.kind {
-                SourceKind::Selected if !self.selected => return Err(ScheduleError::NothingSelected),
+                SourceKind::Selected if !self.selected => {
+                    return Err(ScheduleError::NothingSelected);
+                }
                 SourceKind::State => {
                     let state = self.tables.state(source.of as usize).ok_or(refused)?;
                     if state.scope == Scope::Step && self.written & bit(source.of) == 0 {
@@ -462,7 +468,13 @@ impl Walk<'_, '_> {
     }
 
     /// The KV cache has room for all runs.
-    fn append(&mut self, entry: &EntryRecord, event: Event, times: u32, refused: ScheduleError) -> Checked {
+    fn append(
+        &mut self,
+        entry: &EntryRecord,
+        event: Event,
+        times: u32,
+        refused: ScheduleError,
+    ) -> Checked {
         let state = self.tables.state(entry.cache as usize).ok_or(refused)?;
         let again = self.appended & bit(entry.cache) != 0;
         if event == Event::Instruct {
@@ -583,7 +595,9 @@ fn go_through(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checke
             return Err(ScheduleError::NoAction { timestep });
         }
         sizes.work = sizes.work.max(walk.work);
-        sizes.noise_len = sizes.noise_len.max(usize::try_from(walk.draws).unwrap_or(usize::MAX));
+        sizes.noise_len = sizes
+            .noise_len
+            .max(usize::try_from(walk.draws).unwrap_or(usize::MAX));
         if timestep.saturating_add(1) == sizes.period {
             halfway = walk.rows;
         }
@@ -721,7 +735,10 @@ impl fmt::Display for ScheduleError {
                 output,
             } => {
                 let side = if *output { "output" } else { "input" };
-                write!(f, "entry {entry}, {side} {port} is bound to nothing that fits")
+                write!(
+                    f,
+                    "entry {entry}, {side} {port} is bound to nothing that fits"
+                )
             }
             Self::Call { call } => write!(f, "call {call} of the schedule makes no sense"),
             Self::NothingSelected => f.write_str("an index is read before one is selected"),

@@ -134,7 +134,10 @@ impl fmt::Display for SelfTestError {
                 step,
                 expected,
                 got,
-            } => write!(f, "step {step} selected index {got}, recorded is {expected}"),
+            } => write!(
+                f,
+                "step {step} selected index {got}, recorded is {expected}"
+            ),
             Self::Action {
                 step,
                 index,

@@ -155,7 +155,16 @@ impl Layout {
     pub fn header(&self) -> [u32; HEADER_WORDS] {
         let mut words = [0; HEADER_WORDS];
         let mut out = Writer::new(&mut words);
-        for word in [MAGIC, VERSION, self.total_bytes as u32, 0, SECTIONS as u32, 0, 0, 0] {
+        for word in [
+            MAGIC,
+            VERSION,
+            self.total_bytes as u32,
+            0,
+            SECTIONS as u32,
+            0,
+            0,
+            0,
+        ] {
             out.word(word);
         }
         for (tag, span) in Tag::ALL.iter().zip(self.sections) {
@@ -181,8 +190,14 @@ impl<'a> Sections<'a> {
         if count > MAX_SECTIONS {
             return Err(FormatError::Table);
         }
-        let rows = image.get(TABLE_WORD..HEADER_WORDS).ok_or(FormatError::Table)?;
-        let table = rows.as_chunks::<3>().0.get(..count).ok_or(FormatError::Table)?;
+        let rows = image
+            .get(TABLE_WORD..HEADER_WORDS)
+            .ok_or(FormatError::Table)?;
+        let table = rows
+            .as_chunks::<3>()
+            .0
+            .get(..count)
+            .ok_or(FormatError::Table)?;
         let mut end = HEADER_WORDS;
         for &[_, offset, len] in table {
             let (start, words) = (offset as usize / 4, len as usize / 4);

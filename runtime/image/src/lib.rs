@@ -39,5 +39,5 @@ pub use check::{Checker, Fault, Spaces};
 pub use lads_kernels::Isa;
 pub use machine::{ExecError, Machine};
 pub use op::{OP_WORDS, Op, Operation, Slots, Work};
-pub use tables::Tables;
 pub use program::{Program, ProgramError};
+pub use tables::Tables;

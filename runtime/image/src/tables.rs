@@ -46,9 +46,10 @@ fn rows<const N: usize>(words: &[u32], tag: Tag) -> Result<&[[u32; N]], TablesEr
 }
 
 /// One record of a table.
-#[inline(always)]
+#[inline]
 fn take<T: Field, const N: usize>(rows: &[[u32; N]], index: usize) -> Option<T> {
-    rows.get(index).and_then(|row| T::take(&mut Reader::new(row)))
+    rows.get(index)
+        .and_then(|row| T::take(&mut Reader::new(row)))
 }
 
 /// Every record of a table; `None` for one that does not decode.
@@ -59,7 +60,9 @@ fn all<T: Field, const N: usize>(rows: &[[u32; N]]) -> impl Iterator<Item = Opti
 /// `first..first + len` of `table`; empty for a range outside, which checked tables do not have.
 fn part<T>(table: &[T], first: u32, len: u32) -> &[T] {
     let start = first as usize;
-    table.get(start..start.saturating_add(len as usize)).unwrap_or(&[])
+    table
+        .get(start..start.saturating_add(len as usize))
+        .unwrap_or(&[])
 }
 
 fn inside(first: u32, len: u32, count: usize) -> bool {
@@ -76,7 +79,10 @@ impl<'a> Tables<'a> {
         let got = image.len();
         let image = image
             .get(..total)
-            .ok_or(TablesError::Format(FormatError::Truncated { got, needed: total }))?;
+            .ok_or(TablesError::Format(FormatError::Truncated {
+                got,
+                needed: total,
+            }))?;
         let words: &[u32] = bytemuck::try_cast_slice(image).map_err(|_| TablesError::Alignment)?;
         let sections = Sections::new(words).map_err(TablesError::Format)?;
         let strings = bytemuck::try_cast_slice(sections.get(Tag::Strings))
@@ -106,7 +112,13 @@ impl<'a> Tables<'a> {
     }
 
     fn check(&self) -> Result<(), TablesError> {
-        let at = |tag, fits: bool| if fits { Ok(()) } else { Err(TablesError::Record(tag)) };
+        let at = |tag, fits: bool| {
+            if fits {
+                Ok(())
+            } else {
+                Err(TablesError::Record(tag))
+            }
+        };
         let texts = |texts: &[Text]| texts.iter().all(|&text| self.find(text).is_some());
         let contract = self.contract();
         at(
@@ -149,9 +161,8 @@ impl<'a> Tables<'a> {
         )?;
         at(
             Tag::States,
-            all(self.states).all(|state: Option<StateRecord>| {
-                state.is_some_and(|state| texts(&[state.name]))
-            }),
+            all(self.states)
+                .all(|state: Option<StateRecord>| state.is_some_and(|state| texts(&[state.name]))),
         )?;
         at(
             Tag::Entries,
@@ -319,7 +330,8 @@ impl<'a> Tables<'a> {
 
     fn find(&self, text: Text) -> Option<&'a str> {
         let start = text.offset as usize;
-        self.strings.get(start..start.checked_add(text.len as usize)?)
+        self.strings
+            .get(start..start.checked_add(text.len as usize)?)
     }
 }
 
