@@ -112,6 +112,12 @@ def _reference(arguments):
     print(f"{arguments.output}: written; next: lads-run --model {arguments.model} --verify {arguments.output}")
 
 
+def _upgrade(arguments):
+    from . import upgrade
+
+    print(upgrade.write(arguments.model, arguments.output, arguments.environment))
+
+
 def _language(arguments):
     from . import language_graph
 
@@ -163,6 +169,12 @@ def _parser():
     rollouts.add_argument("--seed", type=int, default=0)
     rollouts.add_argument("--noise", default="v0", help="observation noise: v0, v1 or none")
     rollouts.set_defaults(run_command=_reference)
+
+    upgraded = commands.add_parser("upgrade", help="a bundle of contract version 1 to version 2; graphs and weights stay as they are")
+    upgraded.add_argument("model", metavar="MODEL", help="the bundle")
+    upgraded.add_argument("-o", "--output", help="the file to write; left out, MODEL and what names its sha256 beside it")
+    upgraded.add_argument("--environment", metavar="FILE", help="says what an action means; left out, the one in exporter/configs of the bundle's environment")
+    upgraded.set_defaults(run_command=_upgrade)
 
     spoken = commands.add_parser("language", help="the language encoder as ONNX, so that lads-run takes any sentence")
     spoken.add_argument("--encoder", default="all-MiniLM-L6-v2", help="as in a config's language.encoder (all-MiniLM-L6-v2)")
