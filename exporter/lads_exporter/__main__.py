@@ -15,11 +15,21 @@ def _encode(setting):
 
 
 def _random(arguments):
-    from . import bundle, config, random_policy
+    from . import bundle, config, kinds, random_policy
 
-    setting = config.load(arguments.config)
-    _, model = random_policy.export(setting, _encode(setting), arguments.seed)
+    if arguments.kind:
+        _, model = kinds.export(arguments.kind, arguments.seed)
+    else:
+        setting = config.load(arguments.config)
+        _, model = random_policy.export(setting, _encode(setting), arguments.seed)
     print(f"{arguments.output}: random weights, sha256 {bundle.save(model, arguments.output)}")
+
+
+def _episode(arguments):
+    from . import episode
+
+    margin = episode.write(arguments.model, arguments.output, arguments.steps, arguments.seed)
+    print(f"{arguments.output}: {arguments.steps} steps, selections with a margin of {margin:.4g}")
 
 
 def _growth(arguments):
@@ -130,10 +140,19 @@ def _parser():
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     random = commands.add_parser("random", help="a bundle with random weights, for tests")
-    random.add_argument("--config", required=True)
+    network = random.add_mutually_exclusive_group(required=True)
+    network.add_argument("--config", help="a LADS policy of this configuration")
+    network.add_argument("--kind", help="a small policy of this kind: lads, lang_dt, lisa, vae, lcsd, skilldiffuser, history, plain, recurrent, stacked")
     random.add_argument("-o", "--output", required=True)
     random.add_argument("--seed", type=int, default=0)
     random.set_defaults(run_command=_random)
+
+    episode = commands.add_parser("episode", help="a made-up episode of a bundle and what it does there, for tests of the runtime")
+    episode.add_argument("model", metavar="MODEL", help="the bundle")
+    episode.add_argument("-o", "--output", required=True, help="the .safetensors file; lads_exporter/episode.py says what is in it")
+    episode.add_argument("--steps", type=int, default=200)
+    episode.add_argument("--seed", type=int, default=0)
+    episode.set_defaults(run_command=_episode)
 
     growth = commands.add_parser("growth", help="random bundles in which one dimension grows, for the benchmarks")
     growth.add_argument("--config", required=True, help="the sizes of everything else")
