@@ -15,11 +15,21 @@ def _encode(setting):
 
 
 def _random(arguments):
-    from . import bundle, config, random_policy
+    from . import bundle, config, kinds, random_policy
 
-    setting = config.load(arguments.config)
-    _, model = random_policy.export(setting, _encode(setting), arguments.seed)
+    if arguments.kind:
+        _, model = kinds.export(arguments.kind, arguments.seed)
+    else:
+        setting = config.load(arguments.config)
+        _, model = random_policy.export(setting, _encode(setting), arguments.seed)
     print(f"{arguments.output}: random weights, sha256 {bundle.save(model, arguments.output)}")
+
+
+def _episode(arguments):
+    from . import episode
+
+    margin = episode.write(arguments.model, arguments.output, arguments.steps, arguments.seed)
+    print(f"{arguments.output}: {arguments.steps} steps, selections with a margin of {margin:.4g}")
 
 
 def _growth(arguments):
@@ -112,6 +122,12 @@ def _reference(arguments):
     print(f"{arguments.output}: written; next: lads-run --model {arguments.model} --verify {arguments.output}")
 
 
+def _upgrade(arguments):
+    from . import upgrade
+
+    print(upgrade.write(arguments.model, arguments.output, arguments.environment))
+
+
 def _language(arguments):
     from . import language_graph
 
@@ -124,10 +140,19 @@ def _parser():
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     random = commands.add_parser("random", help="a bundle with random weights, for tests")
-    random.add_argument("--config", required=True)
+    network = random.add_mutually_exclusive_group(required=True)
+    network.add_argument("--config", help="a LADS policy of this configuration")
+    network.add_argument("--kind", help="a small policy of this kind: lads, lang_dt, lisa, vae, lcsd, skilldiffuser, history, plain, recurrent, stacked")
     random.add_argument("-o", "--output", required=True)
     random.add_argument("--seed", type=int, default=0)
     random.set_defaults(run_command=_random)
+
+    episode = commands.add_parser("episode", help="a made-up episode of a bundle and what it does there, for tests of the runtime")
+    episode.add_argument("model", metavar="MODEL", help="the bundle")
+    episode.add_argument("-o", "--output", required=True, help="the .safetensors file; lads_exporter/episode.py says what is in it")
+    episode.add_argument("--steps", type=int, default=200)
+    episode.add_argument("--seed", type=int, default=0)
+    episode.set_defaults(run_command=_episode)
 
     growth = commands.add_parser("growth", help="random bundles in which one dimension grows, for the benchmarks")
     growth.add_argument("--config", required=True, help="the sizes of everything else")
@@ -163,6 +188,12 @@ def _parser():
     rollouts.add_argument("--seed", type=int, default=0)
     rollouts.add_argument("--noise", default="v0", help="observation noise: v0, v1 or none")
     rollouts.set_defaults(run_command=_reference)
+
+    upgraded = commands.add_parser("upgrade", help="a bundle of contract version 1 to version 2; graphs and weights stay as they are")
+    upgraded.add_argument("model", metavar="MODEL", help="the bundle")
+    upgraded.add_argument("-o", "--output", help="the file to write; left out, MODEL and what names its sha256 beside it")
+    upgraded.add_argument("--environment", metavar="FILE", help="says what an action means; left out, the one in exporter/configs of the bundle's environment")
+    upgraded.set_defaults(run_command=_upgrade)
 
     spoken = commands.add_parser("language", help="the language encoder as ONNX, so that lads-run takes any sentence")
     spoken.add_argument("--encoder", default="all-MiniLM-L6-v2", help="as in a config's language.encoder (all-MiniLM-L6-v2)")
