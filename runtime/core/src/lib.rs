@@ -66,6 +66,7 @@ pub mod op;
 mod policy;
 pub mod program;
 mod self_test;
+pub mod similarity;
 mod workspace;
 
 pub use check::Fault;
