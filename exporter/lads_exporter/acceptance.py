@@ -45,7 +45,7 @@ def alignment(sentence, known):
 def nearest(words, known):
     """Index of the known instruction that a sentence is most like (the first of equal ones), and how much."""
     alike = [alignment(words, other) for other in known]
-    index = int(np.argmax(alike))
+    index = int(np.argmax(np.round(alike, 6)))  # the last bits of a sum are no reason to prefer one
     return index, alike[index]
 
 

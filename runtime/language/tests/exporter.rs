@@ -55,8 +55,12 @@ fn embeddings_are_the_exporters() {
             let known = contract.instructions().map(|known| known.words);
             let (place, alike) = similarity::nearest(&words, known, contract.word_dim()).unwrap();
             assert!((alike - case.similarity).abs() <= TOLERANCE, "{alike}");
-            let nearest = contract.instruction_id(place);
-            assert_eq!(nearest, Some(case.nearest.as_str()), "{}", case.text);
+            // Several known instructions may be equally like it.
+            let named = contract
+                .instructions()
+                .find(|known| known.id == case.nearest);
+            let named = similarity::alignment(&words, named.unwrap().words, contract.word_dim());
+            assert!((alike - named).abs() <= TOLERANCE, "{}: {place}", case.text);
             compared += 1;
         }
         println!("{name}: {compared} sentences, largest difference {worst:.1e}");

@@ -163,8 +163,12 @@ fn hear_sentence<'p>(
     let heard = encoder::words(&encoder, text)
         .map_err(|wrong| refused(format!("--instruction {wrong}")))?;
     let contract = policy.contract();
-    let (nearest, similarity) = spoken::nearest(&contract, &heard)
-        .ok_or_else(|| refused(format!("{}: no instruction to compare it with", not_known())))?;
+    let (nearest, similarity) = spoken::nearest(&contract, &heard).ok_or_else(|| {
+        refused(format!(
+            "{}: no instruction to compare it with",
+            not_known()
+        ))
+    })?;
     let acceptance = bundle.contract().language.acceptance.as_ref();
     let accepted = spoken::accept(acceptance, similarity);
     let shown = text.escape_debug();
