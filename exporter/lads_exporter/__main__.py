@@ -66,7 +66,7 @@ def _train(arguments):
 
 
 def _card(arguments, saved, sha256):
-    from . import bundle, card
+    from . import acceptance, bundle, card
 
     beside = []
     for pair in arguments.beside:
@@ -78,12 +78,12 @@ def _card(arguments, saved, sha256):
     path = Path(arguments.output).with_suffix(".md")
     notes = Path(arguments.output).with_suffix(".notes.md")
     notes = notes.read_text(encoding="utf-8") if notes.is_file() else ""
-    bundle.write_atomically(path, card.write(arguments.run, saved, sha256, results, beside, notes).encode())
+    bundle.write_atomically(path, card.write(arguments.run, saved, sha256, results, beside, notes, acceptance.beside(arguments.output)).encode())
     print(f"{path}: model card")
 
 
 def _export(arguments):
-    from . import bundle, training
+    from . import acceptance, bundle, training
     from .model import Lads
 
     saved, setting = training.load_run(arguments.run)
@@ -100,7 +100,11 @@ def _export(arguments):
         "steps": {name: getattr(setting.config.training, name).steps for name in names},
     }
     candidates = ((instruction, observations.numpy()) for instruction, observations in saved["golden"])
-    sha256 = bundle.save(bundle.assemble(lads, setting, encoded, provenance, candidates), arguments.output)
+    model = bundle.assemble(lads, setting, encoded, provenance, candidates)
+    calibrated = acceptance.beside(arguments.output)
+    if calibrated:
+        acceptance.into(model, calibrated)
+    sha256 = bundle.save(model, arguments.output)
     print(f"{arguments.output}: sha256 {sha256}")
     _card(arguments, saved, sha256)
 
@@ -133,6 +137,16 @@ def _language(arguments):
 
     folder = Path(arguments.output) if arguments.output else language_graph.default_folder(arguments.encoder)
     print(f"{folder}: {'written' if language_graph.write(arguments.encoder, folder) else 'up to date'}")
+
+
+def _calibrate(arguments):
+    from . import acceptance, config
+
+    setting = config.load(arguments.config)
+    calibrated = acceptance.calibrate(setting, acceptance.read_sentences(config.find(arguments.sentences), setting))
+    acceptance.write(calibrated, arguments.output)
+    print("\n".join(acceptance.lines(calibrated)))
+    print(f"{arguments.output}: written")
 
 
 def _parser():
@@ -199,6 +213,12 @@ def _parser():
     spoken.add_argument("--encoder", default="all-MiniLM-L6-v2", help="as in a config's language.encoder (all-MiniLM-L6-v2)")
     spoken.add_argument("-o", "--output", help="the folder; left out, language/ENCODER in $LADS_CACHE, else in the user's cache folder")
     spoken.set_defaults(run_command=_language)
+
+    calibrate = commands.add_parser("calibrate", help="how like a known instruction a free sentence must be to be followed")
+    calibrate.add_argument("--config", required=True, help="the policy's configuration")
+    calibrate.add_argument("--sentences", required=True, help="sentences that ask for what the policy knows, and others: configs/*.sentences.json")
+    calibrate.add_argument("-o", "--output", required=True, help="models/NAME.acceptance.json; `export` takes the one beside the bundle")
+    calibrate.set_defaults(run_command=_calibrate)
     return parser
 
 

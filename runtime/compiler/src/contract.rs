@@ -132,8 +132,29 @@ pub enum Pooling {
     Mean,
 }
 
+/// How the likeness of a sentence and a known instruction is measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Similarity {
+    /// [`lads_core::similarity::alignment`].
+    Alignment,
+}
+
+/// Which sentences outside the table of instructions are followed, as the exporter calibrated it.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+pub struct Acceptance {
+    /// The measure.
+    pub similarity: Similarity,
+    /// Similarity to the nearest known instruction from which on a sentence is followed.
+    pub threshold: f32,
+    /// Share of the calibration's sentences that ask for what the policy knows that it accepts.
+    pub accepted_known: f32,
+    /// Share of the calibration's sentences that ask for something else, or for nothing, that it accepts all the same.
+    pub accepted_other: f32,
+}
+
 /// The language encoder that made the word embeddings.
-#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Language {
     /// Its name.
     pub encoder: String,
@@ -146,6 +167,9 @@ pub struct Language {
     /// What becomes of the words; left out, nothing.
     #[serde(default)]
     pub pooling: Pooling,
+    /// Which sentences outside the table are followed; left out, none without the caller's insistence.
+    #[serde(default)]
+    pub acceptance: Option<Acceptance>,
 }
 
 /// Sizes of the transformer.
@@ -251,6 +275,9 @@ impl Contract {
                 return Err(format!("field `{field}` is {value}, it must be positive"));
             }
         }
+        if let Some(acceptance) = &self.language.acceptance {
+            acceptance.check()?;
+        }
         elements("observation", &self.observation)?;
         elements("action", &self.action)?;
         for (i, known) in self.instructions.iter().enumerate() {
@@ -263,6 +290,23 @@ impl Contract {
         // Texts may repeat: benchmarks ask for the same in other words, and for the same words by other measures.
         let ids = self.instructions.iter().map(|known| known.id.as_str());
         distinct("instructions", "id", ids)
+    }
+}
+
+impl Acceptance {
+    fn check(&self) -> Result<(), String> {
+        for (part, value, least) in [
+            ("threshold", self.threshold, -1.0),
+            ("accepted_known", self.accepted_known, 0.0),
+            ("accepted_other", self.accepted_other, 0.0),
+        ] {
+            if !(least..=1.0).contains(&value) {
+                return Err(format!(
+                    "field `language.acceptance.{part}` is {value}, it must be {least} to 1"
+                ));
+            }
+        }
+        Ok(())
     }
 }
 
