@@ -26,6 +26,7 @@ pub struct Contract<'a> {
     action: u32,
     action_len: u32,
     instruction: Option<u32>,
+    noise: Option<u32>,
 }
 
 /// Which channel of a policy: its position among [`Contract::channels`].
@@ -183,6 +184,7 @@ impl<'a> Contract<'a> {
             action: records::NONE,
             action_len: 0,
             instruction: None,
+            noise: None,
         };
         let mut elements = 0_u32;
         for (i, channel) in (0_u32..).zip(contract.channels()) {
@@ -210,7 +212,13 @@ impl<'a> Contract<'a> {
                     }
                     contract.instruction = Some(i);
                 }
-                Role::Noise | Role::Demonstration => {
+                Role::Noise => {
+                    if contract.noise.is_some() || channel.dtype() != DType::F32 {
+                        return Err(ContractError::Channels);
+                    }
+                    contract.noise = Some(i);
+                }
+                Role::Demonstration => {
                     if channel.dtype() != DType::F32 {
                         return Err(ContractError::Channels);
                     }
@@ -332,6 +340,11 @@ impl<'a> Contract<'a> {
     /// The channel of word embeddings; `None` for a policy that takes no instruction.
     pub fn instruction_channel(&self) -> Option<Channel<'a>> {
         self.channel(ChannelId(self.instruction?))
+    }
+
+    /// The channel of random numbers; `None` for a policy that takes none.
+    pub fn noise_channel(&self) -> Option<Channel<'a>> {
+        self.channel(ChannelId(self.noise?))
     }
 
     /// Words of the longest instruction; 0 for a policy that takes none.
@@ -604,7 +617,8 @@ impl<'a> Channel<'a> {
 pub enum ContractError {
     /// The control period, the temperature or the acceptance threshold is not a number that makes sense.
     Number,
-    /// No observation, no action or more than one, a name twice, or a role whose elements have the wrong type.
+    /// No observation, no action, more than one action, instruction or noise, a name twice, or a role whose elements have the wrong
+    /// type.
     Channels,
     /// The shape of a channel makes no sense, or its elements are not as many.
     Shape {

@@ -223,6 +223,11 @@ impl<'a, 'm> Controller<'a, 'm> {
             memory: &mut self.workspace,
             action: self.policy.contract().action().id().0,
             given,
+            noise: self
+                .policy
+                .contract()
+                .noise_channel()
+                .map(|channel| channel.id().0),
             draws: Draws::Zero,
             counters: Counters::START,
             words,
@@ -262,6 +267,7 @@ impl<'a, 'm> Controller<'a, 'm> {
                 memory: &mut self.workspace,
                 action: self.policy.contract().action().id().0,
                 given: &[],
+                noise: None,
                 draws: Draws::Zero,
                 counters,
                 words: 0,
@@ -454,6 +460,11 @@ impl<'a, 'm> Controller<'a, 'm> {
             memory: &mut self.workspace,
             action: self.policy.contract().action().id().0,
             given,
+            noise: self
+                .policy
+                .contract()
+                .noise_channel()
+                .map(|channel| channel.id().0),
             draws: Draws::Zero,
             counters,
             words: 0,
@@ -503,6 +514,11 @@ impl<'a, 'm> Controller<'a, 'm> {
             memory: &mut self.workspace,
             action: self.policy.contract().action().id().0,
             given,
+            noise: self
+                .policy
+                .contract()
+                .noise_channel()
+                .map(|channel| channel.id().0),
             draws,
             counters,
             words: 0,

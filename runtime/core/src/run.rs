@@ -79,8 +79,10 @@ pub(crate) struct Run<'r, 'a, 'm, 'd> {
     pub memory: &'r mut Workspace<'m>,
     /// Channel of the action.
     pub action: u32,
-    /// What the caller gave.
+    /// What the caller gave, but for noise, which is drawn.
     pub given: &'r [(ChannelId, Data<'d>)],
+    /// Channel of the noise.
+    pub noise: Option<u32>,
     pub draws: Draws<'d>,
     pub counters: Counters,
     /// Words of the instruction that is taken in.
@@ -253,6 +255,7 @@ impl Run<'_, '_, '_, '_> {
                 let given = self.given.iter().find(|(id, _)| id.0 == source.of);
                 let to = elements(self.memory.arena, span)?;
                 match given {
+                    _ if self.noise == Some(source.of) => self.draws.next(to),
                     Some(&(_, Data::F32(values))) => fill(to, values),
                     Some(&(_, Data::U8(values))) => {
                         to.iter_mut()
@@ -265,7 +268,8 @@ impl Run<'_, '_, '_, '_> {
                             .for_each(|(to, &value)| *to = value as f32);
                     }
                     None if source.of == self.action => assign(to, self.memory.now.action),
-                    None => self.draws.next(to),
+                    // Only where nothing is given at all: to warm up.
+                    None => to.fill(0.0),
                 }
                 Ok(())
             }
