@@ -8,7 +8,7 @@ from typing import Callable
 
 from .. import bundle, random_policy
 from ..config import UserError
-from . import common, lads, plain
+from . import common, diffusion, history, lads, lang_dt, lisa, plain, vae
 from .common import Sizes
 
 
@@ -26,6 +26,12 @@ def _of(network, build, contract, sizes=Sizes()):
 
 KINDS = {
     "lads": Kind(lads.policy, lads.build, lads.contract),
+    "lang_dt": _of(lang_dt.LangDt, lang_dt.build, lang_dt.contract),
+    "lisa": _of(lisa.Lisa, lisa.build, lisa.contract),
+    "vae": _of(vae.Vae, vae.build, vae.contract),
+    "lcsd": _of(diffusion.Lcsd, diffusion.build_lcsd, diffusion.contract_lcsd),
+    "skilldiffuser": _of(diffusion.SkillDiffuser, diffusion.build_skilldiffuser, diffusion.contract_skilldiffuser, Sizes(horizon=7, steps=42)),
+    "history": _of(history.History, history.build, history.contract),
     "plain": _of(plain.Plain, plain.build_plain, plain.contract),
     "recurrent": _of(plain.Recurrent, plain.build_recurrent, plain.contract_recurrent),
     "stacked": _of(plain.Stacked, plain.build_stacked, plain.contract_stacked),
