@@ -6,6 +6,8 @@ A kind is a module's three functions: the networks in PyTorch with random weight
 from dataclasses import dataclass
 from typing import Callable
 
+import torch
+
 from .. import bundle, random_policy
 from ..config import UserError
 from . import common, diffusion, history, lads, lang_dt, lisa, plain, vae
@@ -43,6 +45,7 @@ def export(name, seed=0):
     if name not in KINDS:
         raise UserError(f"--kind {name}: unknown; known: {', '.join(KINDS)}")
     kind = KINDS[name]
+    torch.manual_seed(seed)  # of what PyTorch starts weights with that are not drawn anew
     policy = kind.policy(kind.sizes, seed)
     found = kind.contract(kind.sizes, seed)
     known = len(found.get("instructions", []))
