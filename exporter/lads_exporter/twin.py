@@ -3,7 +3,8 @@
 Golden episodes and tests are made with it; the product's control loop is the Rust core, which shares nothing with this file
 but the contract. Values are bound by their names: a channel's name is that channel, `timestep`, `phase`, `pass` and `index` are the
 controller's integers, `action` or `previous_action` as an input is the last executed action, `past_key_values.*` and `present.*`
-are the keys and values of the entry's level, and every other name is a state. Nothing is taken back after an error.
+are the keys and values of the entry's level, and every other name is a state. Nothing is taken back after an error, and a plan is always
+the one with the largest logit: what a contract's rule `sample` would draw is the runtime's own affair.
 """
 
 from contextlib import suppress

@@ -37,6 +37,7 @@ KINDS = {
     "plain": _of(plain.Plain, plain.build_plain, plain.contract),
     "recurrent": _of(plain.Recurrent, plain.build_recurrent, plain.contract_recurrent),
     "stacked": _of(plain.Stacked, plain.build_stacked, plain.contract_stacked),
+    "camera": _of(plain.Camera, plain.build_camera, plain.contract_camera),
 }
 
 
