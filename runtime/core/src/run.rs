@@ -7,8 +7,8 @@
 
 use lads_image::place::{INT_SLOTS, Place, Span};
 use lads_image::records::{
-    self, CallRecord, EntryRecord, Event, Fill, MAX_ROW_STATES, PortRecord, Repeat, Scope, Source,
-    SourceKind, StateKind, StateRecord,
+    self, CallRecord, EntryRecord, Event, Fill, MAX_ROW_STATES, PortRecord, Repeat, Role, Scope,
+    Source, SourceKind, StateKind, StateRecord,
 };
 use lads_image::{ExecError, Machine, Program, Tables};
 use lads_kernels::assign;
@@ -250,9 +250,15 @@ impl Run<'_, '_, '_, '_> {
     fn read(&mut self, source: Source, span: Span, pass: u32) -> Result<(), RunError> {
         match source.kind {
             SourceKind::Channel => {
+                // Of noise the caller gave all draws of the step, of which each run takes the next.
+                let drawn = matches!(self.draws, Draws::Given(_))
+                    && self
+                        .tables
+                        .channel(source.of as usize)
+                        .is_some_and(|channel| channel.role == Role::Noise);
                 let given = self.given.iter().find(|(id, _)| id.0 == source.of);
                 let to = elements(self.memory.arena, span)?;
-                match given {
+                match given.filter(|_| !drawn) {
                     Some(&(_, Data::F32(values))) => fill(to, values),
                     Some(&(_, Data::U8(values))) => {
                         to.iter_mut()
