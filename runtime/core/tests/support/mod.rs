@@ -11,7 +11,6 @@ pub mod writer;
 use lads_core::{ChannelId, Controller, DType, Data, Instruction, Policy, PolicyError, Workspace};
 
 pub use model::{Model, Spec};
-pub use writer::Parts;
 
 /// An image in memory that is aligned as images have to be.
 #[derive(Clone)]
