@@ -129,7 +129,7 @@ fn entries_are_programs_with_a_cache_if_they_append() {
     };
     assert_eq!(
         sound.fault(|parts| parts.entries[ACT].ops.clear()),
-        fault_of_program(ACT, Fault::Arena)
+        entry(ACT)
     );
     let empty = sound.sealed_fault(|parts| {
         let unused = Draft::new("nothing").finish();
@@ -492,7 +492,7 @@ fn caches_have_the_rows_that_the_longest_context_needs() {
     );
     assert_eq!(
         sound.sealed_fault(|parts| parts.contract.context_steps = 0),
-        rows(CONTEXT, 19, 13)
+        rows(CONTEXT, 19, 15)
     );
     let chunks = shapes::chunks();
     // Cleared every fourth step: nine rows.
