@@ -86,7 +86,7 @@ fn channels_are_observations_and_one_action() {
         channels
     );
     assert_eq!(more(Role::Demonstration, 50), None);
-    assert_eq!(more(Role::Demonstration, 200), channels);
+    assert_eq!(more(Role::Demonstration, 124), channels);
 }
 
 #[test]
