@@ -10,6 +10,7 @@ pub mod writer;
 
 use lads_core::{ChannelId, Controller, DType, Data, Instruction, Policy, PolicyError, Workspace};
 
+#[allow(unused_imports, reason = "as above")]
 pub use model::{Model, Spec};
 
 /// An image in memory that is aligned as images have to be.
