@@ -12,8 +12,13 @@ use lads_image::records::{
 };
 use lads_image::tables::Tables;
 
+use crate::inputs::MAX_OBSERVATIONS;
+
 /// The most elements that a channel may have: an image of 4,096 by 4,096 pixels of four colours is within it.
 const MAX_CHANNEL_LEN: u64 = 1 << 26;
+
+/// The most channels that a policy may have.
+const MAX_CHANNELS: usize = 128;
 
 /// A checked view on the contract of a policy.
 #[derive(Debug, Clone, Copy)]
@@ -186,6 +191,9 @@ impl<'a> Contract<'a> {
             instruction: None,
             noise: None,
         };
+        if tables.channels_len() > MAX_CHANNELS {
+            return Err(ContractError::Channels);
+        }
         let mut elements = 0_u32;
         for (i, channel) in (0_u32..).zip(contract.channels()) {
             channel.check(elements)?;
@@ -225,7 +233,9 @@ impl<'a> Contract<'a> {
                 }
             }
         }
-        let complete = contract.observations_len > 0 && contract.action != records::NONE;
+        let observations = 1..=MAX_OBSERVATIONS;
+        let complete =
+            observations.contains(&contract.observations_len()) && contract.action != records::NONE;
         if !complete || elements as usize != tables.elements_len() {
             return Err(ContractError::Channels);
         }
@@ -617,8 +627,8 @@ impl<'a> Channel<'a> {
 pub enum ContractError {
     /// The control period, the temperature or the acceptance threshold is not a number that makes sense.
     Number,
-    /// No observation, no action, more than one action, instruction or noise, a name twice, or a role whose elements have the wrong
-    /// type.
+    /// No observation or more than a step has room for, no action, more than one action, instruction or noise, too many channels
+    /// in all, a name twice, or a role whose elements have the wrong type.
     Channels,
     /// The shape of a channel makes no sense, or its elements are not as many.
     Shape {

@@ -27,7 +27,7 @@ use crate::errors::{EncodeError, FollowError, InputError, InstructionError, RunE
 use crate::inputs::{self, Data};
 use crate::normal::Normals;
 use crate::policy::Policy;
-use crate::run::{Counters, Draws, Run, due};
+use crate::run::{Counters, Draws, Rows, Run, due};
 use crate::workspace::Workspace;
 
 /// What a policy is told to do.
@@ -302,11 +302,17 @@ impl<'a, 'm> Controller<'a, 'm> {
         cleared.timestep = 0;
         for (i, (rows, &base)) in cleared.rows.iter_mut().zip(&self.base).enumerate() {
             let state = self.policy.tables().state(i);
-            if state.is_some_and(|state| state.scope == Scope::Episode) {
-                rows.len = base;
+            let Some(state) = state.filter(|state| state.scope == Scope::Episode) else {
+                continue;
+            };
+            *rows = match state.kind {
+                StateKind::Ring => rows.emptied(&state),
                 // The instruction's rows lie in the first half; a cache that calls clear has none.
-                rows.start = 0;
-            }
+                _ => Rows {
+                    len: base,
+                    start: 0,
+                },
+            };
         }
         cleared
     }

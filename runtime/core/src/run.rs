@@ -32,6 +32,16 @@ pub(crate) struct Rows {
     pub start: u32,
 }
 
+impl Rows {
+    /// No rows of a ring: what follows lies behind those that were valid, which stay as they are.
+    pub fn emptied(self, ring: &StateRecord) -> Self {
+        Self {
+            len: 0,
+            start: wrapped(ring, self.start, self.len),
+        }
+    }
+}
+
 /// The counters that a step advances.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Counters {
@@ -160,10 +170,13 @@ impl Run<'_, '_, '_, '_> {
             let (at, len) = (record.offset as usize, record.width as usize);
             part_mut(self.memory.next.plain, at, len)?.fill(0.0);
         } else if let Some(rows) = self.counters.rows_mut(state) {
-            rows.len = 0;
-            if record.kind == StateKind::Kv {
-                rows.start = 1_u32.saturating_sub(rows.start);
-            }
+            *rows = match record.kind {
+                StateKind::Kv => Rows {
+                    len: 0,
+                    start: 1_u32.saturating_sub(rows.start),
+                },
+                _ => rows.emptied(&record),
+            };
         }
         Ok(())
     }
