@@ -2,7 +2,10 @@
 
 import os
 import stat
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 import pytest
 from lads_exporter import __main__ as command
@@ -68,3 +71,11 @@ def test_commands_refuse_to_write_over_what_they_read(tmp_path, monkeypatch, cap
         assert command.main() == 2, line
         assert "is read" in capsys.readouterr().err
     assert all(path.read_bytes() == b"mine" for path in files.values())
+
+
+def test_setup_replaces_no_folder_of_somebody_else(tmp_path):
+    (tmp_path / "mine").write_text("work of years")
+    setup = Path(__file__).parents[2] / "sim-harness" / "setup.py"
+    done = subprocess.run([sys.executable, setup, "--vendor", tmp_path], capture_output=True, text=True)
+    assert done.returncode == 2 and "something else" in done.stderr and len(done.stderr.splitlines()) == 1
+    assert (tmp_path / "mine").read_text() == "work of years"
