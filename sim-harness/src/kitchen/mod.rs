@@ -53,7 +53,7 @@ pub enum SceneError {
     #[error(transparent)]
     Version(#[from] OtherMujoco),
     /// MuJoCo refuses the scene.
-    #[error("MuJoCo cannot load {path}: {reason}; {}", remedy(reason))]
+    #[error("MuJoCo cannot load {path}: {reason}; {remedy}", remedy = remedy(reason))]
     Refused {
         /// The scene's file.
         path: String,

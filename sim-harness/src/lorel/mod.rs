@@ -65,7 +65,7 @@ pub enum SceneError {
     #[error(transparent)]
     Version(#[from] OtherMujoco),
     /// MuJoCo refuses the scene.
-    #[error("MuJoCo cannot load the LOReL table: {0}; {}", remedy(.0))]
+    #[error("MuJoCo cannot load the LOReL table: {0}; {remedy}", remedy = remedy(.0))]
     Refused(String),
 }
 
