@@ -84,5 +84,5 @@ def write(path, output, steps=200, seed=0):
     found, margin = tensors(model, steps, seed)
     kind = contracts.of(model)["family"]["kind"]
     metadata = {"kind": kind, "seed": str(seed), "margin": f"{margin:.6f}", "sha256": hashlib.sha256(data).hexdigest()}
-    bundle.write_atomically(output, save_safetensors(found, metadata=metadata))
+    output.write_atomically(output, save_safetensors(found, metadata=metadata))
     return margin

@@ -127,7 +127,7 @@ def rebind(path, before, after, purpose):
         text = text.replace(before, after)
         if suffix == ".reference.json":
             text = _line(text, "purpose_sha256", purpose)
-        bundle.write_atomically(beside, text.encode())
+        output.write_atomically(beside, text.encode())
         changed.append(beside.name)
     return changed
 
