@@ -43,7 +43,7 @@ fn certificate(arguments: &[&str], folder: &Path) -> (Option<i32>, Value) {
 #[test]
 fn one_episode_agrees_on_every_instruction_set_and_is_too_few() {
     let folder = tempfile::tempdir().unwrap();
-    let schema = fs::read_to_string(project_file("sim-harness/certificate.schema.json")).unwrap();
+    let schema = fs::read_to_string(project_file("sim-harness/proof/certificate.schema.json")).unwrap();
     let schema: Value = serde_json::from_str(&schema).unwrap();
     let few = ["--episodes", "1", "--instruction", "kbls"];
     let mut certificates = Vec::new();

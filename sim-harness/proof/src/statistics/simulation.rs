@@ -1,0 +1,254 @@
+//! The verdict's size and power by simulation: how often a test says what is not so.
+//!
+//! A reduced one runs with the tests; `cargo test -p lads-proof --release -- --ignored --nocapture size_and_power` prints the table of
+//! the crate's README.
+
+use std::collections::HashMap;
+
+use rand_pcg::Pcg64Mcg;
+use rand_pcg::rand_core::Rng as _;
+
+use super::{Counts, EQUIVALENCE_LEVEL, Pairs};
+
+const MARGIN: f64 = 0.05;
+const N_MARGIN: f64 = 0.1;
+const NUMBERS: [usize; 6] = [25, 50, 100, 200, 500, 1000];
+
+struct Stream(Pcg64Mcg);
+
+impl Stream {
+    fn new(seed: u128) -> Self {
+        Self(Pcg64Mcg::new(seed * 2 + 1))
+    }
+
+    fn unit(&mut self) -> f64 {
+        (self.0.next_u64() >> 11) as f64 / (1_u64 << 53) as f64
+    }
+}
+
+/// How one pair of episodes falls out.
+#[derive(Clone, Copy)]
+enum World {
+    /// The run loses `loss` of all, among those that the reference does with `p`, and is the same otherwise.
+    OneWay { p: f64, loss: f64 },
+    /// The same, and `swapped` of the pairs fall out otherwise either way besides.
+    TwoWay { p: f64, loss: f64, swapped: f64 },
+    /// Both are samples of their own.
+    Apart { p: f64, loss: f64 },
+}
+
+impl World {
+    fn draw(self, stream: &mut Stream) -> (bool, bool) {
+        let u = stream.unit();
+        match self {
+            Self::OneWay { p, loss } => (u < p - loss, u < p),
+            Self::TwoWay { p, loss, swapped } => {
+                let half = swapped / 2.0;
+                match u {
+                    u if u < p - loss - half => (true, true),
+                    u if u < p => (false, true),
+                    u if u < p + half => (true, false),
+                    _ => (false, false),
+                }
+            }
+            Self::Apart { p, loss } => (u < p - loss, stream.unit() < p),
+        }
+    }
+
+    fn name(self) -> String {
+        match self {
+            Self::OneWay { p, .. } => format!("one way, p = {p}"),
+            Self::TwoWay { p, swapped, .. } => {
+                format!("{:.0} % differ either way, p = {p}", 100.0 * swapped)
+            }
+            Self::Apart { p, .. } => format!("independent, p = {p}"),
+        }
+    }
+}
+
+fn worlds(loss: f64) -> Vec<World> {
+    let mut all = Vec::new();
+    for p in [0.5, 0.8, 0.95] {
+        all.push(World::OneWay { p, loss });
+        all.push(World::TwoWay {
+            p,
+            loss,
+            swapped: 0.04,
+        });
+        all.push(World::Apart { p, loss });
+    }
+    all
+}
+
+#[derive(Clone, Copy, Default)]
+struct Shares {
+    equivalent: f64,
+    beyond: f64,
+}
+
+/// How often `trials` verifications of `n` pairs say EQUIVALENT, and DIFFERENT at the level of one of ten tests.
+fn rates(world: World, n: usize, trials: usize, seed: u128) -> Shares {
+    let mut stream = Stream::new(seed);
+    let mut known = HashMap::new();
+    let mut shares = Shares::default();
+    for _ in 0..trials {
+        let mut pairs = Pairs::default();
+        for _ in 0..n {
+            let (run, reference) = world.draw(&mut stream);
+            pairs.add(run, reference);
+        }
+        let (equivalent, beyond) = *known
+            .entry((pairs.run_only, pairs.reference_only))
+            .or_insert_with(|| {
+                let equivalent = pairs.p_equivalence(MARGIN, 1.0) <= EQUIVALENCE_LEVEL;
+                (equivalent, pairs.p_beyond(MARGIN) < 1e-3)
+            });
+        shares.equivalent += f64::from(u8::from(equivalent)) / trials as f64;
+        shares.beyond += f64::from(u8::from(beyond)) / trials as f64;
+    }
+    shares
+}
+
+/// Losses of the N-rate: all four sub-tasks in few episodes, or one in many; with what else differs either way.
+const N_WORLDS: [(&str, usize, f64); 3] = [
+    ("all of the loss in few episodes", 4, 0.0),
+    ("one sub-task in many", 1, 0.0),
+    ("one in many, 20 % differ either way", 1, 0.2),
+];
+
+fn n_rates(
+    (_, lost, swapped): (&str, usize, f64),
+    loss: f64,
+    n: usize,
+    trials: usize,
+    seed: u128,
+) -> Shares {
+    let mut stream = Stream::new(seed);
+    let mut shares = Shares::default();
+    for _ in 0..trials {
+        let mut counts = Counts::default();
+        for _ in 0..n {
+            let [u, v] = [stream.unit(), stream.unit()];
+            let (run, reference) = match v {
+                v if v < swapped / 2.0 => (3, 2),
+                v if v < swapped => (2, 3),
+                _ => (4, 4),
+            };
+            let drop = if u < loss / lost as f64 { lost } else { 0 };
+            counts.add(run.max(drop) - drop, reference, 4);
+        }
+        let difference = counts.judged(N_MARGIN);
+        shares.equivalent += f64::from(u8::from(difference.0 <= EQUIVALENCE_LEVEL)) / trials as f64;
+        shares.beyond += f64::from(u8::from(difference.1 < 1e-3)) / trials as f64;
+    }
+    shares
+}
+
+/// A share of `trials` may be so much above its bound by chance: three standard errors.
+fn slack(bound: f64, trials: usize) -> f64 {
+    3.0 * (bound * (1.0 - bound) / trials as f64).sqrt()
+}
+
+#[test]
+fn a_true_difference_at_the_margin_is_seldom_equivalent() {
+    let trials = 400;
+    for (place, world) in worlds(MARGIN).into_iter().enumerate() {
+        for n in [25, 50, 100, 200] {
+            let found = rates(world, n, trials, place as u128 * 10 + n as u128).equivalent;
+            assert!(
+                found <= 0.05 + slack(0.05, trials),
+                "{} n {n}: {found}",
+                world.name()
+            );
+        }
+    }
+    for (place, world) in N_WORLDS.into_iter().enumerate() {
+        for n in NUMBERS {
+            let found = n_rates(world, N_MARGIN, n, trials, 7 + place as u128).equivalent;
+            assert!(
+                found <= 0.05 + slack(0.05, trials),
+                "{} n {n}: {found}",
+                world.0
+            );
+        }
+    }
+}
+
+#[test]
+fn two_samples_of_one_policy_are_seldom_different() {
+    let trials = 400;
+    for p in [0.5, 0.8] {
+        for n in [25, 100] {
+            let found = rates(World::Apart { p, loss: 0.0 }, n, trials, 3).beyond;
+            // One of ten tests; all of them together have ten times that.
+            assert!(
+                10.0 * found <= 0.01 + 10.0 * slack(0.001, trials),
+                "p {p} n {n}: {found}"
+            );
+        }
+    }
+}
+
+#[test]
+fn the_same_policy_is_equivalent_where_there_are_enough_pairs() {
+    let same = World::OneWay { p: 0.8, loss: 0.0 };
+    assert_eq!(rates(same, 100, 5, 1).equivalent, 1.0);
+    let rounding = World::TwoWay {
+        p: 0.8,
+        loss: 0.0,
+        swapped: 0.02,
+    };
+    assert!(rates(rounding, 500, 200, 1).equivalent > 0.99);
+}
+
+/// Prints the tables of README.md; some minutes.
+#[test]
+#[ignore = "minutes; prints the tables of README.md"]
+fn size_and_power() {
+    let trials = 4000;
+    let heading = format!("| | {} |", NUMBERS.map(|n| n.to_string()).join(" | "));
+    let rule = "|---|---|---|---|---|---|---|";
+    for (title, loss) in [
+        (
+            "EQUIVALENT in % though the run loses 5 % (size: at most 5)",
+            MARGIN,
+        ),
+        ("EQUIVALENT in % where there is no loss (power)", 0.0),
+        ("EQUIVALENT in % where the loss is 1 % (power)", 0.01),
+    ] {
+        println!("\n{title}\n\n{heading}\n{rule}");
+        for world in worlds(loss) {
+            let row =
+                NUMBERS.map(|n| format!("{:.1}", 100.0 * rates(world, n, trials, 11).equivalent));
+            println!("| {} | {} |", world.name(), row.join(" | "));
+        }
+    }
+    println!("\nDIFFERENT in % by one rate of ten\n\n{heading}\n{rule}");
+    for loss in [0.0, 0.1, 0.2, 0.4] {
+        let row = NUMBERS.map(|n| {
+            format!(
+                "{:.2}",
+                100.0 * rates(World::Apart { p: 0.8, loss }, n, trials, 12).beyond
+            )
+        });
+        println!(
+            "| independent, p = 0.8, loss {loss} | {} |",
+            row.join(" | ")
+        );
+    }
+    for (title, loss) in [
+        ("though it is 0.1 (size: at most 5)", N_MARGIN),
+        ("where there is none (power)", 0.0),
+    ] {
+        println!("\nN-rate: EQUIVALENT in % by loss {title}\n\n{heading}\n{rule}");
+        for world in N_WORLDS {
+            let row = NUMBERS.map(|n| {
+                format!(
+                    "{:.1}",
+                    100.0 * n_rates(world, loss, n, trials, 13).equivalent
+                )
+            });
+            println!("| {} | {} |", world.0, row.join(" | "));
+        }
+    }
+}
