@@ -154,7 +154,7 @@ pub struct Completion {
 
 /// An episode step by step.
 #[derive(Debug, Deserialize)]
-#[serde(try_from = "Encoded")]
+#[serde(try_from = "Written")]
 pub struct Trace {
     /// What the policy saw, `[steps, O]`.
     pub observations: Vec<f32>,
@@ -171,7 +171,7 @@ pub struct Trace {
 }
 
 #[derive(Deserialize)]
-struct Encoded {
+struct Written {
     observations: String,
     actions: String,
     states: String,
@@ -191,17 +191,17 @@ impl Trace {
     }
 }
 
-impl TryFrom<Encoded> for Trace {
+impl TryFrom<Written> for Trace {
     type Error = String;
 
-    fn try_from(encoded: Encoded) -> Result<Self, String> {
+    fn try_from(written: Written) -> Result<Self, String> {
         Ok(Self {
-            observations: numbers(&encoded.observations, f32::from_le_bytes)?,
-            actions: numbers(&encoded.actions, f32::from_le_bytes)?,
-            states: numbers(&encoded.states, f64::from_le_bytes)?,
-            logits: numbers(&encoded.logits, f32::from_le_bytes)?,
-            encoded: encoded.encoded,
-            encoded_margins: encoded.encoded_margins,
+            observations: numbers(&written.observations, f32::from_le_bytes)?,
+            actions: numbers(&written.actions, f32::from_le_bytes)?,
+            states: numbers(&written.states, f64::from_le_bytes)?,
+            logits: numbers(&written.logits, f32::from_le_bytes)?,
+            encoded: written.encoded,
+            encoded_margins: written.encoded_margins,
         })
     }
 }
@@ -242,11 +242,16 @@ impl Reference {
             path: path.into(),
             source,
         })?;
+        Self::read(&bytes, path)
+    }
+
+    /// Reads and checks the bytes of a file; `path` names it where they are refused.
+    pub fn read(bytes: &[u8], path: &Path) -> Result<Self, ReferenceError> {
         let content = |problem: String| ReferenceError::Content {
             path: path.into(),
             problem,
         };
-        let mut read: Self = serde_json::from_slice(&bytes)
+        let mut read: Self = serde_json::from_slice(bytes)
             .map_err(|error| content(format!("not a reference of lads ({error})")))?;
         path.clone_into(&mut read.path);
         if read.format != FORMAT || !FORMAT_VERSIONS.contains(&read.format_version) {
