@@ -17,7 +17,7 @@ RUNTIME := -p lads-core -p lads-kernels -p lads-compiler -p lads-ffi -p lads-cli
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report record viewer say language verify test setup lint test-rust test-runtime test-exporter sanitize collect train export reference install bench clean help
+.PHONY: run report record viewer say language verify mutate test setup lint test-rust test-runtime test-exporter sanitize collect train export reference install bench clean help
 
 ## run: the shipped policy over the paper's seen and unseen instructions
 run: setup
@@ -113,6 +113,10 @@ reference: $(VENV)/stamp
 ## verify: is the compiled policy the reference's? Fails unless EQUIVALENT; `lads-run --verify` itself exits with 0, 1 DIFFERENT or 3 INCONCLUSIVE
 verify: setup
 	cargo run --release -p lads-sim --bin lads-run -- --model $(MODEL) --verify $(ARGS)
+
+## mutate: changes of every kind to $(MODEL), what each moves and what its verification says; minutes
+mutate: setup
+	cargo run --release -p lads-sim --example mutate -- $(MODEL)
 
 # OpenVINO is a peer of the benchmarks only; where it does not install, the page says so.
 $(VENV)/bench-stamp: $(VENV)/stamp

@@ -24,8 +24,7 @@ import onnx
 import torch
 from tqdm import tqdm
 
-from . import __version__, config, language, official, weights
-from . import questions
+from . import __version__, config, language, official, questions, weights
 from .bundle import write_atomically
 
 FORMAT, FORMAT_VERSION = "lads-reference", 2

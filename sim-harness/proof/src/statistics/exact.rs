@@ -16,7 +16,7 @@ const MISSED: f64 = 1e-5;
 /// Places in that set.
 const PLACES: usize = 48;
 /// A cell's count less likely than this has no part in a p-value.
-const NEVER: f64 = 1e-13;
+const NEVER: f64 = 1e-11;
 
 /// Tango's score statistic of `run_only` against `reference_only` among `n` pairs, were the difference `delta`: standard normal for many pairs,
 /// the larger, the larger the difference that was seen.
@@ -94,8 +94,8 @@ fn tail(least: &[usize], n: usize, share: f64, delta: f64) -> f64 {
     let rest = (1.0 - share).max(f64::MIN_POSITIVE);
     let other = ((share + delta) / rest).clamp(0.0, 1.0);
     let (mean, deviation) = (n as f64 * share, (n as f64 * share * rest).sqrt());
-    let from = (mean - 9.0 * deviation - 2.0).max(0.0) as usize;
-    let to = ((mean + 9.0 * deviation + 12.0) as usize).min(n);
+    let from = (mean - 7.5 * deviation - 2.0).max(0.0) as usize;
+    let to = ((mean + 7.5 * deviation + 12.0) as usize).min(n);
     (from..=to)
         .map(|count| {
             let chance = likelihood(count, n, share);
@@ -189,7 +189,10 @@ mod tests {
     fn no_differing_pair_proves_what_it_can() {
         for n in [32, 45, 58, 59] {
             let p = p_greater(0, 0, n, -0.05);
-            assert!((p - 0.95_f64.powi(n as i32) - MISSED).abs() < 1e-9, "{n}: {p}");
+            assert!(
+                (p - 0.95_f64.powi(n as i32) - MISSED).abs() < 1e-9,
+                "{n}: {p}"
+            );
         }
         // With more, tables with differing pairs count as much and add to it.
         let p = p_greater(0, 0, 120, -0.05);

@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use rand_pcg::Pcg64Mcg;
 use rand_pcg::rand_core::Rng as _;
 
-use super::{Counts, EQUIVALENCE_LEVEL, Pairs};
+use super::{Counts, EQUIVALENCE_LEVEL, Pairs, exact};
 
 const MARGIN: f64 = 0.05;
 const N_MARGIN: f64 = 0.1;
@@ -86,10 +86,49 @@ struct Shares {
     beyond: f64,
 }
 
+/// Level at which one of ten tests finds a difference.
+const BEYOND_LEVEL: f64 = 1e-3;
+
+/// Where the tests reject, found once for each number of pairs: from the least number of pairs that were done in the run only, for each number
+/// done in the reference only. More for the run speaks more for it, so there is one.
+#[derive(Default)]
+struct Regions(HashMap<(usize, usize, bool), usize>);
+
+impl Regions {
+    fn rejects(&mut self, b: usize, c: usize, n: usize, beyond: bool) -> bool {
+        let (delta, level) = if beyond {
+            (MARGIN, BEYOND_LEVEL)
+        } else {
+            (-MARGIN, EQUIVALENCE_LEVEL)
+        };
+        let least = *self.0.entry((n, c, beyond)).or_insert_with(|| {
+            let (mut low, mut high) = (0, n - c + 1);
+            while low < high {
+                let middle = usize::midpoint(low, high);
+                if exact::p_greater(middle, c, n, delta) <= level {
+                    high = middle;
+                } else {
+                    low = middle + 1;
+                }
+            }
+            low
+        });
+        b >= least
+    }
+
+    fn judge(&mut self, pairs: &Pairs) -> (bool, bool) {
+        let (b, c, n) = (pairs.run_only, pairs.reference_only, pairs.len());
+        let equivalent = self.rejects(b, c, n, false) && self.rejects(c, b, n, false);
+        (
+            equivalent,
+            self.rejects(b, c, n, true) || self.rejects(c, b, n, true),
+        )
+    }
+}
+
 /// How often `trials` verifications of `n` pairs say EQUIVALENT, and DIFFERENT at the level of one of ten tests.
-fn rates(world: World, n: usize, trials: usize, seed: u128) -> Shares {
+fn rates(regions: &mut Regions, world: World, n: usize, trials: usize, seed: u128) -> Shares {
     let mut stream = Stream::new(seed);
-    let mut known = HashMap::new();
     let mut shares = Shares::default();
     for _ in 0..trials {
         let mut pairs = Pairs::default();
@@ -97,16 +136,30 @@ fn rates(world: World, n: usize, trials: usize, seed: u128) -> Shares {
             let (run, reference) = world.draw(&mut stream);
             pairs.add(run, reference);
         }
-        let (equivalent, beyond) = *known
-            .entry((pairs.run_only, pairs.reference_only))
-            .or_insert_with(|| {
-                let equivalent = pairs.p_equivalence(MARGIN, 1.0) <= EQUIVALENCE_LEVEL;
-                (equivalent, pairs.p_beyond(MARGIN) < 1e-3)
-            });
+        let (equivalent, beyond) = regions.judge(&pairs);
         shares.equivalent += f64::from(u8::from(equivalent)) / trials as f64;
         shares.beyond += f64::from(u8::from(beyond)) / trials as f64;
     }
     shares
+}
+
+#[test]
+fn the_regions_are_those_of_the_verdict() {
+    let mut regions = Regions::default();
+    for (b, c) in [(0, 0), (3, 0), (0, 3), (5, 4), (2, 9), (30, 1)] {
+        let pairs = Pairs {
+            both: 100 - b - c,
+            run_only: b,
+            reference_only: c,
+            neither: 0,
+        };
+        let paired = pairs.paired(MARGIN);
+        assert_eq!(
+            regions.judge(&pairs),
+            (paired.equivalent, paired.beyond_margin(BEYOND_LEVEL)),
+            "{b} {c}"
+        );
+    }
 }
 
 /// Losses of the N-rate: all four sub-tasks in few episodes, or one in many; with what else differs either way.
@@ -139,7 +192,7 @@ fn n_rates(
         }
         let difference = counts.judged(N_MARGIN);
         shares.equivalent += f64::from(u8::from(difference.0 <= EQUIVALENCE_LEVEL)) / trials as f64;
-        shares.beyond += f64::from(u8::from(difference.1 < 1e-3)) / trials as f64;
+        shares.beyond += f64::from(u8::from(difference.1 < BEYOND_LEVEL)) / trials as f64;
     }
     shares
 }
@@ -151,10 +204,17 @@ fn slack(bound: f64, trials: usize) -> f64 {
 
 #[test]
 fn a_true_difference_at_the_margin_is_seldom_equivalent() {
-    let trials = 400;
+    let (trials, mut regions) = (400, Regions::default());
     for (place, world) in worlds(MARGIN).into_iter().enumerate() {
         for n in [25, 50, 100, 200] {
-            let found = rates(world, n, trials, place as u128 * 10 + n as u128).equivalent;
+            let found = rates(
+                &mut regions,
+                world,
+                n,
+                trials,
+                place as u128 * 10 + n as u128,
+            )
+            .equivalent;
             assert!(
                 found <= 0.05 + slack(0.05, trials),
                 "{} n {n}: {found}",
@@ -176,10 +236,10 @@ fn a_true_difference_at_the_margin_is_seldom_equivalent() {
 
 #[test]
 fn two_samples_of_one_policy_are_seldom_different() {
-    let trials = 400;
+    let (trials, mut regions) = (400, Regions::default());
     for p in [0.5, 0.8] {
         for n in [25, 100] {
-            let found = rates(World::Apart { p, loss: 0.0 }, n, trials, 3).beyond;
+            let found = rates(&mut regions, World::Apart { p, loss: 0.0 }, n, trials, 3).beyond;
             // One of ten tests; all of them together have ten times that.
             assert!(
                 10.0 * found <= 0.01 + 10.0 * slack(0.001, trials),
@@ -191,21 +251,22 @@ fn two_samples_of_one_policy_are_seldom_different() {
 
 #[test]
 fn the_same_policy_is_equivalent_where_there_are_enough_pairs() {
+    let mut regions = Regions::default();
     let same = World::OneWay { p: 0.8, loss: 0.0 };
-    assert_eq!(rates(same, 100, 5, 1).equivalent, 1.0);
+    assert_eq!(rates(&mut regions, same, 100, 5, 1).equivalent, 1.0);
     let rounding = World::TwoWay {
         p: 0.8,
         loss: 0.0,
         swapped: 0.02,
     };
-    assert!(rates(rounding, 500, 200, 1).equivalent > 0.99);
+    assert!(rates(&mut regions, rounding, 500, 200, 1).equivalent > 0.99);
 }
 
 /// Prints the tables of README.md; some minutes.
 #[test]
 #[ignore = "minutes; prints the tables of README.md"]
 fn size_and_power() {
-    let trials = 4000;
+    let (trials, mut regions) = (4000, Regions::default());
     let heading = format!("| | {} |", NUMBERS.map(|n| n.to_string()).join(" | "));
     let rule = "|---|---|---|---|---|---|---|";
     for (title, loss) in [
@@ -218,8 +279,12 @@ fn size_and_power() {
     ] {
         println!("\n{title}\n\n{heading}\n{rule}");
         for world in worlds(loss) {
-            let row =
-                NUMBERS.map(|n| format!("{:.1}", 100.0 * rates(world, n, trials, 11).equivalent));
+            let row = NUMBERS.map(|n| {
+                format!(
+                    "{:.1}",
+                    100.0 * rates(&mut regions, world, n, trials, 11).equivalent
+                )
+            });
             println!("| {} | {} |", world.name(), row.join(" | "));
         }
     }
@@ -228,7 +293,7 @@ fn size_and_power() {
         let row = NUMBERS.map(|n| {
             format!(
                 "{:.2}",
-                100.0 * rates(World::Apart { p: 0.8, loss }, n, trials, 12).beyond
+                100.0 * rates(&mut regions, World::Apart { p: 0.8, loss }, n, trials, 12).beyond
             )
         });
         println!(
