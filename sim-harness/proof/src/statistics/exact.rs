@@ -114,7 +114,8 @@ fn tail(least: &[usize], n: usize, share: f64, delta: f64) -> f64 {
         .sum()
 }
 
-fn likelihood(count: usize, n: usize, share: f64) -> f64 {
+/// The probability of a count.
+pub(super) fn likelihood(count: usize, n: usize, share: f64) -> f64 {
     if share <= 0.0 {
         return f64::from(u8::from(count == 0));
     }

@@ -1,4 +1,5 @@
-//! The verdict's size and power by simulation: how often a test says what is not so.
+//! The verdict's size and power: how often a test says what is not so, and what is. Rates by summing over all tables, the N-rate by
+//! simulation.
 //!
 //! A reduced one runs with the tests; `cargo test -p lads-proof --release -- --ignored --nocapture size_and_power` prints the table of
 //! the crate's README.
@@ -52,6 +53,15 @@ impl World {
                 }
             }
             Self::Apart { p, loss } => (u < p - loss, stream.unit() < p),
+        }
+    }
+
+    /// Probabilities of run only and of reference only.
+    fn cells(self) -> [f64; 2] {
+        match self {
+            Self::OneWay { loss, .. } => [0.0, loss],
+            Self::TwoWay { loss, swapped, .. } => [swapped / 2.0, loss + swapped / 2.0],
+            Self::Apart { p, loss } => [(p - loss) * (1.0 - p), (1.0 - p + loss) * p],
         }
     }
 
@@ -143,6 +153,57 @@ fn rates(regions: &mut Regions, world: World, n: usize, trials: usize, seed: u12
     shares
 }
 
+/// The same without chance: the sum over all tables that pairs of a world can come to.
+fn exactly(regions: &mut Regions, world: World, n: usize) -> Shares {
+    let [run_only, reference_only] = world.cells();
+    let mut shares = Shares::default();
+    let near = |mean: f64, most: usize| {
+        let reach = 8.0 * mean.sqrt() + 8.0;
+        (
+            (mean - reach).max(0.0) as usize,
+            ((mean + reach) as usize).min(most),
+        )
+    };
+    let (from, to) = near(n as f64 * reference_only, n);
+    for c in from..=to {
+        let chance_of_c = exact::likelihood(c, n, reference_only);
+        let share = run_only / (1.0 - reference_only);
+        let (from, to) = near((n - c) as f64 * share, n - c);
+        for b in from..=to {
+            let chance = chance_of_c * exact::likelihood(b, n - c, share);
+            if chance < 1e-12 {
+                continue;
+            }
+            let pairs = Pairs {
+                both: n - b - c,
+                run_only: b,
+                reference_only: c,
+                neither: 0,
+            };
+            let (equivalent, beyond) = regions.judge(&pairs);
+            shares.equivalent += chance * f64::from(u8::from(equivalent));
+            shares.beyond += chance * f64::from(u8::from(beyond));
+        }
+    }
+    shares
+}
+
+#[test]
+fn simulation_and_sum_agree() {
+    let mut regions = Regions::default();
+    for world in worlds(0.02) {
+        let [drawn, summed] = [
+            rates(&mut regions, world, 100, 2000, 5).equivalent,
+            exactly(&mut regions, world, 100).equivalent,
+        ];
+        assert!(
+            (drawn - summed).abs() < 0.045,
+            "{}: {drawn} {summed}",
+            world.name()
+        );
+    }
+}
+
 #[test]
 fn the_regions_are_those_of_the_verdict() {
     let mut regions = Regions::default();
@@ -205,21 +266,10 @@ fn slack(bound: f64, trials: usize) -> f64 {
 #[test]
 fn a_true_difference_at_the_margin_is_seldom_equivalent() {
     let (trials, mut regions) = (400, Regions::default());
-    for (place, world) in worlds(MARGIN).into_iter().enumerate() {
+    for world in worlds(MARGIN) {
         for n in [25, 50, 100, 200] {
-            let found = rates(
-                &mut regions,
-                world,
-                n,
-                trials,
-                place as u128 * 10 + n as u128,
-            )
-            .equivalent;
-            assert!(
-                found <= 0.05 + slack(0.05, trials),
-                "{} n {n}: {found}",
-                world.name()
-            );
+            let found = exactly(&mut regions, world, n).equivalent;
+            assert!(found <= 0.05, "{} n {n}: {found}", world.name());
         }
     }
     for (place, world) in N_WORLDS.into_iter().enumerate() {
@@ -236,15 +286,12 @@ fn a_true_difference_at_the_margin_is_seldom_equivalent() {
 
 #[test]
 fn two_samples_of_one_policy_are_seldom_different() {
-    let (trials, mut regions) = (400, Regions::default());
-    for p in [0.5, 0.8] {
+    let mut regions = Regions::default();
+    for p in [0.5, 0.8, 0.95] {
         for n in [25, 100] {
-            let found = rates(&mut regions, World::Apart { p, loss: 0.0 }, n, trials, 3).beyond;
-            // One of ten tests; all of them together have ten times that.
-            assert!(
-                10.0 * found <= 0.01 + 10.0 * slack(0.001, trials),
-                "p {p} n {n}: {found}"
-            );
+            let found = exactly(&mut regions, World::Apart { p, loss: 0.0 }, n).beyond;
+            // One of ten tests.
+            assert!(10.0 * found <= 0.01, "p {p} n {n}: {found}");
         }
     }
 }
@@ -253,13 +300,13 @@ fn two_samples_of_one_policy_are_seldom_different() {
 fn the_same_policy_is_equivalent_where_there_are_enough_pairs() {
     let mut regions = Regions::default();
     let same = World::OneWay { p: 0.8, loss: 0.0 };
-    assert_eq!(rates(&mut regions, same, 100, 5, 1).equivalent, 1.0);
+    assert!(exactly(&mut regions, same, 100).equivalent > 1.0 - 1e-9);
     let rounding = World::TwoWay {
         p: 0.8,
         loss: 0.0,
         swapped: 0.02,
     };
-    assert!(rates(&mut regions, rounding, 500, 200, 1).equivalent > 0.99);
+    assert!(exactly(&mut regions, rounding, 500).equivalent > 0.99);
 }
 
 /// Prints the tables of README.md; some minutes.
@@ -279,12 +326,8 @@ fn size_and_power() {
     ] {
         println!("\n{title}\n\n{heading}\n{rule}");
         for world in worlds(loss) {
-            let row = NUMBERS.map(|n| {
-                format!(
-                    "{:.1}",
-                    100.0 * rates(&mut regions, world, n, trials, 11).equivalent
-                )
-            });
+            let row = NUMBERS
+                .map(|n| format!("{:.1}", 100.0 * exactly(&mut regions, world, n).equivalent));
             println!("| {} | {} |", world.name(), row.join(" | "));
         }
     }
@@ -293,7 +336,7 @@ fn size_and_power() {
         let row = NUMBERS.map(|n| {
             format!(
                 "{:.2}",
-                100.0 * rates(&mut regions, World::Apart { p: 0.8, loss }, n, trials, 12).beyond
+                100.0 * exactly(&mut regions, World::Apart { p: 0.8, loss }, n).beyond
             )
         });
         println!(
