@@ -28,6 +28,7 @@ struct Kind {
     moving: usize,
     found: usize,
     exceptions: Vec<String>,
+    refusals: Vec<String>,
 }
 
 struct Bench {
@@ -40,20 +41,28 @@ impl Bench {
         kind.changes += 1;
         let judged = match mutate::verify(bytes, options, &self.reference, self.every) {
             Said::Judged(judged) => judged,
-            Said::Refused(_) => {
+            Said::Refused(why) => {
                 kind.refused += 1;
+                kind.refusals.push(format!("{what}: {why}"));
                 return;
             }
         };
         let answers = &judged.answers;
-        let (logit, action) = (answers.largest_logit_difference, answers.largest_action_difference);
+        let (logit, action) = (
+            answers.largest_logit_difference,
+            answers.largest_action_difference,
+        );
         let moving = logit > LOGIT || action > ACTION;
         let different = judged.different();
         kind.different += usize::from(different);
         kind.moving += usize::from(moving);
         kind.found += usize::from(moving && different);
         if moving != different {
-            let verdict = if different { "DIFFERENT" } else { "no difference" };
+            let verdict = if different {
+                "DIFFERENT"
+            } else {
+                "no difference"
+            };
             let segments = answers.differing_segments;
             let reason = judged.reason();
             kind.exceptions.push(format!(
@@ -66,10 +75,12 @@ impl Bench {
 fn weights(model: &Model, bench: &Bench) -> Vec<Kind> {
     type Change = fn(&mut [f32], usize, &mut Normals);
     let changes: [(&str, Change); 4] = [
-        ("times 1.01", |values, _, _| values.iter_mut().for_each(|x| *x *= 1.01)),
+        ("times 1.01", |values, _, _| mutate::scale(values, 1.01)),
         ("zero", |values, _, _| values.fill(0.0)),
         ("noise of 1e-3", |values, _, normals| {
-            values.iter_mut().for_each(|x| *x *= 1.0 + 1e-3 * normals.next());
+            for x in values {
+                *x *= 1.0 + 1e-3 * normals.next();
+            }
         }),
         ("two rows swapped", |values, rows, _| {
             let row = values.len() / rows.max(1);
@@ -87,7 +98,9 @@ fn weights(model: &Model, bench: &Bench) -> Vec<Kind> {
         for tensor in &model.tensors {
             let mut changed = model.clone();
             let mut normals = Normals::new(1);
-            changed.edit(&tensor.name, |values| change(values, tensor.rows, &mut normals));
+            changed.edit(&tensor.name, |values| {
+                change(values, tensor.rows, &mut normals)
+            });
             if changed.bytes() != model.bytes() {
                 bench.add(&mut kind, &tensor.name, changed.bytes(), Options::default());
             }
@@ -104,9 +117,17 @@ fn contract(model: &Model, bench: &Bench) -> Kind {
     };
     let mut kinds = std::collections::BTreeSet::new();
     for (pointer, changed) in mutate::contracts(&model.contract()) {
-        let parts: String = pointer.split('/').filter(|part| part.parse::<usize>().is_err()).collect();
+        let parts: String = pointer
+            .split('/')
+            .filter(|part| part.parse::<usize>().is_err())
+            .collect();
         if kinds.insert(parts) {
-            bench.add(&mut kind, &pointer, model.with_contract(&changed).bytes(), Options::default());
+            bench.add(
+                &mut kind,
+                &pointer,
+                model.with_contract(&changed).bytes(),
+                Options::default(),
+            );
         }
     }
     kind
@@ -117,7 +138,13 @@ fn options(model: &Model, bench: &Bench) -> Kind {
         name: "image options".to_owned(),
         ..Kind::default()
     };
-    let formats = [WeightFormat::F32, WeightFormat::F16, WeightFormat::Bf16, WeightFormat::Int16, WeightFormat::Int8];
+    let formats = [
+        WeightFormat::F32,
+        WeightFormat::F16,
+        WeightFormat::Bf16,
+        WeightFormat::Int16,
+        WeightFormat::Int8,
+    ];
     for weights in formats {
         for low_level in [None, Some(WeightFormat::F32)] {
             for cache in [CacheFormat::F32, CacheFormat::F16] {
@@ -143,11 +170,21 @@ fn harmless(model: &Model, bench: &Bench) -> Kind {
     bench.add(&mut kind, "nothing", model.bytes(), Options::default());
     for seed in 0..10 {
         let noisy = mutate::noisy(model, 1e-6, 100 + seed);
-        bench.add(&mut kind, &format!("noise of 1e-6 on all weights, seed {seed}"), noisy.bytes(), Options::default());
+        bench.add(
+            &mut kind,
+            &format!("noise of 1e-6 on all weights, seed {seed}"),
+            noisy.bytes(),
+            Options::default(),
+        );
     }
     for step in [1, 7] {
         let renumbered = mutate::renumbered(model, step);
-        bench.add(&mut kind, &format!("plans renumbered by {step}"), renumbered.bytes(), Options::default());
+        bench.add(
+            &mut kind,
+            &format!("plans renumbered by {step}"),
+            renumbered.bytes(),
+            Options::default(),
+        );
     }
     kind
 }
@@ -158,7 +195,9 @@ fn main() -> ExitCode {
         eprintln!("mutate MODEL [EVERY]: name a bundle with a reference beside it");
         return ExitCode::from(2);
     };
-    let every = every.and_then(|text| text.to_str()?.parse().ok()).unwrap_or(1);
+    let every = every
+        .and_then(|text| text.to_str()?.parse().ok())
+        .unwrap_or(1);
     let reference = match Reference::open(&path.with_extension("reference.json")) {
         Ok(reference) => reference,
         Err(error) => {
@@ -171,7 +210,9 @@ fn main() -> ExitCode {
     kinds.push(contract(&model, &bench));
     kinds.push(options(&model, &bench));
     let harmless = harmless(&model, &bench);
-    println!("| change | number | refused | DIFFERENT | move a logit > {LOGIT} or an action > {ACTION} | of these DIFFERENT |");
+    println!(
+        "| change | number | refused | DIFFERENT | move a logit > {LOGIT} or an action > {ACTION} | of these DIFFERENT |"
+    );
     println!("|---|---|---|---|---|---|");
     for kind in kinds.iter().chain([&harmless]) {
         println!(
@@ -181,11 +222,23 @@ fn main() -> ExitCode {
     }
     println!("\nWhere verdict and movement do not agree:\n");
     for kind in kinds.iter().chain([&harmless]) {
-        kind.exceptions.iter().for_each(|what| println!("- {}: {what}", kind.name));
+        kind.exceptions
+            .iter()
+            .for_each(|what| println!("- {}: {what}", kind.name));
+    }
+    println!("\nRefused before anything runs:\n");
+    for kind in kinds.iter().chain([&harmless]) {
+        kind.refusals
+            .iter()
+            .for_each(|what| println!("- {}: {what}", kind.name));
     }
     let moving: usize = kinds.iter().map(|kind| kind.moving).sum();
     let found: usize = kinds.iter().map(|kind| kind.found).sum();
     let share = found as f64 / moving.max(1) as f64;
-    println!("\n{found} of {moving} changes that move something are DIFFERENT: {:.1} %; {} harmless ones are.", 100.0 * share, harmless.different);
+    println!(
+        "\n{found} of {moving} changes that move something are DIFFERENT: {:.1} %; {} harmless ones are.",
+        100.0 * share,
+        harmless.different
+    );
     ExitCode::from(u8::from(share < FOUND || harmless.different > 0))
 }

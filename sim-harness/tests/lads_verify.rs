@@ -43,7 +43,8 @@ fn certificate(arguments: &[&str], folder: &Path) -> (Option<i32>, Value) {
 #[test]
 fn one_episode_agrees_on_every_instruction_set_and_is_too_few() {
     let folder = tempfile::tempdir().unwrap();
-    let schema = fs::read_to_string(project_file("sim-harness/proof/certificate.schema.json")).unwrap();
+    let schema =
+        fs::read_to_string(project_file("sim-harness/proof/certificate.schema.json")).unwrap();
     let schema: Value = serde_json::from_str(&schema).unwrap();
     let few = ["--episodes", "1", "--instruction", "kbls"];
     let mut certificates = Vec::new();
@@ -58,7 +59,12 @@ fn one_episode_agrees_on_every_instruction_set_and_is_too_few() {
         assert!(found["policy"]["largest_logit_difference"].as_f64() < Some(1e-4));
         assert!(found["policy"]["compared_decisions"].as_u64() > Some(5));
         assert!(found["policy"]["compared_segments"].as_u64() > Some(5));
-        assert!(found["contract"]["fields"].as_array().unwrap().contains(&"decision".into()));
+        assert!(
+            found["contract"]["fields"]
+                .as_array()
+                .unwrap()
+                .contains(&"decision".into())
+        );
         assert_eq!(found["contract"]["differing"], Value::Array(Vec::new()));
         assert!(found["environment"]["largest_state_difference"].as_f64() <= Some(1e-6));
         assert_eq!(found["rollouts"]["identical_completions"], 1.0);
@@ -182,13 +188,24 @@ fn the_source_of_the_reference_is_printed() {
     let folder = tempfile::tempdir().unwrap();
     // The same from a run's checkpoint has no such note.
     let source = r#""weights_from": "the bundle's initializers""#;
-    let checkpoint = altered(folder.path(), source, r#""weights_from": "the run's checkpoint", "ignored": 1"#);
+    let checkpoint = altered(
+        folder.path(),
+        source,
+        r#""weights_from": "the run's checkpoint", "ignored": 1"#,
+    );
     let text = fs::read_to_string(&checkpoint).unwrap();
-    let text = text.replacen(r#""logits_from": "the bundle's initializers""#, r#""logits_from": null"#, 1);
+    let text = text.replacen(
+        r#""logits_from": "the bundle's initializers""#,
+        r#""logits_from": null"#,
+        1,
+    );
     fs::write(&checkpoint, text).unwrap();
     let output = verify(&[&checkpoint, "--episodes", "1", "--instruction", "kbls"]);
     let printed = String::from_utf8(output.stdout).unwrap();
-    assert!(printed.contains("weights from the run's checkpoint") && !printed.contains("note: "), "{printed}");
+    assert!(
+        printed.contains("weights from the run's checkpoint") && !printed.contains("note: "),
+        "{printed}"
+    );
 }
 
 /// A reference of the first version records neither contract nor logits: its silence is no agreement.
@@ -201,11 +218,20 @@ fn a_reference_without_a_contract_decides_nothing() {
     file.as_object_mut().unwrap().remove("contract");
     let path = folder.path().join("old.json");
     fs::write(&path, file.to_string()).unwrap();
-    let few = [path.to_str().unwrap(), "--episodes", "1", "--instruction", "kbls"];
+    let few = [
+        path.to_str().unwrap(),
+        "--episodes",
+        "1",
+        "--instruction",
+        "kbls",
+    ];
     let (code, found) = certificate(&few, folder.path());
     assert_eq!((code, &found["verdict"]), (Some(3), &"INCONCLUSIVE".into()));
     let reasons = found["reasons"].to_string();
-    assert!(reasons.contains("the contract was not compared") && reasons.contains("--complete"), "{reasons}");
+    assert!(
+        reasons.contains("the contract was not compared") && reasons.contains("--complete"),
+        "{reasons}"
+    );
 }
 
 fn refused(arguments: &[&str], parts: &[&str]) {

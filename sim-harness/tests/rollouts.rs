@@ -332,7 +332,11 @@ fn a_panic_stops_all_threads() {
         }
         std::thread::sleep(std::time::Duration::from_millis(1));
     };
-    let run = || evaluation.run(&open, &AtomicBool::new(false), &count).map(drop);
+    let run = || {
+        evaluation
+            .run(&open, &AtomicBool::new(false), &count)
+            .map(drop)
+    };
     let panic = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run)).unwrap_err();
     assert_eq!(panic.downcast_ref::<&str>(), Some(&"lost"));
     let finished = finished.into_inner();

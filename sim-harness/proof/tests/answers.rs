@@ -117,7 +117,7 @@ fn logits_are_judged_up_to_a_constant() {
                 .replies
                 .iter_mut()
                 .flat_map(|it| &mut it.logits)
-                .for_each(|x| *x = by(*x))
+                .for_each(|x| *x = by(*x));
         }
     };
     let shifted = judged(all(|x| x + 7.0));

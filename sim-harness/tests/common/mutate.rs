@@ -102,10 +102,19 @@ impl Model {
         let mut tensors = Vec::new();
         let top = fields(&bytes, 0..bytes.len());
         let graphs = top.into_iter().filter(|field| field.0 == GRAPH);
-        for (.., initializer) in graphs.flat_map(|(.., graph)| fields(&bytes, graph)).filter(|field| field.0 == INITIALIZER) {
+        for (.., initializer) in graphs
+            .flat_map(|(.., graph)| fields(&bytes, graph))
+            .filter(|field| field.0 == INITIALIZER)
+        {
             let parts = fields(&bytes, initializer);
-            let find = |number| parts.iter().find(|part| part.0 == number).map(|part| part.2.clone());
-            let (Some(name), Some(data), Some(mut dims)) = (find(NAME), find(RAW_DATA), find(DIMS)) else {
+            let find = |number| {
+                parts
+                    .iter()
+                    .find(|part| part.0 == number)
+                    .map(|part| part.2.clone())
+            };
+            let (Some(name), Some(data), Some(mut dims)) = (find(NAME), find(RAW_DATA), find(DIMS))
+            else {
                 continue;
             };
             if let Some(name) = String::from_utf8_lossy(&bytes[name]).strip_prefix("weights/") {
@@ -127,9 +136,17 @@ impl Model {
     /// The same with the values of a tensor changed.
     pub fn edit(&mut self, name: &str, change: impl FnOnce(&mut [f32])) {
         let tensor = self.tensors.iter().find(|tensor| tensor.name == name);
-        let range = tensor.unwrap_or_else(|| panic!("no tensor {name}")).bytes.clone();
+        let range = tensor
+            .unwrap_or_else(|| panic!("no tensor {name}"))
+            .bytes
+            .clone();
         let bytes = &mut self.bytes[range];
-        let mut values: Vec<f32> = bytes.as_chunks::<4>().0.iter().map(|&word| f32::from_le_bytes(word)).collect();
+        let mut values: Vec<f32> = bytes
+            .as_chunks::<4>()
+            .0
+            .iter()
+            .map(|&word| f32::from_le_bytes(word))
+            .collect();
         change(&mut values);
         for (word, value) in bytes.as_chunks_mut::<4>().0.iter_mut().zip(values) {
             *word = value.to_le_bytes();
@@ -140,7 +157,10 @@ impl Model {
     pub fn reorder(&mut self, name: &str, order: &[usize]) {
         self.edit(name, |values| {
             let row = values.len() / order.len();
-            let rows: Vec<_> = order.iter().flat_map(|&from| values[from * row..(from + 1) * row].to_vec()).collect();
+            let rows: Vec<_> = order
+                .iter()
+                .flat_map(|&from| values[from * row..(from + 1) * row].to_vec())
+                .collect();
             values.copy_from_slice(&rows);
         });
     }
@@ -150,7 +170,12 @@ impl Model {
         let mut entries = top.into_iter().filter(|field| field.0 == METADATA);
         let found = entries.find_map(|(_, whole, entry)| {
             let parts = fields(&self.bytes, entry);
-            let part = |number| parts.iter().find(|part| part.0 == number).map(|part| part.2.clone());
+            let part = |number| {
+                parts
+                    .iter()
+                    .find(|part| part.0 == number)
+                    .map(|part| part.2.clone())
+            };
             (&self.bytes[part(KEY)?] == CONTRACT.as_bytes()).then_some((whole, part(VALUE)?))
         });
         found.expect("a bundle has a contract")
@@ -192,23 +217,38 @@ pub struct Judged {
 
 impl Judged {
     pub fn different(&self) -> bool {
-        !self.contract.differing.is_empty() || !self.contract.image_differing.is_empty() || self.answers.first_difference.is_some()
+        !self.contract.differing.is_empty()
+            || !self.contract.image_differing.is_empty()
+            || self.answers.first_difference.is_some()
     }
 
     /// What a verdict names first.
     pub fn reason(&self) -> String {
-        let field = self.contract.differing.first().map(|it| format!("contract: {}", it.field));
-        field.or_else(|| self.answers.first_difference.as_ref().map(|it| it.what.clone())).unwrap_or_default()
+        let field = self
+            .contract
+            .differing
+            .first()
+            .map(|it| format!("contract: {}", it.field));
+        field
+            .or_else(|| {
+                self.answers
+                    .first_difference
+                    .as_ref()
+                    .map(|it| it.what.clone())
+            })
+            .unwrap_or_default()
     }
 }
 
 /// Compares a bundle with its reference: the contract, and the policy's answers to the first traced episode of the instructions whose index
 /// is a multiple of `every`.
 pub fn verify(bytes: &[u8], options: Options, reference: &Reference, every: usize) -> Said {
-    let compiled = Bundle::from_bytes(bytes).map_err(|error| error.to_string()).and_then(|bundle| {
-        let image = compile_with(&bundle, options).map_err(|error| error.to_string())?;
-        Ok((bundle, image))
-    });
+    let compiled = Bundle::from_bytes(bytes)
+        .map_err(|error| error.to_string())
+        .and_then(|bundle| {
+            let image = compile_with(&bundle, options).map_err(|error| error.to_string())?;
+            Ok((bundle, image))
+        });
     let (bundle, image) = match compiled {
         Ok(compiled) => compiled,
         Err(refused) => return Said::Refused(refused),
@@ -226,11 +266,24 @@ pub fn verify(bytes: &[u8], options: Options, reference: &Reference, every: usiz
         })
         .collect();
     let stop = AtomicBool::new(false);
-    let replays = verify::policy::ask(&policy, Isa::detect(), reference, &assignments, 1, &stop, &|| {}).unwrap();
+    let replays = verify::policy::ask(
+        &policy,
+        Isa::detect(),
+        reference,
+        &assignments,
+        1,
+        &stop,
+        &|| {},
+    )
+    .unwrap();
     let tolerance = policy.golden().map(|golden| f64::from(golden.tolerance()));
     let stated = serde_json::from_str(bundle.metadata(CONTRACT).unwrap()).unwrap();
     Said::Judged(Box::new(Judged {
-        contract: Compared::new(&stated, reference.contract.as_ref(), &verify::contract::of_image(&policy.contract())),
+        contract: Compared::new(
+            &stated,
+            reference.contract.as_ref(),
+            &verify::contract::of_image(&policy.contract()),
+        ),
         answers: Answers::judge(reference, &replays, tolerance).0,
     }))
 }
@@ -239,8 +292,13 @@ pub fn verify(bytes: &[u8], options: Options, reference: &Reference, every: usiz
 pub fn contracts(contract: &Value) -> Vec<(String, Value)> {
     fn places(value: &Value, pointer: String, found: &mut Vec<String>) {
         match value {
-            Value::Object(object) => object.iter().for_each(|(key, value)| places(value, format!("{pointer}/{key}"), found)),
-            Value::Array(list) => list.iter().enumerate().for_each(|(index, value)| places(value, format!("{pointer}/{index}"), found)),
+            Value::Object(object) => object
+                .iter()
+                .for_each(|(key, value)| places(value, format!("{pointer}/{key}"), found)),
+            Value::Array(list) => list
+                .iter()
+                .enumerate()
+                .for_each(|(index, value)| places(value, format!("{pointer}/{index}"), found)),
             _ => found.push(pointer),
         }
     }
@@ -274,6 +332,13 @@ fn other_word(word: &str) -> String {
     }
 }
 
+/// A tensor times a factor.
+pub fn scale(values: &mut [f32], factor: f32) {
+    for x in values {
+        *x *= factor;
+    }
+}
+
 /// A stream of normals, the same each time.
 pub struct Normals(lads_sim::random::Stream);
 
@@ -292,7 +357,11 @@ impl Normals {
 pub fn noisy(model: &Model, relative: f32, seed: u64) -> Model {
     let (mut model, mut normals) = (model.clone(), Normals::new(seed));
     for tensor in model.tensors.clone() {
-        model.edit(&tensor.name, |values| values.iter_mut().for_each(|x| *x *= 1.0 + relative * normals.next()));
+        model.edit(&tensor.name, |values| {
+            for x in values {
+                *x *= 1.0 + relative * normals.next();
+            }
+        });
     }
     model
 }
@@ -300,7 +369,12 @@ pub fn noisy(model: &Model, relative: f32, seed: u64) -> Model {
 /// The plans under other numbers, throughout.
 pub fn renumbered(model: &Model, step: usize) -> Model {
     let mut model = model.clone();
-    let codes = model.tensors.iter().find(|tensor| tensor.name == "codebook").expect("a codebook").rows;
+    let codes = model
+        .tensors
+        .iter()
+        .find(|tensor| tensor.name == "codebook")
+        .expect("a codebook")
+        .rows;
     let order: Vec<_> = (0..codes).map(|plan| (plan + step) % codes).collect();
     for name in ["codebook", "high_level.head.weight", "high_level.head.bias"] {
         model.reorder(name, &order);

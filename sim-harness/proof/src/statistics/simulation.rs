@@ -111,16 +111,37 @@ impl Regions {
         } else {
             (-MARGIN, EQUIVALENCE_LEVEL)
         };
-        let least = *self.0.entry((n, c, beyond)).or_insert_with(|| {
-            let (mut low, mut high) = (0, n - c + 1);
+        let least = self.0.get(&(n, c, beyond)).copied().unwrap_or_else(|| {
+            let holds = |b: usize| b > n - c || exact::p_greater(b, c, n, delta) <= level;
+            // One more for the reference asks for about one more for the run.
+            let beside = c.checked_sub(1).and_then(|c| self.0.get(&(n, c, beyond)));
+            let guess = beside.map_or((n - c) / 2, |least| least + 1).min(n - c + 1);
+            // `low` is refused or nothing, `high` holds.
+            let (mut low, mut high, mut reach) = (0, n - c + 1, 1);
+            if holds(guess) {
+                high = guess;
+                while high > low && holds(high.saturating_sub(reach)) {
+                    high = high.saturating_sub(reach);
+                    reach *= 2;
+                }
+                low = high.saturating_sub(reach);
+            } else {
+                low = guess + 1;
+                while !holds(low) {
+                    low += reach;
+                    reach *= 2;
+                }
+                (low, high) = (low.saturating_sub(reach), low.min(high));
+            }
             while low < high {
                 let middle = usize::midpoint(low, high);
-                if exact::p_greater(middle, c, n, delta) <= level {
+                if holds(middle) {
                     high = middle;
                 } else {
                     low = middle + 1;
                 }
             }
+            self.0.insert((n, c, beyond), low);
             low
         });
         b >= least
