@@ -99,7 +99,7 @@ fn weights(model: &Model, bench: &Bench) -> Vec<Kind> {
             let mut changed = model.clone();
             let mut normals = Normals::new(1);
             changed.edit(&tensor.name, |values| {
-                change(values, tensor.rows, &mut normals)
+                change(values, tensor.rows, &mut normals);
             });
             if changed.bytes() != model.bytes() {
                 bench.add(&mut kind, &tensor.name, changed.bytes(), Options::default());

@@ -85,7 +85,7 @@ fn damaged_weights_are_different() {
             (|values| values.fill(0.0)) as fn(&mut [f32]),
         ),
         ("low_level.layer.3.weight", |values| {
-            mutate::scale(values, 1.01)
+            mutate::scale(values, 1.01);
         }),
         ("observation_mean", |values| values.swap(0, 1)),
         ("codebook", |values| values.rotate_left(1)),
