@@ -9,9 +9,9 @@ use kuva::render::layout::Layout;
 use kuva::render::plots::Plot;
 
 use super::Report;
-use crate::metrics::Interval;
 use crate::results::Results;
 use crate::trace::Trace;
+use lads_proof::metrics::Interval;
 
 /// Colours that stay apart for most eyes (Okabe and Ito), darkest first.
 const COLORS: [&str; 6] = [

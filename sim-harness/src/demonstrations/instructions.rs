@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-const KITCHEN: &str = include_str!("../../models/kitchen.instructions.json");
+const KITCHEN: &str = include_str!("../../../models/kitchen.instructions.json");
 
 /// One instruction.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]

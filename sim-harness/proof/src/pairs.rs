@@ -5,11 +5,10 @@
 
 use serde::Serialize;
 
+use super::numbering::Numbering;
 use super::reference::Reference;
 use super::statistics::{Counts, Difference, Pairs};
-use crate::evaluate::{Assignment, Evaluated};
-use crate::rollout::Episode;
-use crate::trace::Step;
+use crate::episode::Episode;
 
 /// Largest negligible difference of a success rate.
 pub const RATE_MARGIN: f64 = 0.05;
@@ -77,41 +76,72 @@ pub struct Paired {
 }
 
 impl Paired {
-    /// Compares the episodes of each assignment with the reference's.
-    pub fn new(
-        reference: &Reference,
-        assignments: &[Assignment],
+    /// Compares the episodes of each instruction with the reference's, whose plans have the run's numbers by `numbering`; `sub_tasks` are the
+    /// environment's, `lens` those of observation and action.
+    pub fn new<'r>(
+        (reference, numbering): (&Reference, &Numbering),
         sub_tasks: &[&str],
-        evaluated: &Evaluated,
+        episodes: impl IntoIterator<Item = Episodes<'r>>,
+        traces: impl IntoIterator<Item = Traced<'r>>,
         lens: [usize; 2],
     ) -> Self {
         let mut sum = Sum {
             outcomes: vec![Pairs::default(); sub_tasks.len() + 1],
             ..Sum::default()
         };
-        for (assignment, ours) in assignments.iter().zip(&evaluated.episodes) {
-            let Some(theirs) = reference.instructions.get(assignment.instruction as usize) else {
+        for ours in episodes {
+            let Some(theirs) = reference.instructions.get(ours.instruction) else {
                 continue;
             };
-            for (run, recorded) in ours.iter().zip(&theirs.episodes) {
-                sum.add(
-                    run,
-                    recorded,
-                    &assignment.commanded,
-                    sub_tasks,
-                    reference.horizon,
-                );
+            for (run, recorded) in ours.episodes.iter().zip(&theirs.episodes) {
+                let decided = Decided {
+                    plans: recorded
+                        .plans
+                        .iter()
+                        .map(|&plan| numbering.of_run(plan))
+                        .collect(),
+                    at: reference.decided_at(recorded),
+                };
+                sum.add(run, recorded, ours.commanded, sub_tasks, &decided);
             }
         }
-        for trace in &evaluated.traces {
-            let instruction = reference.instructions.get(trace.instruction as usize);
-            let recorded = instruction.and_then(|row| row.episodes.get(trace.episode as usize));
+        for ours in traces {
+            let instruction = reference.instructions.get(ours.instruction);
+            let recorded = instruction.and_then(|row| row.episodes.get(ours.episode));
             if let Some(theirs) = recorded.and_then(|episode| episode.trace.as_ref()) {
-                sum.follow(&trace.steps, theirs, lens);
+                sum.follow(&ours.steps, theirs, lens);
             }
         }
         sum.finish(sub_tasks)
     }
+}
+
+/// The run's episodes of one instruction.
+#[derive(Debug, Clone, Copy)]
+pub struct Episodes<'r> {
+    /// Index of the instruction.
+    pub instruction: usize,
+    /// The environment's indices of the sub-tasks that it commands.
+    pub commanded: &'r [usize],
+    /// In order of their numbers.
+    pub episodes: &'r [Episode],
+}
+
+/// One of the run's episodes, step by step.
+#[derive(Debug, Clone)]
+pub struct Traced<'r> {
+    /// Index of the instruction.
+    pub instruction: usize,
+    /// Number of the episode.
+    pub episode: usize,
+    /// What was seen and done at each control step.
+    pub steps: Vec<[&'r [f32]; 2]>,
+}
+
+/// The reference's plans in the run's numbers, and the control steps at which they were decided.
+struct Decided {
+    plans: Vec<u32>,
+    at: Vec<usize>,
 }
 
 #[derive(Default)]
@@ -134,7 +164,7 @@ impl Sum {
         recorded: &super::reference::Episode,
         commanded: &[usize],
         sub_tasks: &[&str],
-        horizon: usize,
+        decided: &Decided,
     ) {
         self.episodes += 1;
         let ours: Vec<_> = run
@@ -156,14 +186,12 @@ impl Sum {
         self.steps += usize::from(ours == theirs && run.steps == recorded.steps);
         let mut ends = run.final_state.iter().zip(&recorded.final_state);
         self.final_states += usize::from(ends.all(|(a, b)| (a - b).abs() < FINAL_TOLERANCE));
-        if run.plans != recorded.plans {
-            let same = run
-                .plans
-                .iter()
-                .zip(&recorded.plans)
-                .take_while(|(a, b)| a == b)
-                .count();
-            self.first_plan_differences.push(same * horizon);
+        if run.plans != decided.plans {
+            let both = run.plans.iter().zip(&decided.plans);
+            let same = both.take_while(|(a, b)| a == b).count();
+            let step = decided.at.get(same).copied();
+            self.first_plan_differences
+                .push(step.unwrap_or(recorded.steps));
         }
         let done = |list: &[(&str, usize)], index: usize| {
             list.iter().any(|(name, _)| *name == sub_tasks[index])
@@ -175,7 +203,7 @@ impl Sum {
             completed[1] += usize::from(b);
             self.outcomes[index].add(a, b);
         }
-        self.counts.add(completed[0], completed[1]);
+        self.counts.add(completed[0], completed[1], commanded.len());
         if let Some(full) = self.outcomes.last_mut() {
             full.add(run.success, recorded.success);
         }
@@ -184,7 +212,7 @@ impl Sum {
     /// Compares actions as long as both trajectories are the same.
     fn follow(
         &mut self,
-        ours: &[Step],
+        ours: &[[&[f32]; 2]],
         theirs: &super::reference::Trace,
         [observation_len, action_len]: [usize; 2],
     ) {
@@ -197,14 +225,13 @@ impl Sum {
                 .map(|(a, b)| f64::from((a - b).abs()))
                 .fold(0.0, f64::max)
         };
-        for (step, (seen, done)) in ours.iter().zip(seen.zip(done)) {
-            if largest(&step.observation, seen) > TRAJECTORY_TOLERANCE {
+        for ([observation, action], (seen, done)) in ours.iter().zip(seen.zip(done)) {
+            if largest(observation, seen) > TRAJECTORY_TOLERANCE {
                 return;
             }
             self.agreeing_steps[0] += 1;
-            self.largest_action_difference = self
-                .largest_action_difference
-                .max(largest(&step.action, done));
+            self.largest_action_difference =
+                self.largest_action_difference.max(largest(action, done));
         }
     }
 
@@ -249,8 +276,6 @@ impl Sum {
 impl RatePair {
     /// Rates of run and reference with nothing else.
     pub fn shares(&self) -> [f64; 2] {
-        let n = self.pairs.len().max(1) as f64;
-        let both = self.pairs.both;
-        [both + self.pairs.run_only, both + self.pairs.reference_only].map(|count| count as f64 / n)
+        self.pairs.shares()
     }
 }

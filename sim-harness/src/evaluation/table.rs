@@ -2,8 +2,8 @@
 
 use std::fmt::{self, Display, Formatter};
 
-use crate::metrics::{Interval, Latency};
 use crate::results::{InstructionResult, Results, SplitResult, SubTaskRate};
+use lads_proof::timing::Latency;
 
 /// Writes itself as a table of a few lines per instruction, then the splits, latency and time.
 pub struct Table<'r>(pub &'r Results);
@@ -214,11 +214,5 @@ impl Display for Number {
             Some(value) => write!(f, "{value:>5.2}"),
             None => write!(f, "{:>5}", "-"),
         }
-    }
-}
-
-impl Display for Interval {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        write!(f, "[{:.2}, {:.2}]", self.0, self.1)
     }
 }

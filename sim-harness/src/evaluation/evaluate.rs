@@ -2,7 +2,7 @@
 //!
 //! Each thread has its own environment and its own controller and takes the next episode from one queue. Every episode draws from streams
 //! of its own (seed, instruction, episode), and results are put in the order of the queue, so scheduling cannot show. What can fail: an
-//! episode that does not finish; then all threads stop after their current episode.
+//! episode that does not finish, or a panic in one; then all threads stop after their current episode.
 
 use std::panic::resume_unwind;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -109,6 +109,15 @@ pub struct Evaluated {
     pub timing: Timing,
 }
 
+/// Raises its flag when a panic unwinds through its scope.
+struct OnPanic<'f>(&'f AtomicBool);
+
+impl Drop for OnPanic<'_> {
+    fn drop(&mut self) {
+        self.0.fetch_or(thread::panicking(), Ordering::Relaxed);
+    }
+}
+
 /// What one thread did: its episodes with their places in the queue.
 struct Share {
     episodes: Vec<(usize, Episode, Option<Trace>)>,
@@ -165,6 +174,7 @@ impl Evaluation<'_> {
             (place < self.len()).then_some(place)
         };
         let work = || {
+            let _raised = OnPanic(&failed);
             let done = self.worker(open, &next, finished);
             failed.fetch_or(done.is_err(), Ordering::Relaxed);
             done

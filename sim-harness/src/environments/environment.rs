@@ -8,6 +8,8 @@ use std::sync::Arc;
 use mujoco_rs::wrappers::{MjData, MjModel};
 use thiserror::Error;
 
+pub use lads_proof::episode::Completion;
+
 /// What there is to look at, for pictures.
 pub struct Stage<'e> {
     /// The simulator's state; drawing it changes nothing that the next control step depends on.
@@ -52,15 +54,6 @@ impl EpisodeSeed {
     pub fn entropy(self) -> [u64; 3] {
         [self.seed, self.instruction, self.episode]
     }
-}
-
-/// A sub-task that was completed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Completion {
-    /// Index in [`Environment::sub_tasks`].
-    pub sub_task: usize,
-    /// The first control step after which it was done, counted from 1.
-    pub step: usize,
 }
 
 /// An action that cannot be executed. The environment is as it was before.

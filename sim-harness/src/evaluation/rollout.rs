@@ -11,7 +11,10 @@ use lads_core::{
 use rustix::time::{ClockId, clock_gettime};
 use thiserror::Error;
 
-use crate::environment::{ActionError, Completion, Environment, EpisodeSeed};
+pub use lads_proof::episode::Episode;
+pub use lads_proof::timing::Timing;
+
+use crate::environment::{ActionError, Environment, EpisodeSeed};
 use crate::faults::{Faults, Link};
 use crate::random::Stream;
 use crate::trace::Step;
@@ -128,50 +131,6 @@ pub struct Task<'t> {
     pub faults: Faults,
     /// Plans for the low level alone, one per horizon; the episode ends with them. `None`: the high level decides.
     pub plans: Option<&'t [u32]>,
-}
-
-/// What happened in one episode.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Episode {
-    /// Control steps executed.
-    pub steps: usize,
-    /// Whether the instruction was carried out, as the environment judges it.
-    pub success: bool,
-    /// Completed sub-tasks, in order of time.
-    pub completions: Vec<Completion>,
-    /// Plan indices in the order in which they were decided.
-    pub plans: Vec<u32>,
-    /// Noise-free state after the last step.
-    pub final_state: Vec<f64>,
-}
-
-/// How long everything took, over all episodes of one driver.
-#[derive(Debug, Clone, Default)]
-pub struct Timing {
-    /// Every control step that kept its plan, in nanoseconds.
-    pub ordinary_ns: Vec<u64>,
-    /// Every control step that decided a plan, in nanoseconds.
-    pub decision_ns: Vec<u64>,
-    /// Every change of instruction, in nanoseconds.
-    pub instruct_ns: Vec<u64>,
-    /// CPU time inside the environment's reset and step, which is physics but for noise and task checks.
-    pub simulator_cpu: Duration,
-    /// CPU time inside the controller.
-    pub controller_cpu: Duration,
-    /// CPU time inside episodes as a whole.
-    pub episodes_cpu: Duration,
-}
-
-impl Timing {
-    /// Adds another driver's durations.
-    pub fn absorb(&mut self, other: Self) {
-        self.ordinary_ns.extend(other.ordinary_ns);
-        self.decision_ns.extend(other.decision_ns);
-        self.instruct_ns.extend(other.instruct_ns);
-        self.simulator_cpu += other.simulator_cpu;
-        self.controller_cpu += other.controller_cpu;
-        self.episodes_cpu += other.episodes_cpu;
-    }
 }
 
 /// CPU time that this thread has used: unlike the wall clock's, its differences do not depend on what else the machine does.

@@ -9,6 +9,8 @@
 //! Invariants: a rate is in `0..=1` and inside its own interval; K-rates never grow with `k`. Nothing here can fail: over no
 //! episodes a rate is `None` and its interval is `[0, 1]`, which is what no evidence means.
 
+use std::fmt::{self, Display, Formatter};
+
 use serde::Serialize;
 
 /// The K-rates that are reported: at least 1, 2, 3 and 4 commanded sub-tasks completed.
@@ -21,18 +23,29 @@ const Z_95: f64 = 1.959963984540054;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Interval(pub f64, pub f64);
 
+impl Display for Interval {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        write!(f, "[{:.2}, {:.2}]", self.0, self.1)
+    }
+}
+
 /// The Wilson score interval at 95 % of `successes` out of `trials` (Wilson 1927; method 3 of Newcombe 1998), no continuity correction.
 ///
 /// Over no trials it is `[0, 1]`.
 pub fn wilson(successes: usize, trials: usize) -> Interval {
+    wilson_at(successes, trials, Z_95)
+}
+
+/// The Wilson score interval whose limits are `z` standard errors away.
+pub fn wilson_at(successes: usize, trials: usize, z: f64) -> Interval {
     if trials == 0 {
         return Interval(0.0, 1.0);
     }
     let n = trials as f64;
     let p = successes as f64 / n;
-    let z2 = Z_95 * Z_95;
+    let z2 = z * z;
     let centre = p + z2 / (2.0 * n);
-    let half = Z_95 * (p * (1.0 - p) / n + z2 / (4.0 * n * n)).sqrt();
+    let half = z * (p * (1.0 - p) / n + z2 / (4.0 * n * n)).sqrt();
     let scale = 1.0 + z2 / n;
     // At 0 and at n successes the limit is exactly 0 or 1; rounding must not move it past the rate.
     let low = if successes == 0 {
@@ -163,39 +176,6 @@ fn standard_error(sum: usize, sum_of_squares: usize, episodes: usize) -> Option<
     Some((n_times_deviations / n / (n - 1.0) / n).sqrt())
 }
 
-/// Percentiles of a set of durations, in microseconds.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Latency {
-    /// Number of durations.
-    pub count: usize,
-    /// Median; `None` without durations, as the next two.
-    pub p50: Option<f64>,
-    /// 99th percentile.
-    pub p99: Option<f64>,
-    /// Largest.
-    pub max: Option<f64>,
-}
-
-impl Latency {
-    /// Percentiles of durations in nanoseconds, by nearest rank: the smallest duration that at least `p` percent do not exceed.
-    pub fn of_ns(durations_ns: &[u64]) -> Self {
-        let mut durations_ns = durations_ns.to_vec();
-        durations_ns.sort_unstable();
-        let at = |percent: usize| {
-            let rank = (durations_ns.len() * percent).div_ceil(100);
-            durations_ns
-                .get(rank.checked_sub(1)?)
-                .map(|&ns| ns as f64 / 1_000.0)
-        };
-        Self {
-            count: durations_ns.len(),
-            p50: at(50),
-            p99: at(99),
-            max: at(100),
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -297,29 +277,5 @@ mod tests {
         );
         assert_eq!(score.k_rate, [None; K_RATES]);
         assert_eq!(score.full_success_interval, Interval(0.0, 1.0));
-    }
-
-    #[test]
-    fn percentiles_are_nearest_rank() {
-        let durations: Vec<u64> = (1..=200).rev().map(|x| x * 1_000).collect();
-        let latency = Latency::of_ns(&durations);
-        assert_eq!(
-            (latency.count, latency.p50, latency.p99, latency.max),
-            (200, Some(100.0), Some(198.0), Some(200.0))
-        );
-        let one = Latency::of_ns(&[1_500]);
-        assert_eq!(
-            (one.p50, one.p99, one.max),
-            (Some(1.5), Some(1.5), Some(1.5))
-        );
-        assert_eq!(
-            Latency::of_ns(&[]),
-            Latency {
-                count: 0,
-                p50: None,
-                p99: None,
-                max: None
-            }
-        );
     }
 }

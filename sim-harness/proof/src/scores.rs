@@ -1,31 +1,17 @@
-//! What `lads-run` reports: rollouts summed up per instruction and per split, and their JSON form (documented in results.schema.json).
+//! Episodes summed up per instruction and per split.
 //!
-//! Invariants: the order is the contract's order of instructions and then of episodes, whatever the thread count; everything but
-//! `latency_us` and `time` depends only on bundle, seed, noise, decision and versions.
+//! Invariants: the order is that of the instructions and then of the episodes. Nothing here can fail.
 
-use std::collections::BTreeMap;
-
-use lads_core::{Contract, Decision, KnownInstruction};
 use serde::{Serialize, Serializer};
 
-use crate::environment::Environment;
-use crate::faults::Faults;
-use crate::fit;
-use crate::metrics::{Latency, Outcome, Rate, Score};
-use crate::plans::Agreement;
-use crate::rollout::{Actor, Episode, Timing};
-
-/// Value of the JSON's `format`.
-pub const FORMAT: &str = "lads-results";
-
-/// Version of the JSON form; changes when a field changes its meaning or goes.
-pub const FORMAT_VERSION: u32 = 1;
+use crate::episode::Episode;
+use crate::metrics::{Outcome, Rate, Score};
 
 /// A sub-task that was completed in an episode.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Completion {
     /// Name of the sub-task.
-    pub sub_task: &'static str,
+    pub sub_task: String,
     /// Control step, counted from 1, after which it held for the first time.
     pub step: usize,
     /// Whether the instruction commands it.
@@ -51,10 +37,23 @@ pub struct Run {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SubTaskRate {
     /// Name of the sub-task.
-    pub sub_task: &'static str,
+    pub sub_task: String,
     /// How often, with a Wilson 95 % interval.
     #[serde(flatten)]
     pub rate: Rate,
+}
+
+/// An instruction, as far as its episodes are judged by it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Asked<'a> {
+    /// Its id in the contract.
+    pub id: &'a str,
+    /// Its text.
+    pub text: &'a str,
+    /// The split it belongs to.
+    pub split: &'a str,
+    /// The sub-tasks that it commands, in its order.
+    pub sub_tasks: Vec<&'a str>,
 }
 
 /// All episodes of one instruction.
@@ -79,27 +78,19 @@ pub struct InstructionResult {
 
 impl InstructionResult {
     /// Sums up the episodes of one instruction; `watched` are the environment's sub-tasks.
-    pub fn new(
-        instruction: &KnownInstruction<'_>,
-        watched: &[&'static str],
-        episodes: &[Episode],
-    ) -> Self {
-        let asked: Vec<&str> = fit::sub_tasks(instruction.sub_tasks).collect();
-        // In the instruction's order, in the environment's names.
-        let commanded = asked
-            .iter()
-            .filter_map(|name| watched.iter().find(|known| *known == name));
-        let commanded: Vec<&'static str> = commanded.copied().collect();
+    pub fn new(instruction: &Asked<'_>, watched: &[&str], episodes: &[Episode]) -> Self {
+        let mut commanded = instruction.sub_tasks.clone();
+        commanded.retain(|name| watched.contains(name));
         let runs: Vec<Run> = episodes
             .iter()
             .enumerate()
             .map(|(number, e)| run(number, e, watched, &commanded))
             .collect();
-        let rate = |sub_task: &'static str| {
+        let rate = |sub_task: &str| {
             let done = |run: &&Run| run.completions.iter().any(|c| c.sub_task == sub_task);
             let count = runs.iter().filter(done).count();
             SubTaskRate {
-                sub_task,
+                sub_task: sub_task.to_owned(),
                 rate: Rate::new(count, runs.len()),
             }
         };
@@ -120,11 +111,11 @@ impl InstructionResult {
 }
 
 /// One episode in the environment's names.
-fn run(number: usize, episode: &Episode, watched: &[&'static str], commanded: &[&str]) -> Run {
-    let named = |completion: &crate::environment::Completion| {
+fn run(number: usize, episode: &Episode, watched: &[&str], commanded: &[&str]) -> Run {
+    let named = |completion: &crate::episode::Completion| {
         let &sub_task = watched.get(completion.sub_task)?;
         Some(Completion {
-            sub_task,
+            sub_task: sub_task.to_owned(),
             step: completion.step,
             commanded: commanded.contains(&sub_task),
         })
@@ -178,11 +169,7 @@ pub struct Splits(pub Vec<(String, SplitResult)>);
 
 impl Splits {
     /// Sums up all episodes of each split in `names`; `watched` are the environment's sub-tasks.
-    pub fn of(
-        names: &[String],
-        instructions: &[InstructionResult],
-        watched: &[&'static str],
-    ) -> Self {
+    pub fn of(names: &[String], instructions: &[InstructionResult], watched: &[&str]) -> Self {
         let of_split = |name: &String| {
             let own = instructions.iter().filter(|result| result.split == *name);
             let own: Vec<_> = own.collect();
@@ -204,20 +191,9 @@ impl Serialize for Splits {
     }
 }
 
-/// The names of the contract's splits, in the order in which its instructions first name them.
-pub fn split_names(contract: &Contract<'_>) -> Vec<String> {
-    let mut names: Vec<String> = Vec::new();
-    for known in contract.instructions() {
-        if !names.iter().any(|name| name == known.split) {
-            names.push(known.split.to_owned());
-        }
-    }
-    names
-}
-
 impl SplitResult {
-    fn of(instructions: &[&InstructionResult], watched: &[&'static str]) -> Self {
-        let rate = |sub_task: &'static str, commanded: bool| {
+    fn of(instructions: &[&InstructionResult], watched: &[&str]) -> Self {
+        let rate = |sub_task: &str, commanded: bool| {
             let commands = |result: &&InstructionResult| {
                 result.completions.iter().any(|c| c.sub_task == sub_task) == commanded
             };
@@ -229,7 +205,7 @@ impl SplitResult {
             let done = |run: &&Run| run.completions.iter().any(|c| c.sub_task == sub_task);
             let count = runs.clone().filter(done).count();
             SubTaskRate {
-                sub_task,
+                sub_task: sub_task.to_owned(),
                 rate: Rate::new(count, runs.count()),
             }
         };
@@ -242,208 +218,6 @@ impl SplitResult {
     }
 }
 
-/// Latency of the controller, in microseconds, by the kind of call.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct LatencyByKind {
-    /// Control steps that keep the plan.
-    pub ordinary: Latency,
-    /// Control steps that decide a new plan, every horizon.
-    pub decision: Latency,
-    /// Setting an instruction, which runs its words through the high level.
-    pub instruct: Latency,
-}
-
-impl LatencyByKind {
-    /// Percentiles of all calls.
-    pub fn of(timing: &Timing) -> Self {
-        Self {
-            ordinary: Latency::of_ns(&timing.ordinary_ns),
-            decision: Latency::of_ns(&timing.decision_ns),
-            instruct: Latency::of_ns(&timing.instruct_ns),
-        }
-    }
-}
-
-/// Where the time went; CPU times are summed over the threads and do not depend on what else the machine does.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct TimeUse {
-    /// Wall time from the first episode to the last, in seconds.
-    pub wall_s: f64,
-    /// Threads that ran episodes.
-    pub threads: usize,
-    /// CPU time inside episodes, in seconds.
-    pub episodes_cpu_s: f64,
-    /// CPU time inside the environment's reset and step, in seconds: physics but for noise and task checks.
-    pub simulator_cpu_s: f64,
-    /// CPU time inside the controller, in seconds.
-    pub controller_cpu_s: f64,
-    /// `simulator_cpu_s` over `episodes_cpu_s`; `None` without episodes.
-    pub simulator_share: Option<f64>,
-}
-
-impl TimeUse {
-    /// Sums up what was measured.
-    pub fn of(timing: &Timing, wall: std::time::Duration, threads: usize) -> Self {
-        let (simulator_cpu_s, episodes_cpu_s) = (
-            timing.simulator_cpu.as_secs_f64(),
-            timing.episodes_cpu.as_secs_f64(),
-        );
-        Self {
-            wall_s: wall.as_secs_f64(),
-            threads,
-            episodes_cpu_s,
-            simulator_cpu_s,
-            controller_cpu_s: timing.controller_cpu.as_secs_f64(),
-            simulator_share: (episodes_cpu_s > 0.0).then(|| simulator_cpu_s / episodes_cpu_s),
-        }
-    }
-}
-
-/// How plans were chosen.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct DecisionUsed {
-    /// `argmax` or `sample`; `uniform` where actions were drawn at random and no plan was chosen.
-    pub rule: &'static str,
-    /// Temperature of the softmax that is sampled; `None` for argmax.
-    pub temperature: Option<f32>,
-}
-
-impl DecisionUsed {
-    /// How the actions came about.
-    pub fn of(decision: Decision, actor: Actor) -> Self {
-        match actor {
-            Actor::Policy => decision.into(),
-            Actor::Uniform => Self {
-                rule: "uniform",
-                temperature: None,
-            },
-        }
-    }
-}
-
-impl From<Decision> for DecisionUsed {
-    fn from(decision: Decision) -> Self {
-        match decision {
-            Decision::Argmax => Self {
-                rule: "argmax",
-                temperature: None,
-            },
-            Decision::Sample { temperature, .. } => Self {
-                rule: "sample",
-                temperature: Some(temperature),
-            },
-        }
-    }
-}
-
-/// Which environment the rollouts ran in.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct EnvironmentUsed {
-    /// The contract's environment id.
-    pub id: &'static str,
-    /// Its version.
-    pub version: &'static str,
-    /// Control period, in seconds.
-    pub control_period_s: f64,
-    /// Longest episode, in control steps.
-    pub max_steps: usize,
-}
-
-impl EnvironmentUsed {
-    /// The environment, with the longest of the splits' episodes.
-    pub fn new(environment: &dyn Environment, splits: &[String]) -> Self {
-        let steps = splits.iter().map(|split| environment.max_steps(split));
-        Self {
-            id: environment.id(),
-            version: environment.version(),
-            control_period_s: environment.control_period_s(),
-            max_steps: steps.max().unwrap_or(0),
-        }
-    }
-}
-
-/// What a sentence outside the table is most like.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct NearestKnown {
-    /// Id of the known instruction.
-    pub id: String,
-    /// Its text.
-    pub text: String,
-    /// Similarity of the sentence to it, from -1 to 1.
-    pub similarity: f32,
-    /// Similarity from which on the bundle follows a sentence; `None` where its contract does not say.
-    pub threshold: Option<f32>,
-    /// Whether the bundle accepts the sentence; if not, the caller insisted.
-    pub accepted: bool,
-}
-
-/// Who made the word embeddings, where they are not the bundle's own.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct HeardBy {
-    /// Name of the language encoder.
-    pub encoder: String,
-    /// SHA-256 of its weights, in hexadecimal digits.
-    pub sha256: String,
-    /// Largest difference of an element from the bundle's table; `None` for a sentence outside it.
-    pub largest_difference: Option<f32>,
-    /// What a sentence outside the table is most like; left out for known instructions.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub nearest: Option<NearestKnown>,
-}
-
-/// The whole report of one `lads-run`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Results {
-    /// [`FORMAT`].
-    pub format: &'static str,
-    /// [`FORMAT_VERSION`].
-    pub format_version: u32,
-    /// Environment of the rollouts.
-    pub environment: EnvironmentUsed,
-    /// SHA-256 of the bundle file, in hexadecimal digits.
-    pub bundle_sha256: String,
-    /// SHA-256 of the program image that ran.
-    pub image_sha256: String,
-    /// Seed of all random streams.
-    pub seed: u64,
-    /// Noise level of the environment.
-    pub noise: String,
-    /// How plans were chosen.
-    pub decision: DecisionUsed,
-    /// Episodes asked for per instruction.
-    pub episodes_per_instruction: u32,
-    /// Who made the word embeddings; left out where they are the bundle's own.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub heard_by: Option<HeardBy>,
-    /// What was wrong between policy and environment; left out without faults.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub faults: Option<Faults>,
-    /// Whether the low level ran alone on given plans; left out where the policy decided.
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
-    pub plans_commanded: bool,
-    /// Plans in force against plans encoded from what was executed; left out where not asked for.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub plan_agreement: Option<Agreement>,
-    /// Versions of what the numbers depend on, by name.
-    pub versions: BTreeMap<&'static str, String>,
-    /// Scores by split.
-    pub splits: Splits,
-    /// Results by instruction, in the contract's order.
-    pub instructions: Vec<InstructionResult>,
-    /// Latency of the controller.
-    pub latency_us: LatencyByKind,
-    /// Where the time went.
-    pub time: TimeUse,
-}
-
-/// Versions of what the numbers depend on besides the bundle, by name.
-pub fn versions() -> BTreeMap<&'static str, String> {
-    BTreeMap::from([
-        ("lads-sim", env!("CARGO_PKG_VERSION").to_owned()),
-        ("mujoco", mujoco_rs::mujoco_version().to_owned()),
-    ])
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -451,7 +225,7 @@ mod tests {
     const WATCHED: [&str; 5] = ["a", "b", "c", "d", "e"];
 
     fn episode(success: bool, done: &[(usize, usize)]) -> Episode {
-        let completion = |&(sub_task, step)| crate::environment::Completion { sub_task, step };
+        let completion = |&(sub_task, step)| crate::episode::Completion { sub_task, step };
         Episode {
             steps: 280,
             success,
@@ -462,12 +236,11 @@ mod tests {
     }
 
     fn two_instructions() -> [InstructionResult; 2] {
-        let known = |id, sub_tasks, split| KnownInstruction {
+        let known = |id, sub_tasks: &'static str, split| Asked {
             id,
             text: "t",
-            sub_tasks,
             split,
-            words: &[],
+            sub_tasks: sub_tasks.split(',').collect(),
         };
         let first = [
             episode(true, &[(0, 3), (1, 9), (4, 11), (2, 20), (3, 30)]),
@@ -475,7 +248,7 @@ mod tests {
         ];
         let second = [episode(false, &[(0, 2), (3, 8)])];
         [
-            InstructionResult::new(&known("dcba", "d, c, b, a", "seen"), &WATCHED, &first),
+            InstructionResult::new(&known("dcba", "d,c,b,a", "seen"), &WATCHED, &first),
             InstructionResult::new(&known("eabc", "e,a,b,c", "unseen"), &WATCHED, &second),
         ]
     }
@@ -489,7 +262,7 @@ mod tests {
     fn counts(rates: &[SubTaskRate]) -> Vec<(&str, usize)> {
         rates
             .iter()
-            .map(|rate| (rate.sub_task, rate.rate.count))
+            .map(|rate| (rate.sub_task.as_str(), rate.rate.count))
             .collect()
     }
 
@@ -517,7 +290,7 @@ mod tests {
         let order: Vec<_> = first.runs[0]
             .completions
             .iter()
-            .map(|c| (c.sub_task, c.commanded))
+            .map(|c| (c.sub_task.as_str(), c.commanded))
             .collect();
         assert_eq!(
             order,

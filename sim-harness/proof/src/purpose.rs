@@ -4,11 +4,13 @@
 //! their code points, `[value ...]`, texts as `"bytes:UTF-8`, numbers as the 16 hexadecimal digits of their IEEE 754 double, `true`,
 //! `false` and `null`, no separators. What can fail: text that is no JSON object.
 
-use lads_compiler::sha256 as digest;
+use std::fmt::Write as _;
+
 use serde_json::Value;
+use sha2::{Digest as _, Sha256};
 
 /// The parts of a contract that say what a policy is for; the others say how it is built.
-const PURPOSE: [&str; 7] = [
+const PURPOSE: [&str; 9] = [
     "environment",
     "control_period_s",
     "observation",
@@ -16,7 +18,12 @@ const PURPOSE: [&str; 7] = [
     "quaternion_order",
     "instructions",
     "language",
+    "channels",
+    "evaluation",
 ];
+
+/// The channels that the environment gives and takes; the others are the policy's own.
+const ROLES: [&str; 2] = ["observation", "action"];
 
 /// The hash of a contract's purpose, hexadecimal; `None` for what is no JSON object.
 pub fn sha256(contract: &str) -> Option<String> {
@@ -24,9 +31,39 @@ pub fn sha256(contract: &str) -> Option<String> {
     let all = contract.as_object()?;
     let purpose = PURPOSE
         .iter()
-        .filter_map(|&key| Some((key.to_owned(), all.get(key)?.clone())))
+        .filter_map(|&key| Some((key.to_owned(), part(key, all.get(key)?))))
         .collect();
     Some(digest(canonical(&Value::Object(purpose)).as_bytes()))
+}
+
+/// What of a part counts: of the channels those of the environment, of the language what makes words of a sentence, and not which
+/// sentences are refused.
+fn part(key: &str, value: &Value) -> Value {
+    let mut value = value.clone();
+    match (key, &mut value) {
+        ("channels", Value::Array(channels)) => {
+            channels.retain(|channel| {
+                channel["role"]
+                    .as_str()
+                    .is_some_and(|role| ROLES.contains(&role))
+            });
+        }
+        ("language", Value::Object(language)) => {
+            language.remove("acceptance");
+        }
+        _ => {}
+    }
+    value
+}
+
+/// SHA-256 of bytes, hexadecimal.
+fn digest(bytes: &[u8]) -> String {
+    Sha256::digest(bytes)
+        .iter()
+        .fold(String::new(), |mut text, byte| {
+            let _ = write!(text, "{byte:02x}");
+            text
+        })
 }
 
 fn canonical(value: &Value) -> String {

@@ -9,17 +9,16 @@ use std::path::{Path, PathBuf};
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use lads_compiler::Bundle;
 use serde::Deserialize;
+use serde_json::Value;
 use thiserror::Error;
 
 use super::purpose;
-use crate::environment::Environment;
 
 /// Value of the JSON's `format`.
 const FORMAT: &str = "lads-reference";
-/// Version of the JSON form that is read.
-const FORMAT_VERSION: u32 = 1;
+/// Versions of the JSON form that are read. The first records neither contract nor logits, so that less can be proved by it.
+const FORMAT_VERSIONS: [u32; 2] = [1, 2];
 
 /// Why a reference is refused.
 #[derive(Debug, Error)]
@@ -79,6 +78,12 @@ pub struct Reference {
     pub weights_from: String,
     /// Where the embeddings of the words came from.
     pub words_from: String,
+    /// The contract that was rolled out; `None` in files of version 1.
+    pub contract: Option<Value>,
+    /// Where the weights behind the recorded logits came from, if they were added later.
+    pub logits_from: Option<String>,
+    /// What float noise does to the reference itself.
+    pub float_noise: Option<FloatNoise>,
     /// Versions of everything that took part.
     pub versions: std::collections::BTreeMap<String, String>,
     /// In the contract's order.
@@ -91,6 +96,17 @@ pub struct Reference {
 struct EnvironmentUsed {
     id: String,
     version: String,
+}
+
+/// What small noise on all weights of the reference does to its own answers to the traced questions: the largest differences.
+#[derive(Debug, Clone, Copy, Default, Deserialize)]
+pub struct FloatNoise {
+    /// Standard deviation of the noise, relative to each weight.
+    pub relative: f64,
+    /// Of an action element.
+    pub action: f64,
+    /// Of a logit, up to a constant.
+    pub logit: f64,
 }
 
 /// All episodes of one instruction.
@@ -117,6 +133,8 @@ pub struct Episode {
     pub completions: Vec<Completion>,
     /// Plan indices in the order in which they were decided.
     pub plans: Vec<u32>,
+    /// The control steps at which they were decided; left out where there is one in each horizon from the episode's start.
+    pub decided_at: Option<Vec<usize>>,
     /// Largest logit minus second largest, of each decision.
     pub margins: Vec<f64>,
     /// Noise-free state after the last step.
@@ -136,7 +154,7 @@ pub struct Completion {
 
 /// An episode step by step.
 #[derive(Debug, Deserialize)]
-#[serde(try_from = "Encoded")]
+#[serde(try_from = "Written")]
 pub struct Trace {
     /// What the policy saw, `[steps, O]`.
     pub observations: Vec<f32>,
@@ -144,23 +162,46 @@ pub struct Trace {
     pub actions: Vec<f32>,
     /// Noise-free states before the first steps' actions, `[n, O]`.
     pub states: Vec<f64>,
+    /// Logits of each decision, `[decisions, M]`; empty where none were recorded.
+    pub logits: Vec<f32>,
+    /// The plan that the trajectory encoder sees in each full horizon.
+    pub encoded: Option<Vec<u32>>,
+    /// How much farther the second nearest code was, relative to the nearest's squared distance.
+    pub encoded_margins: Option<Vec<f64>>,
 }
 
 #[derive(Deserialize)]
-struct Encoded {
+struct Written {
     observations: String,
     actions: String,
     states: String,
+    #[serde(default)]
+    logits: String,
+    encoded: Option<Vec<u32>>,
+    encoded_margins: Option<Vec<f64>>,
 }
 
-impl TryFrom<Encoded> for Trace {
+impl Trace {
+    /// The logits of one of `decisions` decisions; empty where none were recorded.
+    pub fn logits_of(&self, number: usize, decisions: usize) -> &[f32] {
+        let len = self.logits.len() / decisions.max(1);
+        self.logits
+            .get(number * len..(number + 1) * len)
+            .unwrap_or_default()
+    }
+}
+
+impl TryFrom<Written> for Trace {
     type Error = String;
 
-    fn try_from(encoded: Encoded) -> Result<Self, String> {
+    fn try_from(written: Written) -> Result<Self, String> {
         Ok(Self {
-            observations: numbers(&encoded.observations, f32::from_le_bytes)?,
-            actions: numbers(&encoded.actions, f32::from_le_bytes)?,
-            states: numbers(&encoded.states, f64::from_le_bytes)?,
+            observations: numbers(&written.observations, f32::from_le_bytes)?,
+            actions: numbers(&written.actions, f32::from_le_bytes)?,
+            states: numbers(&written.states, f64::from_le_bytes)?,
+            logits: numbers(&written.logits, f32::from_le_bytes)?,
+            encoded: written.encoded,
+            encoded_margins: written.encoded_margins,
         })
     }
 }
@@ -177,6 +218,23 @@ fn numbers<T, const N: usize>(text: &str, read: fn([u8; N]) -> T) -> Result<Vec<
     }
 }
 
+/// What is to be verified, as far as a reference must be of the same.
+#[derive(Debug, Clone)]
+pub struct Subject<'s> {
+    /// The contract as JSON, as it stands in the bundle.
+    pub contract: &'s str,
+    /// Texts of the contract's instructions.
+    pub instructions: Vec<&'s str>,
+    /// Id of the environment.
+    pub environment_id: &'s str,
+    /// The environment's version.
+    pub environment_version: &'s str,
+    /// Elements of its observations.
+    pub observation_len: usize,
+    /// Elements of its actions.
+    pub action_len: usize,
+}
+
 impl Reference {
     /// Reads and checks a file.
     pub fn open(path: &Path) -> Result<Self, ReferenceError> {
@@ -184,16 +242,21 @@ impl Reference {
             path: path.into(),
             source,
         })?;
+        Self::read(&bytes, path)
+    }
+
+    /// Reads and checks the bytes of a file; `path` names it where they are refused.
+    pub fn read(bytes: &[u8], path: &Path) -> Result<Self, ReferenceError> {
         let content = |problem: String| ReferenceError::Content {
             path: path.into(),
             problem,
         };
-        let mut read: Self = serde_json::from_slice(&bytes)
+        let mut read: Self = serde_json::from_slice(bytes)
             .map_err(|error| content(format!("not a reference of lads ({error})")))?;
         path.clone_into(&mut read.path);
-        if read.format != FORMAT || read.format_version != FORMAT_VERSION {
+        if read.format != FORMAT || !FORMAT_VERSIONS.contains(&read.format_version) {
             return Err(content(format!(
-                "its format is {} {}, this program reads {FORMAT} {FORMAT_VERSION}",
+                "its format is {} {}, this program reads {FORMAT} 1 and 2",
                 read.format, read.format_version
             )));
         }
@@ -211,27 +274,42 @@ impl Reference {
                 return wrong("its number of episodes is not the heading's");
             }
             for (number, episode) in (0..).zip(&instruction.episodes) {
-                let decisions = episode.steps.div_ceil(self.horizon);
+                let decisions = self.decided_at(episode);
+                let in_order = decisions.is_sorted()
+                    && decisions.last().is_none_or(|&last| last < episode.steps);
+                let logits = episode.trace.as_ref().map_or(0, |trace| trace.logits.len());
                 let traced = number < u64::from(self.traced_episodes);
                 if episode.number != number || episode.trace.is_some() != traced {
                     return wrong(
                         "its episodes are not in order, or not traced as the heading says",
                     );
                 }
-                if episode.plans.len() != decisions || episode.margins.len() != decisions {
-                    return wrong("its plans are not one per horizon");
+                if episode.plans.len() != decisions.len()
+                    || episode.margins.len() != decisions.len()
+                    || !in_order
+                {
+                    return wrong("its plans are not one per decision");
+                }
+                if !logits.is_multiple_of(decisions.len().max(1)) {
+                    return wrong(
+                        "the logits of a trace are not the same number for each decision",
+                    );
                 }
             }
         }
         Ok(())
     }
 
-    /// Refuses a reference of another environment, of other instructions, or of a policy for something else than this bundle's.
-    pub fn check(
-        &self,
-        bundle: &Bundle,
-        environment: &dyn Environment,
-    ) -> Result<(), ReferenceError> {
+    /// The control steps at which the plans of an episode were decided.
+    pub fn decided_at(&self, episode: &Episode) -> Vec<usize> {
+        let grid = || (0..episode.steps).step_by(self.horizon.max(1)).collect();
+        episode.decided_at.clone().unwrap_or_else(grid)
+    }
+
+    /// Refuses a reference of another environment, of other instructions, or of a policy for something else than this bundle's. Where the
+    /// reference records its contract, that is compared field by field by the certificate, and only what would leave nothing to
+    /// compare is refused here.
+    pub fn check(&self, subject: &Subject<'_>) -> Result<(), ReferenceError> {
         let same = |field, reference: &str, whose, other: &str| {
             if reference == other {
                 return Ok(());
@@ -245,15 +323,20 @@ impl Reference {
             })
         };
         let used = &self.environment;
-        same("environment", &used.id, "the bundle's", environment.id())?;
-        let version = environment.version();
+        same(
+            "environment",
+            &used.id,
+            "the bundle's",
+            subject.environment_id,
+        )?;
+        let version = subject.environment_version;
         same(
             "environment version",
             &used.version,
             "the simulator's",
             version,
         )?;
-        let known = &bundle.contract().instructions;
+        let known = &subject.instructions;
         let texts = |list: Vec<&str>| list.join("; ");
         let ours = texts(
             self.instructions
@@ -261,27 +344,23 @@ impl Reference {
                 .map(|row| row.text.as_str())
                 .collect(),
         );
-        let theirs = texts(known.iter().map(|row| row.text.as_str()).collect());
+        let theirs = texts(known.clone());
         if ours != theirs {
             let place = self.instructions.iter().zip(known);
-            let differ = place.into_iter().find(|(a, b)| a.text != b.text);
+            let differ = place.into_iter().find(|(a, b)| a.text != **b);
             let (a, b) = differ.map_or(
                 (self.instructions.len().to_string(), known.len().to_string()),
-                |(a, b)| (a.text.clone(), b.text.clone()),
+                |(a, b)| (a.text.clone(), (*b).to_owned()),
             );
             same("instruction list", &a, "the bundle's", &b)?;
         }
-        let purpose = bundle
-            .metadata("lads.contract")
-            .and_then(purpose::sha256)
-            .unwrap_or_default();
-        same(
-            "contract hash",
-            &self.purpose_sha256,
-            "the bundle's",
-            &purpose,
-        )?;
-        let lens = (environment.observation_len(), environment.action_len());
+        let (whose, contract) = match &self.contract {
+            None => ("the bundle's", subject.contract.to_owned()),
+            Some(recorded) => ("its own contract's", recorded.to_string()),
+        };
+        let purpose = purpose::sha256(&contract).unwrap_or_default();
+        same("contract hash", &self.purpose_sha256, whose, &purpose)?;
+        let lens = (subject.observation_len, subject.action_len);
         for episode in self.instructions.iter().flat_map(|row| &row.episodes) {
             if episode.final_state.len() != lens.0 {
                 return Err(ReferenceError::Content {

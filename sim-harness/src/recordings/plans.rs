@@ -12,8 +12,9 @@ use lads_core::{Contract, EncodeError, Policy};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::metrics::{Interval, wilson};
 use crate::trace::{Step, Trace};
+use lads_proof::metrics::wilson;
+pub use lads_proof::results::Agreement;
 
 /// Value of the file's `format`.
 pub const FORMAT: &str = "lads-plans";
@@ -201,19 +202,6 @@ pub fn encode<'t>(
             whole.chain(tail).map(&mut of_segment).collect()
         })
         .collect()
-}
-
-/// How often the encoder sees, in what was executed, the plan that was in force.
-#[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub struct Agreement {
-    /// Segments encoded as their plan.
-    pub agreed: usize,
-    /// Segments in all: full horizons.
-    pub segments: usize,
-    /// Wilson 95 % interval of their share.
-    pub interval: Option<Interval>,
-    /// For each plan that was in force, ascending: which plans its segments were encoded as, and how often.
-    pub encoded_as: BTreeMap<u32, BTreeMap<u32, usize>>,
 }
 
 /// Encodes every executed segment and compares with the plan that was in force.
