@@ -5,6 +5,7 @@ import hashlib
 import sys
 from pathlib import Path
 
+from . import output
 from .config import UserError
 
 
@@ -17,6 +18,7 @@ def _encode(setting):
 def _random(arguments):
     from . import bundle, config, random_policy
 
+    output.check_apart([arguments.config], [arguments.output])
     setting = config.load(arguments.config)
     _, model = random_policy.export(setting, _encode(setting), arguments.seed)
     print(f"{arguments.output}: random weights, sha256 {bundle.save(model, arguments.output)}")
@@ -55,8 +57,16 @@ def _train(arguments):
     return 0
 
 
+def _check_card(arguments, more):
+    """Refuses a bundle or card in the place of something that the card is made from."""
+    path = Path(arguments.output)
+    results = [pair.rpartition("=")[2] for pair in arguments.beside]
+    read = [arguments.results, *results, path.with_suffix(".notes.md")]
+    output.check_apart(read, [*more, path.with_suffix(".md")])
+
+
 def _card(arguments, saved, sha256):
-    from . import bundle, card
+    from . import card
 
     beside = []
     for pair in arguments.beside:
@@ -68,7 +78,7 @@ def _card(arguments, saved, sha256):
     path = Path(arguments.output).with_suffix(".md")
     notes = Path(arguments.output).with_suffix(".notes.md")
     notes = notes.read_text(encoding="utf-8") if notes.is_file() else ""
-    bundle.write_atomically(path, card.write(arguments.run, saved, sha256, results, beside, notes).encode())
+    output.write_atomically(path, card.write(arguments.run, saved, sha256, results, beside, notes).encode())
     print(f"{path}: model card")
 
 
@@ -76,6 +86,7 @@ def _export(arguments):
     from . import bundle, training
     from .model import Lads
 
+    _check_card(arguments, [arguments.output])
     saved, setting = training.load_run(arguments.run)
     encoded = _encode(setting)
     identity = saved["identity"]
@@ -98,6 +109,7 @@ def _export(arguments):
 def _card_alone(arguments):
     from . import training
 
+    _check_card(arguments, [])
     saved, _ = training.load_run(arguments.run)
     if not Path(arguments.output).is_file():
         raise UserError(f"no bundle at {arguments.output}; export one first (make export)")
@@ -107,6 +119,7 @@ def _card_alone(arguments):
 def _reference(arguments):
     from . import reference
 
+    output.check_apart([arguments.model], [arguments.output, f"{arguments.output}.progress"])
     chosen = {key: getattr(arguments, key) for key in ("run", "episodes", "traced", "seed", "noise")}
     reference.write(arguments.model, arguments.output, **chosen)
     print(f"{arguments.output}: written; next: lads-run --model {arguments.model} --verify {arguments.output}")

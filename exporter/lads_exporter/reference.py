@@ -25,7 +25,7 @@ import torch
 from tqdm import tqdm
 
 from . import __version__, config, language, official, weights
-from .bundle import write_atomically
+from .output import write_atomically
 
 FORMAT, FORMAT_VERSION = "lads-reference", 1
 TRACED_STATES = 50

@@ -180,7 +180,7 @@ fn numbers<T, const N: usize>(text: &str, read: fn([u8; N]) -> T) -> Result<Vec<
 impl Reference {
     /// Reads and checks a file.
     pub fn open(path: &Path) -> Result<Self, ReferenceError> {
-        let bytes = std::fs::read(path).map_err(|source| ReferenceError::File {
+        let bytes = lads_host::input::read(path).map_err(|source| ReferenceError::File {
             path: path.into(),
             source,
         })?;

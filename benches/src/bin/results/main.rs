@@ -158,7 +158,7 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
     let preparation = preparation(&bytes, &opened, &images, effort)?;
     say("first steps of fresh processes");
     let image_file = arguments.scratch.join("kitchen.lads");
-    std::fs::write(&image_file, images[0].1.as_bytes())
+    lads_host::output::write(&image_file, images[0].1.as_bytes())
         .map_err(|error| about(image_file.display(), error))?;
     let cold = cold::measure(&image_file, effort.processes)?;
 
@@ -332,7 +332,8 @@ fn export_recompute(
     let content = json!({
         "instruction": episode.instruction, "observations": observations, "actions": actions.collect::<Vec<_>>(),
     });
-    std::fs::write(&file, content.to_string()).map_err(|error| about(file.display(), error))?;
+    lads_host::output::write(&file, content.to_string().as_bytes())
+        .map_err(|error| about(file.display(), error))?;
     let model = arguments.scratch.join("recompute.onnx");
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/recompute.py");
     let done = Command::new(&arguments.python)
