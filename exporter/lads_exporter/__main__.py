@@ -16,12 +16,22 @@ def _encode(setting):
 
 
 def _random(arguments):
-    from . import bundle, config, random_policy
+    from . import bundle, config, kinds, random_policy
 
-    output.check_apart([arguments.config], [arguments.output])
-    setting = config.load(arguments.config)
-    _, model = random_policy.export(setting, _encode(setting), arguments.seed)
+    output.check_apart([] if arguments.kind else [arguments.config], [arguments.output])
+    if arguments.kind:
+        _, model = kinds.export(arguments.kind, arguments.seed)
+    else:
+        setting = config.load(arguments.config)
+        _, model = random_policy.export(setting, _encode(setting), arguments.seed)
     print(f"{arguments.output}: random weights, sha256 {bundle.save(model, arguments.output)}")
+
+
+def _episode(arguments):
+    from . import episode
+
+    margin = episode.write(arguments.model, arguments.output, arguments.steps, arguments.seed)
+    print(f"{arguments.output}: {arguments.steps} steps, selections with a margin of {margin:.4g}")
 
 
 def _growth(arguments):
@@ -66,7 +76,7 @@ def _check_card(arguments, more):
 
 
 def _card(arguments, saved, sha256):
-    from . import card
+    from . import acceptance, card
 
     beside = []
     for pair in arguments.beside:
@@ -78,12 +88,12 @@ def _card(arguments, saved, sha256):
     path = Path(arguments.output).with_suffix(".md")
     notes = Path(arguments.output).with_suffix(".notes.md")
     notes = notes.read_text(encoding="utf-8") if notes.is_file() else ""
-    output.write_atomically(path, card.write(arguments.run, saved, sha256, results, beside, notes).encode())
+    output.write_atomically(path, card.write(arguments.run, saved, sha256, results, beside, notes, acceptance.beside(arguments.output)).encode())
     print(f"{path}: model card")
 
 
 def _export(arguments):
-    from . import bundle, training
+    from . import acceptance, bundle, training
     from .model import Lads
 
     _check_card(arguments, [arguments.output])
@@ -101,7 +111,11 @@ def _export(arguments):
         "steps": {name: getattr(setting.config.training, name).steps for name in names},
     }
     candidates = ((instruction, observations.numpy()) for instruction, observations in saved["golden"])
-    sha256 = bundle.save(bundle.assemble(lads, setting, encoded, provenance, candidates), arguments.output)
+    model = bundle.assemble(lads, setting, encoded, provenance, candidates)
+    calibrated = acceptance.beside(arguments.output)
+    if calibrated:
+        acceptance.into(model, calibrated)
+    sha256 = bundle.save(model, arguments.output)
     print(f"{arguments.output}: sha256 {sha256}")
     _card(arguments, saved, sha256)
 
@@ -125,6 +139,12 @@ def _reference(arguments):
     print(f"{arguments.output}: written; next: lads-run --model {arguments.model} --verify {arguments.output}")
 
 
+def _upgrade(arguments):
+    from . import upgrade
+
+    print(upgrade.write(arguments.model, arguments.output, arguments.environment))
+
+
 def _language(arguments):
     from . import language_graph
 
@@ -132,15 +152,34 @@ def _language(arguments):
     print(f"{folder}: {'written' if language_graph.write(arguments.encoder, folder) else 'up to date'}")
 
 
+def _calibrate(arguments):
+    from . import acceptance, config
+
+    setting = config.load(arguments.config)
+    calibrated = acceptance.calibrate(setting, acceptance.read_sentences(config.find(arguments.sentences), setting))
+    acceptance.write(calibrated, arguments.output)
+    print("\n".join(acceptance.lines(calibrated)))
+    print(f"{arguments.output}: written")
+
+
 def _parser():
     parser = argparse.ArgumentParser(prog="python -m lads_exporter", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     random = commands.add_parser("random", help="a bundle with random weights, for tests")
-    random.add_argument("--config", required=True)
+    network = random.add_mutually_exclusive_group(required=True)
+    network.add_argument("--config", help="a LADS policy of this configuration")
+    network.add_argument("--kind", help="a small policy of this kind: lads, lang_dt, lisa, vae, lcsd, skilldiffuser, history, plain, recurrent, stacked")
     random.add_argument("-o", "--output", required=True)
     random.add_argument("--seed", type=int, default=0)
     random.set_defaults(run_command=_random)
+
+    episode = commands.add_parser("episode", help="a made-up episode of a bundle and what it does there, for tests of the runtime")
+    episode.add_argument("model", metavar="MODEL", help="the bundle")
+    episode.add_argument("-o", "--output", required=True, help="the .safetensors file; lads_exporter/episode.py says what is in it")
+    episode.add_argument("--steps", type=int, default=200)
+    episode.add_argument("--seed", type=int, default=0)
+    episode.set_defaults(run_command=_episode)
 
     growth = commands.add_parser("growth", help="random bundles in which one dimension grows, for the benchmarks")
     growth.add_argument("--config", required=True, help="the sizes of everything else")
@@ -177,10 +216,22 @@ def _parser():
     rollouts.add_argument("--noise", default="v0", help="observation noise: v0, v1 or none")
     rollouts.set_defaults(run_command=_reference)
 
+    upgraded = commands.add_parser("upgrade", help="a bundle of contract version 1 to version 2; graphs and weights stay as they are")
+    upgraded.add_argument("model", metavar="MODEL", help="the bundle")
+    upgraded.add_argument("-o", "--output", help="the file to write; left out, MODEL and what names its sha256 beside it")
+    upgraded.add_argument("--environment", metavar="FILE", help="says what an action means; left out, the one in exporter/configs of the bundle's environment")
+    upgraded.set_defaults(run_command=_upgrade)
+
     spoken = commands.add_parser("language", help="the language encoder as ONNX, so that lads-run takes any sentence")
     spoken.add_argument("--encoder", default="all-MiniLM-L6-v2", help="as in a config's language.encoder (all-MiniLM-L6-v2)")
     spoken.add_argument("-o", "--output", help="the folder; left out, language/ENCODER in $LADS_CACHE, else in the user's cache folder")
     spoken.set_defaults(run_command=_language)
+
+    calibrate = commands.add_parser("calibrate", help="how like a known instruction a free sentence must be to be followed")
+    calibrate.add_argument("--config", required=True, help="the policy's configuration")
+    calibrate.add_argument("--sentences", required=True, help="sentences that ask for what the policy knows, and others: configs/*.sentences.json")
+    calibrate.add_argument("-o", "--output", required=True, help="models/NAME.acceptance.json; `export` takes the one beside the bundle")
+    calibrate.set_defaults(run_command=_calibrate)
     return parser
 
 

@@ -36,6 +36,8 @@ pub enum Instruction<'w> {
     /// Number of an instruction in the contract.
     Id(u32),
     /// Word embeddings, `[n, word_dim]` with `n` from 1 to the contract's `words_len`.
+    ///
+    /// Any are followed, of nonsense too: [`similarity::nearest`](crate::similarity::nearest) says what they are like before that.
     Words(&'w [f32]),
 }
 

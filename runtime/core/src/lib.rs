@@ -65,6 +65,7 @@ mod policy;
 mod run;
 mod schedule;
 mod self_test;
+pub mod similarity;
 mod workspace;
 
 pub use contract::{

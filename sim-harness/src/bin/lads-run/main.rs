@@ -149,6 +149,8 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
     }
     let recording = record::prepare(files, &evaluation, &open)?;
     let viewer = viewer::prepare(arguments, &evaluation, &open)?;
+    // Before the policy moves anything.
+    print(&heard.first)?;
     let bench = Bench {
         evaluation,
         open: &open,
@@ -198,7 +200,7 @@ struct Bench<'b> {
     open: &'b registry::Opener,
     environment: &'b dyn Environment,
     noise: &'b str,
-    heard: &'b Heard,
+    heard: &'b Heard<'b>,
     stop: &'b AtomicBool,
 }
 
@@ -336,7 +338,7 @@ impl Bench<'_> {
             report::write(&page, path)?;
         }
         print(&Table(&results))?;
-        print(&self.heard.note)?;
+        print(&self.heard.last(&results))?;
         if let Some(agreement) = &results.plan_agreement {
             print(&recordings::agreement(agreement))?;
         }
