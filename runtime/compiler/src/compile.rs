@@ -15,7 +15,6 @@ use crate::graph::Dim;
 use crate::image::{self, Image, Parts};
 use crate::import::Model;
 use crate::lower::{Cache, Weights, lower};
-use crate::memory::Memory;
 use crate::plan::{Placed, plan};
 use crate::report::{CompileReport, ProgramReport};
 use crate::tensor::Tensor;
@@ -80,8 +79,8 @@ pub fn compile(bundle: &Bundle) -> Result<Image, CompileError> {
 pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileError> {
     let contract = bundle.contract();
     let blueprint = contract.family.kind().blueprint(contract);
-    let signatures = entries::signatures(bundle.graph(), contract, &blueprint)
-        .map_err(CompileError::Bundle)?;
+    let signatures =
+        entries::signatures(bundle.graph(), contract, &blueprint).map_err(CompileError::Bundle)?;
     let model = Model::new(&bundle.model, bundle.graph())?;
     let caches = caches(bundle, &blueprint, &signatures, options.cache)?;
     let mut weights = Weights::default();
@@ -98,7 +97,12 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
             options.weights
         };
         let cache = entry.cache.as_ref().and_then(|name| caches.get(name));
-        let lowered = lower(&entry.name, &fused, *cache.unwrap_or(&Cache::NONE), &mut weights)?;
+        let lowered = lower(
+            &entry.name,
+            &fused,
+            *cache.unwrap_or(&Cache::NONE),
+            &mut weights,
+        )?;
         let placed = plan(&lowered);
         verify(&lowered, &placed).map_err(|fault| CompileError::Plan {
             program: entry.name.as_str().into(),
@@ -117,7 +121,10 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
             tokens: lowered.tokens,
         });
     }
-    let words = match signatures.iter().find(|known| known.entry == LOOKUP_INSTRUCTION) {
+    let words = match signatures
+        .iter()
+        .find(|known| known.entry == LOOKUP_INSTRUCTION)
+    {
         Some(signature) => instruction_words(bundle, &model, signature, &mut weights)?,
         None => vec![],
     };
@@ -153,13 +160,25 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
     Ok(image)
 }
 
+/// Refuses memory of more f32 elements than a policy gets.
+fn bounded(elements: usize) -> Result<(), CompileError> {
+    let bytes = elements.saturating_mul(size_of::<f32>());
+    if bytes > Policy::MEMORY_LIMIT {
+        return Err(CompileError::Excessive { bytes });
+    }
+    Ok(())
+}
+
 /// The golden episode, in memory of its own.
 fn gate(policy: &Policy, options: Options, tolerance: f32) -> Result<(), CompileError> {
-    Memory::bytes_of(policy.arena_len().saturating_add(policy.state_len()))?;
+    bounded(policy.arena_len().saturating_add(policy.state_len()))?;
     let mut arena = vec![0.0; policy.arena_len()];
     let mut state = vec![0.0; policy.state_len()];
-    let workspace = Workspace::new(policy, &mut arena, &mut state)
-        .map_err(|error| CompileError::Memory(error.into()))?;
+    let workspace = Workspace::new(policy, &mut arena, &mut state).map_err(|small| {
+        CompileError::Excessive {
+            bytes: small.needed.saturating_mul(size_of::<f32>()),
+        }
+    })?;
     let replayed = Controller::new(*policy, workspace).self_test();
     replayed.map(|_| ()).map_err(|error| CompileError::Gate {
         stored: options.to_string().into(),
@@ -183,7 +202,7 @@ fn caches(
     };
     let rows = blueprint.rows(bundle.contract(), tokens);
     let mut caches = HashMap::new();
-    let mut bytes = 0_usize;
+    let mut elements = 0_usize;
     for (state, rows) in blueprint.states.iter().zip(rows) {
         let Keep::Kv(network) = state.keep else {
             continue;
@@ -193,8 +212,8 @@ fn caches(
             what: "the KV cache".into(),
         })?;
         // Before the compiler itself takes memory that grows with the context.
-        bytes = bytes.saturating_add(len as usize);
-        Memory::bytes_of(bytes)?;
+        elements = elements.saturating_add(len as usize);
+        bounded(elements)?;
         caches.insert(state.name.clone(), cache);
     }
     Ok(caches)
@@ -219,8 +238,14 @@ fn fused(
             let output = entry.outputs.first().map_or("", String::as_str);
             let name = output.strip_prefix("next_").unwrap_or(output);
             let state = blueprint.states.iter().find(|state| state.name == name);
-            let width = state.and_then(|state| state.width.as_ref()).map_or(0, |wide| wide.0);
-            Ok(Some(Fused::copy(channel, output, &[Dim::of(1), Dim::of(width)])))
+            let width = state
+                .and_then(|state| state.width.as_ref())
+                .map_or(0, |wide| wide.0);
+            Ok(Some(Fused::copy(
+                channel,
+                output,
+                &[Dim::of(1), Dim::of(width)],
+            )))
         }
     }
 }
@@ -272,9 +297,7 @@ fn instruction_words(
                 known.id
             )));
         }
-        let span = weights
-            .store(&words[..length * dim])
-            .map_err(refused)?;
+        let span = weights.store(&words[..length * dim]).map_err(refused)?;
         all.push((length as u32, span));
     }
     Ok(all)

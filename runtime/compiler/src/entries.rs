@@ -37,7 +37,10 @@ pub(crate) struct Signature {
 impl Signature {
     /// Rows that a run appends to the KV cache.
     pub fn tokens(&self) -> usize {
-        let present = self.outputs.iter().find(|value| value.name.starts_with("present."));
+        let present = self
+            .outputs
+            .iter()
+            .find(|value| value.name.starts_with("present."));
         present.map_or(0, |value| value.shape.get(2).map_or(0, |dim| dim.fixed))
     }
 }
@@ -181,7 +184,9 @@ impl Checker<'_> {
                 )
             })?;
         let (mut ty, shape) = declaration(declared)?;
-        let len = shape.iter().try_fold(1_usize, |len, dim| dim.known()?.checked_mul(len));
+        let len = shape
+            .iter()
+            .try_fold(1_usize, |len, dim| dim.known()?.checked_mul(len));
         let fields = match bound {
             Bound::Channel(index) => {
                 let channel = &self.contract.channels[index];
@@ -265,7 +270,10 @@ impl Checker<'_> {
         outputs: &[Value],
     ) -> Result<(), String> {
         let state = cache.and_then(|name| {
-            self.blueprint.states.iter().find(|state| state.name == name)
+            self.blueprint
+                .states
+                .iter()
+                .find(|state| state.name == name)
         });
         let network = match state.map(|state| state.keep) {
             Some(Keep::Kv(network)) => Some(network),
@@ -280,7 +288,9 @@ impl Checker<'_> {
             // What reads the instruction begins the cache, and so has no past.
             let begins = what == "past_key_values"
                 && found.is_empty()
-                && inputs.iter().any(|value| Some(value.shape.len()) == words.map(|_| 3));
+                && inputs
+                    .iter()
+                    .any(|value| Some(value.shape.len()) == words.map(|_| 3));
             let layers = match network {
                 Some(_) if begins => 0,
                 Some(network) => network.layers,

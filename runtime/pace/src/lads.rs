@@ -29,7 +29,10 @@ impl<'c, 'a, 'm> Lads<'c, 'a, 'm> {
         let policy = controller.policy();
         let cache = cache_format(policy.image()).map(|format| format!(", {format} cache"));
         let cache = cache.unwrap_or_default();
-        let recorded = policy.golden().into_iter().flat_map(|golden| golden.steps());
+        let recorded = policy
+            .golden()
+            .into_iter()
+            .flat_map(|golden| golden.steps());
         let recorded = recorded.collect();
         let action = vec![0.0; policy.contract().action_len()];
         Self {

@@ -68,7 +68,11 @@ impl Protocol {
             return senseless("rate", format!("{} Hz", self.rate), "give 0.1 to 10000");
         }
         if !(self.seconds.is_finite() && (0.1..=86_400.0).contains(&self.seconds)) {
-            return senseless("seconds", format!("{} s", self.seconds), "give 0.1 to 86400");
+            return senseless(
+                "seconds",
+                format!("{} s", self.seconds),
+                "give 0.1 to 86400",
+            );
         }
         let most = std::thread::available_parallelism().map_or(64, |cores| 16 * cores.get());
         if self.load > most {
@@ -99,9 +103,7 @@ pub fn measure(
     protocol: &Protocol,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Report, BenchError> {
-    protocol
-        .check()
-        .map_err(|error| BenchError::of(&error))?;
+    protocol.check().map_err(|error| BenchError::of(&error))?;
     let _load = Load::start(protocol.load);
     with_contenders(candidates, others, vec![], |field, contenders| {
         run(field, contenders, protocol, progress)
