@@ -79,8 +79,8 @@ pub fn compile(bundle: &Bundle) -> Result<Image, CompileError> {
 pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileError> {
     let contract = bundle.contract();
     let blueprint = contract.family.kind().blueprint(contract);
-    let signatures =
-        entries::signatures(bundle.graph(), contract, &blueprint).map_err(CompileError::Bundle)?;
+    let signatures = entries::signatures(bundle.graph(), contract, &blueprint)
+        .map_err(CompileError::Bundle)?;
     let model = Model::new(&bundle.model, bundle.graph())?;
     let caches = caches(bundle, &blueprint, &signatures, options.cache)?;
     let mut weights = Weights::default();
@@ -97,12 +97,7 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
             options.weights
         };
         let cache = entry.cache.as_ref().and_then(|name| caches.get(name));
-        let lowered = lower(
-            &entry.name,
-            &fused,
-            *cache.unwrap_or(&Cache::NONE),
-            &mut weights,
-        )?;
+        let lowered = lower(&entry.name, &fused, *cache.unwrap_or(&Cache::NONE), &mut weights)?;
         let placed = plan(&lowered);
         verify(&lowered, &placed).map_err(|fault| CompileError::Plan {
             program: entry.name.as_str().into(),
@@ -121,10 +116,7 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
             tokens: lowered.tokens,
         });
     }
-    let words = match signatures
-        .iter()
-        .find(|known| known.entry == LOOKUP_INSTRUCTION)
-    {
+    let words = match signatures.iter().find(|known| known.entry == LOOKUP_INSTRUCTION) {
         Some(signature) => instruction_words(bundle, &model, signature, &mut weights)?,
         None => vec![],
     };
@@ -174,10 +166,8 @@ fn gate(policy: &Policy, options: Options, tolerance: f32) -> Result<(), Compile
     bounded(policy.arena_len().saturating_add(policy.state_len()))?;
     let mut arena = vec![0.0; policy.arena_len()];
     let mut state = vec![0.0; policy.state_len()];
-    let workspace = Workspace::new(policy, &mut arena, &mut state).map_err(|small| {
-        CompileError::Excessive {
-            bytes: small.needed.saturating_mul(size_of::<f32>()),
-        }
+    let workspace = Workspace::new(policy, &mut arena, &mut state).map_err(|small| CompileError::Excessive {
+        bytes: small.needed.saturating_mul(size_of::<f32>()),
     })?;
     let replayed = Controller::new(*policy, workspace).self_test();
     replayed.map(|_| ()).map_err(|error| CompileError::Gate {
@@ -238,14 +228,8 @@ fn fused(
             let output = entry.outputs.first().map_or("", String::as_str);
             let name = output.strip_prefix("next_").unwrap_or(output);
             let state = blueprint.states.iter().find(|state| state.name == name);
-            let width = state
-                .and_then(|state| state.width.as_ref())
-                .map_or(0, |wide| wide.0);
-            Ok(Some(Fused::copy(
-                channel,
-                output,
-                &[Dim::of(1), Dim::of(width)],
-            )))
+            let width = state.and_then(|state| state.width.as_ref()).map_or(0, |wide| wide.0);
+            Ok(Some(Fused::copy(channel, output, &[Dim::of(1), Dim::of(width)])))
         }
     }
 }
@@ -297,7 +281,9 @@ fn instruction_words(
                 known.id
             )));
         }
-        let span = weights.store(&words[..length * dim]).map_err(refused)?;
+        let span = weights
+            .store(&words[..length * dim])
+            .map_err(refused)?;
         all.push((length as u32, span));
     }
     Ok(all)

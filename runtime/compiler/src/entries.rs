@@ -37,10 +37,7 @@ pub(crate) struct Signature {
 impl Signature {
     /// Rows that a run appends to the KV cache.
     pub fn tokens(&self) -> usize {
-        let present = self
-            .outputs
-            .iter()
-            .find(|value| value.name.starts_with("present."));
+        let present = self.outputs.iter().find(|value| value.name.starts_with("present."));
         present.map_or(0, |value| value.shape.get(2).map_or(0, |dim| dim.fixed))
     }
 }
@@ -184,9 +181,7 @@ impl Checker<'_> {
                 )
             })?;
         let (mut ty, shape) = declaration(declared)?;
-        let len = shape
-            .iter()
-            .try_fold(1_usize, |len, dim| dim.known()?.checked_mul(len));
+        let len = shape.iter().try_fold(1_usize, |len, dim| dim.known()?.checked_mul(len));
         let fields = match bound {
             Bound::Channel(index) => {
                 let channel = &self.contract.channels[index];
@@ -270,10 +265,7 @@ impl Checker<'_> {
         outputs: &[Value],
     ) -> Result<(), String> {
         let state = cache.and_then(|name| {
-            self.blueprint
-                .states
-                .iter()
-                .find(|state| state.name == name)
+            self.blueprint.states.iter().find(|state| state.name == name)
         });
         let network = match state.map(|state| state.keep) {
             Some(Keep::Kv(network)) => Some(network),
@@ -288,9 +280,7 @@ impl Checker<'_> {
             // What reads the instruction begins the cache, and so has no past.
             let begins = what == "past_key_values"
                 && found.is_empty()
-                && inputs
-                    .iter()
-                    .any(|value| Some(value.shape.len()) == words.map(|_| 3));
+                && inputs.iter().any(|value| Some(value.shape.len()) == words.map(|_| 3));
             let layers = match network {
                 Some(_) if begins => 0,
                 Some(network) => network.layers,
@@ -358,14 +348,7 @@ fn shape_of(tensor: &TensorTypeProto) -> Option<Vec<Dim>> {
     let dims = tensor.shape.as_ref()?.dim.iter();
     dims.map(|dim| match (&dim.dim_value, &dim.dim_param) {
         (Some(len), _) => usize::try_from(*len).ok().map(Dim::of),
-        (None, Some(text)) => {
-            let rest = text.strip_prefix('P')?;
-            let added = rest
-                .trim()
-                .strip_prefix('+')
-                .map_or_else(|| rest.is_empty().then_some(0), |n| n.trim().parse().ok());
-            added.map(Dim::past)
-        }
+        (None, Some(text)) => past(text),
         (None, None) => None,
     })
     .collect()
@@ -405,4 +388,14 @@ pub(crate) fn needed<'g>(
         .zip(wanted)
         .filter_map(|(node, wanted)| wanted.then_some(node))
         .collect()
+}
+
+/// The length that a symbolic axis stands for: `P`, the rows of the cache, or `P+n`.
+pub(crate) fn past(name: &str) -> Option<Dim> {
+    let rest = name.strip_prefix('P')?;
+    let added = rest
+        .trim()
+        .strip_prefix('+')
+        .map_or_else(|| rest.is_empty().then_some(0), |n| n.trim().parse().ok());
+    added.map(Dim::past)
 }

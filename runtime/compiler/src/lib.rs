@@ -36,6 +36,7 @@ mod lower;
 mod onnx;
 mod plan;
 mod report;
+mod survey;
 mod tensor;
 mod verify;
 
@@ -51,4 +52,5 @@ pub use golden::Golden;
 pub use image::Image;
 pub use lads_image::op::{CacheFormat, WeightFormat};
 pub use report::{CompileReport, ProgramReport};
+pub use survey::{Field, Missing, Operand, Operator, Survey, Value, survey};
 pub use verify::PlanFault;
