@@ -10,9 +10,9 @@ def policies():
 
 
 def limits(contract):
-    """-> the smallest and the largest value of each element of the action."""
-    elements = next(channel["elements"] for channel in contract["channels"] if channel["role"] == "action")
-    return [[element[key] for element in elements] for key in ("min", "max")]
+    """The action's lowest and highest values."""
+    action = next(row for row in contract["channels"] if row["role"] == "action")
+    return tuple([element[key] for element in action["elements"]] for key in ("min", "max"))
 
 
 class Torch:
@@ -25,7 +25,7 @@ class Torch:
         self.inference = torch.inference_mode()
         self.inference.__enter__()
         self.net = Eager(model, contract)
-        self.low, self.high = (torch.tensor(row) for row in limits(contract))
+        self.low, self.high = (torch.tensor(side) for side in limits(contract))
         self.detail = f"{torch.__version__}, eager, inference mode, 1 thread, keys and values written in place"
 
     def tensor(self, row):
@@ -86,7 +86,7 @@ class OpenVino:
         arrays = {t.name: onnx.numpy_helper.to_array(t) for t in model.graph.initializer}
         self.length = int(arrays["constants/instruction.lengths"][instruction])
         self.known = arrays["weights/instruction.words"][instruction][None].copy()
-        self.low, self.high = (np.array(row, np.float32) for row in limits(contract))
+        self.low, self.high = (np.array(side, np.float32) for side in limits(contract))
         self.cache, self.saved = {}, {}
         self.detail = f"{openvino.__version__.split('-')[0]}, Python, f32, 1 thread, latency hint"
 
