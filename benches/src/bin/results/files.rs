@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use lads_benches::BenchError;
-use lads_benches::contender::Kind;
+use lads_pace::BenchError;
+use lads_pace::contender::Kind;
 use serde_json::{Value, json};
 
 use crate::charts::{Line, lines, tail};

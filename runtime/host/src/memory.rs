@@ -16,11 +16,7 @@ pub struct Memory {
 }
 
 impl Memory {
-    /// The most that a policy gets. Real ones take a few megabytes; an operating system that promises more memory than it has
-    /// would let an image take all of it.
-    pub const MOST_BYTES: usize = 1 << 30;
-
-    /// As much as `policy` asks for.
+    /// As much as `policy` asks for, up to [`Policy::MEMORY_LIMIT`].
     pub fn of(policy: &Policy<'_>) -> Result<Self, MemoryError> {
         let (arena, state) = (policy.arena_len(), policy.state_len());
         let bytes = Self::bytes_of(arena.saturating_add(state))?;
@@ -29,9 +25,9 @@ impl Memory {
     }
 
     /// Bytes of so many f32 elements, if that is not more than a policy gets.
-    pub(crate) fn bytes_of(elements: usize) -> Result<usize, MemoryError> {
+    fn bytes_of(elements: usize) -> Result<usize, MemoryError> {
         let bytes = elements.saturating_mul(size_of::<f32>());
-        if bytes > Self::MOST_BYTES {
+        if bytes > Policy::MEMORY_LIMIT {
             return Err(MemoryError::Excessive { bytes });
         }
         Ok(bytes)
@@ -63,7 +59,7 @@ pub enum MemoryError {
     /// The policy asks for more than any policy gets.
     #[error(
         "the policy asks for a workspace of {bytes} bytes, and gets at most {most}; do not trust it, or export a bundle with a shorter context",
-        most = Memory::MOST_BYTES
+        most = Policy::MEMORY_LIMIT
     )]
     Excessive {
         /// What it asks for.

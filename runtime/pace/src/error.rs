@@ -10,7 +10,12 @@ pub struct BenchError(String);
 impl BenchError {
     /// `thing` (a file, a contender, an argument), what is wrong with it, and the remedy.
     pub fn new(thing: impl Display, wrong: impl Display, remedy: impl Display) -> Self {
-        let text = format!("{thing}: {wrong}; {remedy}");
+        Self::of(&format_args!("{thing}: {wrong}; {remedy}"))
+    }
+
+    /// An error that names thing and remedy itself.
+    pub fn of(error: &dyn Display) -> Self {
+        let text = error.to_string();
         let words: Vec<_> = text.split_whitespace().collect();
         Self(words.join(" "))
     }

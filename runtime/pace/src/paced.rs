@@ -1,7 +1,7 @@
-//! `lads bench`: a policy at its real rate, over whole episodes, alone or beside peers; what a control thread would see.
+//! A policy at its real rate, over whole episodes, alone or beside peers; what a control thread would see.
 //!
-//! A run is made of rounds. In a round every contender gets one block at one part of the episode (two horizons long), one of the low
-//! level alone and one of new instructions; within a block the calls come at the period's absolute deadlines. The rounds go through
+//! A run is made of rounds. In a round every contender gets one block at one part of the episode (two periods of the schedule long),
+//! one of actions for a given index and one of new instructions, where the policy has them; within a block the calls come at the period's absolute deadlines. The rounds go through
 //! the parts of the episode again and again.
 
 use std::fmt::{self, Display, Formatter};
@@ -15,17 +15,20 @@ use crate::error::BenchError;
 use crate::load::Load;
 use crate::realtime::Realtime;
 use crate::stats::{Ratio, Rounds, Summary, median};
-use crate::suite::{Candidate, Entrant, Field, Peers, with_contenders};
+use crate::suite::{Candidate, Entrant, Field, Others, with_contenders};
 use crate::turns::take_turns;
 
 /// Calls before the recorded ones of each block.
 const SETTLE: usize = 3;
 
-/// Calls of the low level alone in a round.
+/// Actions for a given index in a round.
 const ACTIONS: usize = 10;
 
 /// New instructions in a round.
 const INSTRUCTIONS: usize = 2;
+
+/// The fewest control steps of a part of the episode.
+const FEWEST: usize = 8;
 
 /// How to measure.
 #[derive(Debug, Clone)]
@@ -36,6 +39,48 @@ pub struct Protocol {
     pub seconds: f64,
     /// Threads that make load beside it.
     pub load: usize,
+}
+
+/// A field of a [`Protocol`] that makes no sense.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{field}: {wrong}; {remedy}")]
+pub struct Senseless {
+    /// Name of the field.
+    pub field: &'static str,
+    /// What is wrong with it.
+    pub wrong: String,
+    /// What to give instead.
+    pub remedy: String,
+}
+
+impl Protocol {
+    /// Refuses rates, times and loads with which nothing can be measured on this machine.
+    pub fn check(&self) -> Result<(), Senseless> {
+        let senseless = |field, wrong, remedy: &str| {
+            let remedy = remedy.to_owned();
+            Err(Senseless {
+                field,
+                wrong,
+                remedy,
+            })
+        };
+        if !(self.rate.is_finite() && (0.1..=10_000.0).contains(&self.rate)) {
+            return senseless("rate", format!("{} Hz", self.rate), "give 0.1 to 10000");
+        }
+        if !(self.seconds.is_finite() && (0.1..=86_400.0).contains(&self.seconds)) {
+            return senseless(
+                "seconds",
+                format!("{} s", self.seconds),
+                "give 0.1 to 86400",
+            );
+        }
+        let most = std::thread::available_parallelism().map_or(64, |cores| 16 * cores.get());
+        if self.load > most {
+            let remedy = format!("give at most {most} on this machine");
+            return senseless("load", format!("{} threads", self.load), &remedy);
+        }
+        Ok(())
+    }
 }
 
 /// What was measured.
@@ -51,16 +96,16 @@ pub struct Report {
     steps: usize,
 }
 
-/// Measures the candidates and the peers.
+/// Measures the candidates and the others.
 pub fn measure(
     candidates: &[Candidate<'_>],
-    bundle: &[u8],
-    peers: &Peers,
+    others: &dyn Others,
     protocol: &Protocol,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Report, BenchError> {
+    protocol.check().map_err(|error| BenchError::of(&error))?;
     let _load = Load::start(protocol.load);
-    with_contenders(candidates, bundle, peers, vec![], |field, contenders| {
+    with_contenders(candidates, others, vec![], |field, contenders| {
         run(field, contenders, protocol, progress)
     })
 }
@@ -72,7 +117,7 @@ fn run(
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Report, BenchError> {
     let steps = field.episode.context_steps;
-    let part = (2 * field.episode.horizon).min(steps);
+    let part = (2 * field.episode.period).max(FEWEST).min(steps);
     let parts = steps / part;
     let pace = Pace::Every(Duration::from_secs_f64(1.0 / protocol.rate));
     let block = |work, calls, settle| Block {

@@ -1,7 +1,8 @@
 //! Brings all contenders to the start: opens what they need and compares what they compute, before anything is timed.
 
-use lads_compiler::{CacheFormat, Memory, Options, WeightFormat};
+use lads_compiler::{CacheFormat, Options, WeightFormat};
 use lads_core::{Controller, Policy};
+use lads_host::Memory;
 
 use crate::clock::now;
 use crate::contender::{Contender, Episode, compare};
@@ -39,15 +40,24 @@ pub struct Candidate<'i> {
     pub tolerance: f32,
 }
 
-/// Which peers to run, and where they are.
-#[derive(Debug, Clone, Default)]
-pub struct Peers {
-    /// The shared library of ONNX Runtime.
-    pub onnxruntime: Option<std::path::PathBuf>,
-    /// Whether to run tract and rten.
-    pub crates: bool,
-    /// A Python that has PyTorch or OpenVINO, and the bundle's file.
-    pub python: Option<(std::path::PathBuf, std::path::PathBuf)>,
+/// Whoever runs the same policy by other means.
+pub trait Others {
+    /// Opens them; who was asked for and cannot be run is told to `absent`, with the reason.
+    fn open<'e>(
+        &self,
+        episode: &'e Episode,
+        absent: &mut Vec<String>,
+    ) -> Vec<Box<dyn Contender + 'e>>;
+}
+
+/// Nobody else.
+#[derive(Debug, Clone, Copy)]
+pub struct Nobody;
+
+impl Others for Nobody {
+    fn open<'e>(&self, _: &'e Episode, _: &mut Vec<String>) -> Vec<Box<dyn Contender + 'e>> {
+        vec![]
+    }
 }
 
 /// A contender at the start.
@@ -70,19 +80,18 @@ pub struct Entrant {
 pub struct Field<'f> {
     /// The episode.
     pub episode: &'f Episode,
-    /// Words of its instruction.
+    /// Words of its instruction; 0 without one.
     pub words: usize,
     /// Who takes part.
     pub entrants: Vec<Entrant>,
-    /// Peers that were asked for and could not be run, with the reason.
+    /// Others that were asked for and could not be run, with the reason.
     pub absent: Vec<String>,
 }
 
 /// Opens all contenders, compares them, and lends them to `body`. Guests come last and are not compared: they run no policy.
 pub fn with_contenders<R>(
     candidates: &[Candidate<'_>],
-    bundle: &[u8],
-    peers: &Peers,
+    others: &dyn Others,
     mut guests: Vec<Box<dyn Contender>>,
     body: impl FnOnce(&Field<'_>, &mut [&mut dyn Contender]) -> Result<R, BenchError>,
 ) -> Result<R, BenchError> {
@@ -99,12 +108,16 @@ pub fn with_contenders<R>(
         return Err(BenchError::new(
             "the benchmark",
             "there is no policy",
-            "name one with --model",
+            "name one",
         ));
     };
     let episode = Episode::of(first)?;
-    let known = first.contract().instruction(episode.instruction as usize);
-    let words = known.map_or(0, |known| known.words.len() / first.contract().word_dim());
+    let known = episode
+        .instruction
+        .and_then(|number| first.contract().instruction(number as usize));
+    let words = known.map_or(0, |known| {
+        known.words.len() / first.contract().word_dim().max(1)
+    });
     let memories = policies.iter().map(Memory::of).collect::<Result<_, _>>();
     let mut memories: Vec<Memory> = memories.map_err(|error| refused(&error))?;
     let controllers = memories
@@ -120,7 +133,7 @@ pub fn with_contenders<R>(
         .map(|(controller, candidate)| Lads::new(candidate.weights, controller, &episode))
         .collect();
     let mut absent = vec![];
-    let mut others = open_peers(bundle, peers, &episode, &mut absent);
+    let mut others = others.open(&episode, &mut absent);
 
     let tolerance = first.golden().map_or(0.0, |golden| golden.tolerance());
     let tolerances = candidates.iter().map(|candidate| candidate.tolerance);
@@ -175,66 +188,4 @@ fn admit(
         first_ns,
         again_ns: again.get(again.len() / 2).copied().unwrap_or(0),
     })
-}
-
-#[cfg(not(feature = "peers"))]
-fn open_peers<'e>(
-    _: &[u8],
-    peers: &Peers,
-    _: &'e Episode,
-    absent: &mut Vec<String>,
-) -> Vec<Box<dyn Contender + 'e>> {
-    if peers.onnxruntime.is_some() || peers.crates || peers.python.is_some() {
-        absent.push("all peers: built without the cargo feature `peers`".into());
-    }
-    vec![]
-}
-
-#[cfg(feature = "peers")]
-fn open_peers<'e>(
-    bundle: &[u8],
-    peers: &Peers,
-    episode: &'e Episode,
-    absent: &mut Vec<String>,
-) -> Vec<Box<dyn Contender + 'e>> {
-    use crate::peers::cut::Source;
-    use crate::peers::engine::Engine;
-    use crate::peers::general::General;
-    use crate::peers::worker::{NAMES, Worker};
-    use crate::peers::{onnxruntime::OnnxRuntime, rten::Rten, tract::Tract};
-
-    let mut open: Vec<Box<dyn Contender + 'e>> = vec![];
-    let source = match Source::new(bundle) {
-        Ok(source) => source,
-        Err(error) => {
-            absent.push(error.to_string());
-            return open;
-        }
-    };
-    let mut engines: Vec<Box<dyn Engine>> = vec![];
-    if let Some(library) = &peers.onnxruntime {
-        match OnnxRuntime::new(library) {
-            Ok(engine) => engines.push(Box::new(engine)),
-            Err(error) => absent.push(error.to_string()),
-        }
-    }
-    if peers.crates {
-        engines.push(Box::new(Tract));
-        engines.push(Box::new(Rten));
-    }
-    for engine in engines {
-        match General::new(engine.as_ref(), &source, episode) {
-            Ok(contender) => open.push(Box::new(contender)),
-            Err(error) => absent.push(error.to_string()),
-        }
-    }
-    if let Some((python, path)) = &peers.python {
-        for name in NAMES {
-            match Worker::new(name, python, path, episode) {
-                Ok(contender) => open.push(Box::new(contender)),
-                Err(error) => absent.push(error.to_string()),
-            }
-        }
-    }
-    open
 }

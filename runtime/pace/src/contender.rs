@@ -3,17 +3,21 @@
 //! A [`Contender`] runs one policy. It is measured in blocks: a few calls one after the other, hot or paced, of one kind of work,
 //! so that contenders can take turns and a change of the machine's mood hits them all.
 
+use lads_core::Policy;
+use lads_host::schedule;
+use lads_image::Tables;
+
 use crate::clock::{Pace, Ticker, now};
 use crate::error::BenchError;
 
 /// What one call did.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Kind {
-    /// `low_level/act` alone.
+    /// The action for an index that is given, such as that of a plan: what alone runs in every control step.
     Act,
-    /// A control step that keeps the plan.
+    /// A control step inside a period of the schedule; any control step of a policy without one.
     Ordinary,
-    /// A control step that also picks a plan.
+    /// A control step that begins a period of the schedule: it also runs what comes every so many steps, such as picking a plan.
     Decision,
     /// A new instruction: its words go through the transformer.
     Instruct,
@@ -46,7 +50,7 @@ impl Kind {
 /// The work of a block.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Work {
-    /// `low_level/act` alone.
+    /// The action for an index that is given.
     Act,
     /// Control steps from this one of an episode on. Contenders that cannot go on from one call to the next repeat the middle one.
     Steps {
@@ -102,8 +106,8 @@ pub struct Sample {
 /// What a contender computed in one control step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Computed {
-    /// The plan in force.
-    pub plan: u32,
+    /// The index in force, if the policy selects one.
+    pub selected: Option<u32>,
     /// The action, inside the contract's limits.
     pub action: Vec<f32>,
 }
@@ -111,13 +115,13 @@ pub struct Computed {
 /// A recorded episode, the same for all contenders.
 #[derive(Debug, Clone)]
 pub struct Episode {
-    /// Number of the instruction.
-    pub instruction: u32,
-    /// Control steps per plan.
-    pub horizon: usize,
-    /// Control steps that fit into the context.
+    /// Number of the instruction; `None` for a policy that takes none.
+    pub instruction: Option<u32>,
+    /// Control steps after which the schedule repeats; 1 for a policy whose steps are alike.
+    pub period: usize,
+    /// Control steps that fit into the context; as many as were recorded where there is no such bound.
     pub context_steps: usize,
-    /// Observations; a longer episode starts with the first again.
+    /// Observations; a longer episode starts with the first again. Empty ones for a policy that has more than one channel of floats.
     pub observations: Vec<Vec<f32>>,
     /// What the policy did, by the runtime that recorded it.
     pub recorded: Vec<Computed>,
@@ -127,7 +131,7 @@ pub struct Episode {
 
 impl Episode {
     /// The golden episode of a policy.
-    pub fn of(policy: &lads_core::Policy<'_>) -> Result<Self, BenchError> {
+    pub fn of(policy: &Policy<'_>) -> Result<Self, BenchError> {
         let contract = policy.contract();
         let golden = policy.golden().ok_or_else(|| {
             BenchError::new(
@@ -136,19 +140,23 @@ impl Episode {
                 "export the bundle with one",
             )
         })?;
-        let recorded = golden.steps().map(|(_, plan, action)| Computed {
-            plan,
-            action: action.to_vec(),
+        let recorded = golden.steps().map(|step| Computed {
+            selected: step.selected,
+            action: step.action.to_vec(),
         });
+        let period = Tables::new(policy.image()).map_or(1, |tables| schedule::period(&tables));
         Ok(Self {
             instruction: golden.instruction(),
-            horizon: contract.horizon(),
-            context_steps: contract.context_steps(),
-            observations: golden.steps().map(|(seen, _, _)| seen.to_vec()).collect(),
+            period: period as usize,
+            context_steps: contract.context_steps().unwrap_or(golden.len()),
+            observations: golden
+                .steps()
+                .map(|step| step.observation().to_vec())
+                .collect(),
             recorded: recorded.collect(),
             limits: contract
-                .actions()
-                .map(|e| (e.limits.min, e.limits.max))
+                .action_limits()
+                .map(|limits| (limits.min, limits.max))
                 .collect(),
         })
     }
@@ -159,9 +167,9 @@ impl Episode {
         self.observations.get(index).map_or(&[], Vec::as_slice)
     }
 
-    /// Whether a control step picks a plan.
+    /// Whether a control step begins a period of the schedule.
     pub fn decides(&self, step: usize) -> bool {
-        step.is_multiple_of(self.horizon)
+        self.period > 1 && step.is_multiple_of(self.period)
     }
 
     /// [`Kind::Decision`] or [`Kind::Ordinary`].
@@ -226,7 +234,7 @@ pub fn measure<E>(
     Ok(())
 }
 
-/// Compares what two contenders computed: plans equal, actions within `tolerance`. Says the largest difference of an action.
+/// Compares what two contenders computed: indices in force equal, actions within `tolerance`. Says the largest difference of an action.
 pub fn compare(
     name: &str,
     got: &[Computed],
@@ -244,8 +252,9 @@ pub fn compare(
     }
     let mut largest = 0.0_f32;
     for (step, (got, wanted)) in got.iter().zip(wanted).enumerate() {
-        if got.plan != wanted.plan {
-            let wrong = format!("plan {} in step {step}, not {}", got.plan, wanted.plan);
+        if got.selected != wanted.selected {
+            let index = |of: &Computed| of.selected.map_or("none".to_owned(), |i| i.to_string());
+            let wrong = format!("index {} in step {step}, not {}", index(got), index(wanted));
             return Err(BenchError::new(name, wrong, remedy));
         }
         let differences = got
@@ -272,15 +281,15 @@ pub fn compare(
 mod tests {
     use super::*;
 
-    fn computed(plan: u32, action: f32) -> Computed {
+    fn computed(selected: u32, action: f32) -> Computed {
         Computed {
-            plan,
+            selected: Some(selected),
             action: vec![action],
         }
     }
 
     #[test]
-    fn other_plans_and_other_actions_are_told() {
+    fn other_indices_and_other_actions_are_told() {
         let wanted = [computed(3, 0.5), computed(4, 0.25)];
         let compared =
             |got: &[Computed]| compare("x", got, &wanted, 1e-3).map_err(|e| e.to_string());
