@@ -389,16 +389,7 @@ fn difference(old: &Contract, new: &Contract) -> Option<u32> {
         .take(count)
         .map(|i| (i, old.channel(ChannelId(i)), new.channel(ChannelId(i))))
         .find(|(_, old, new)| match (old, new) {
-            (Some(old), Some(new)) => {
-                old.role() != new.role()
-                    || old.dtype() != new.dtype()
-                    || old.name() != new.name()
-                    || old.shape() != new.shape()
-                    || old.reference() != new.reference()
-                    || old.quaternion_order() != new.quaternion_order()
-                    || !old.elements().eq(new.elements())
-                    || !old.limits().eq(new.limits())
-            }
+            (Some(old), Some(new)) => !old.is_like(new),
             _ => true,
         })
         .map(|(i, ..)| i)
