@@ -60,7 +60,8 @@ impl Bundle {
         let graph = model.graph.as_ref().ok_or_else(|| BundleError::NotOnnx {
             problem: "it has no graph".into(),
         })?;
-        entries::check(graph, &contract)?;
+        let blueprint = contract.family.kind().blueprint(&contract);
+        entries::signatures(graph, &contract, &blueprint)?;
         Ok(Self {
             contract,
             golden,

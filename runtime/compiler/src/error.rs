@@ -71,6 +71,11 @@ pub enum BundleError {
         /// Version that is read.
         supported: u32,
     },
+    /// A contract of the first version.
+    #[error(
+        "the contract has version 1, this program reads version 2; upgrade it: `python -m lads_exporter upgrade FILE`"
+    )]
+    ContractV1,
     /// A contract that misses something or contradicts itself.
     #[error("contract: {problem}; export the bundle again")]
     Contract {
@@ -102,6 +107,9 @@ pub enum BundleError {
 /// Why a bundle does not compile.
 #[derive(Debug, thiserror::Error)]
 pub enum CompileError {
+    /// The graphs contradict the contract.
+    #[error(transparent)]
+    Bundle(BundleError),
     /// An operator that the compiler does not know, or uses of a known one that it does not.
     #[error("entry {entry}, node `{node}`: operator {operator} {problem}")]
     Operator {
@@ -128,7 +136,7 @@ pub enum CompileError {
     )]
     Plan {
         /// The program.
-        program: &'static str,
+        program: Line,
         /// What the verifier found.
         fault: crate::verify::PlanFault,
     },

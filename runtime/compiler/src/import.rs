@@ -93,7 +93,7 @@ impl<'m> Model<'m> {
         signature: &Signature,
         bindings: &HashMap<&str, Tensor>,
     ) -> Result<Entry, CompileError> {
-        let entry = signature.entry;
+        let entry = signature.entry.as_str();
         let refused = |problem: String| CompileError::Entry {
             entry: entry.into(),
             problem: problem.into(),

@@ -1,7 +1,7 @@
 //! Compiles an ONNX bundle to a program image.
 //!
 //! ```text
-//! bundle ─► import ─► graph ─► fuse ─► lower ─► plan ─► verify ─► image
+//! bundle ─► family ─► import ─► graph ─► fuse ─► lower ─► plan ─► verify ─► image
 //! ```
 //!
 //! A [`Bundle`] is one ONNX file that holds a whole policy: the entry graphs, a contract and a golden episode. [`compile`] makes it
@@ -26,6 +26,7 @@ pub mod contract;
 mod digest;
 mod entries;
 mod error;
+pub mod family;
 mod fuse;
 mod golden;
 mod graph;

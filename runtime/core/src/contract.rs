@@ -97,6 +97,8 @@ pub struct Element<'a> {
     pub joint: &'a str,
     /// What of the joint: `position`, `velocity`, `effort`; empty where the bundle does not say.
     pub interface: &'a str,
+    /// Unit of the physical value that the element stands for; empty where the bundle does not say.
+    pub physical_unit: &'a str,
     /// Physical value of one unit of the element: physical = reference + offset + scale * value.
     pub scale: f32,
     /// Physical value of zero, on top of the channel's reference.
@@ -602,6 +604,7 @@ impl<'a> Channel<'a> {
                 unit: tables.text(record.unit),
                 joint: tables.text(record.joint),
                 interface: tables.text(record.interface),
+                physical_unit: tables.text(record.physical_unit),
                 scale: record.scale,
                 offset: record.offset,
                 limits: Interval {
