@@ -80,8 +80,8 @@ pub fn compile(bundle: &Bundle) -> Result<Image, CompileError> {
 pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileError> {
     let contract = bundle.contract();
     let blueprint = contract.family.kind().blueprint(contract);
-    let signatures = entries::signatures(bundle.graph(), contract, &blueprint)
-        .map_err(CompileError::Bundle)?;
+    let signatures =
+        entries::signatures(bundle.graph(), contract, &blueprint).map_err(CompileError::Bundle)?;
     let model = Model::new(&bundle.model, bundle.graph())?;
     let caches = caches(bundle, &blueprint, &signatures, options.cache)?;
     let mut weights = Weights::default();
@@ -98,7 +98,12 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
             options.weights
         };
         let cache = entry.cache.as_ref().and_then(|name| caches.get(name));
-        let lowered = lower(&entry.name, &fused, *cache.unwrap_or(&Cache::NONE), &mut weights)?;
+        let lowered = lower(
+            &entry.name,
+            &fused,
+            *cache.unwrap_or(&Cache::NONE),
+            &mut weights,
+        )?;
         let placed = plan(&lowered);
         verify(&lowered, &placed).map_err(|fault| CompileError::Plan {
             program: entry.name.as_str().into(),
@@ -117,7 +122,10 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
             tokens: lowered.tokens,
         });
     }
-    let words = match signatures.iter().find(|known| known.entry == LOOKUP_INSTRUCTION) {
+    let words = match signatures
+        .iter()
+        .find(|known| known.entry == LOOKUP_INSTRUCTION)
+    {
         Some(signature) => instruction_words(bundle, &model, signature, &mut weights)?,
         None => vec![],
     };
@@ -219,8 +227,14 @@ fn fused(
             let output = entry.outputs.first().map_or("", String::as_str);
             let name = output.strip_prefix("next_").unwrap_or(output);
             let state = blueprint.states.iter().find(|state| state.name == name);
-            let width = state.and_then(|state| state.width.as_ref()).map_or(0, |wide| wide.0);
-            Ok(Some(Fused::copy(channel, output, &[Dim::of(1), Dim::of(width)])))
+            let width = state
+                .and_then(|state| state.width.as_ref())
+                .map_or(0, |wide| wide.0);
+            Ok(Some(Fused::copy(
+                channel,
+                output,
+                &[Dim::of(1), Dim::of(width)],
+            )))
         }
     }
 }
@@ -272,9 +286,7 @@ fn instruction_words(
                 known.id
             )));
         }
-        let span = weights
-            .store(&words[..length * dim])
-            .map_err(refused)?;
+        let span = weights.store(&words[..length * dim]).map_err(refused)?;
         all.push((length as u32, span));
     }
     Ok(all)

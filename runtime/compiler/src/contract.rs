@@ -80,7 +80,10 @@ pub struct Channel {
 
 impl Channel {
     /// How many elements it has.
-    #[expect(clippy::len_without_is_empty, reason = "a checked channel has an element at least")]
+    #[expect(
+        clippy::len_without_is_empty,
+        reason = "a checked channel has an element at least"
+    )]
     pub fn len(&self) -> usize {
         self.shape.iter().product()
     }
@@ -97,7 +100,8 @@ impl Channel {
 
     fn check(&self, at: &str) -> Result<(), String> {
         let len = self.shape.iter().try_fold(1_usize, |len, &dim| {
-            len.checked_mul(dim).filter(|&len| (1..=MAX_CHANNEL_LEN).contains(&len))
+            len.checked_mul(dim)
+                .filter(|&len| (1..=MAX_CHANNEL_LEN).contains(&len))
         });
         if !(1..=4).contains(&self.shape.len()) || len.is_none() {
             return Err(format!(
@@ -122,7 +126,9 @@ impl Channel {
         }
         let (min, max) = self.limits();
         if !(min.is_finite() && max.is_finite() && min < max) {
-            return Err(format!("field `{at}` has limits {min} to {max}, which is no range"));
+            return Err(format!(
+                "field `{at}` has limits {min} to {max}, which is no range"
+            ));
         }
         elements(&format!("{at}.elements"), &self.elements)
     }
@@ -447,7 +453,9 @@ impl Contract {
     }
 
     fn with(&self, role: Role) -> impl Iterator<Item = &Channel> {
-        self.channels.iter().filter(move |channel| channel.role == role)
+        self.channels
+            .iter()
+            .filter(move |channel| channel.role == role)
     }
 
     fn known(&self, role: Role) -> &Channel {
@@ -469,7 +477,9 @@ impl Contract {
     fn check(&self) -> Result<(), String> {
         let period = self.control_period_s;
         if !(period.is_finite() && period > 0.0) {
-            return Err(format!("field `control_period_s` is {period}, it must be positive"));
+            return Err(format!(
+                "field `control_period_s` is {period}, it must be positive"
+            ));
         }
         self.check_channels()?;
         for (i, state) in self.states.iter().enumerate() {
@@ -488,7 +498,11 @@ impl Contract {
         for (i, channel) in self.channels.iter().enumerate() {
             channel.check(&format!("channels[{i}]"))?;
         }
-        distinct("channels", "name", self.channels.iter().map(|c| c.name.as_str()))?;
+        distinct(
+            "channels",
+            "name",
+            self.channels.iter().map(|c| c.name.as_str()),
+        )?;
         let count = |role| self.with(role).count();
         let observations = count(Role::Observation);
         if !(1..=lads_core::MAX_OBSERVATIONS).contains(&observations) {
@@ -555,9 +569,14 @@ impl Contract {
         let Some(context) = &self.context else {
             return Ok(());
         };
-        for (field, len) in [("context.words", context.words), ("context.steps", context.steps)] {
+        for (field, len) in [
+            ("context.words", context.words),
+            ("context.steps", context.steps),
+        ] {
             if !(1..=MAX_LEN).contains(&len) {
-                return Err(format!("field `{field}` is {len}, it must be 1 to {MAX_LEN}"));
+                return Err(format!(
+                    "field `{field}` is {len}, it must be 1 to {MAX_LEN}"
+                ));
             }
         }
         if let Some(period) = self.period()
@@ -613,7 +632,9 @@ impl Contract {
         }
         for (i, known) in self.evaluation.instructions.iter().enumerate() {
             if known.split.trim().is_empty() {
-                return Err(format!("field `evaluation.instructions[{i}].split` is empty"));
+                return Err(format!(
+                    "field `evaluation.instructions[{i}].split` is empty"
+                ));
             }
         }
         // Texts may repeat: benchmarks ask for the same in other words, and for the same words by other measures.

@@ -8,7 +8,7 @@ use std::collections::HashMap;
 
 use crate::contract::{Contract, DType};
 use crate::error::BundleError;
-use crate::family::{Blueprint, Bound, Keep};
+use crate::family::{Blueprint, Bound, Entry, Keep};
 use crate::graph::{Dim, Type, show};
 use crate::onnx::{GraphProto, NodeProto, TensorTypeProto, ValueInfoProto, data_type};
 
@@ -37,7 +37,10 @@ pub(crate) struct Signature {
 impl Signature {
     /// Rows that a run appends to the KV cache.
     pub fn tokens(&self) -> usize {
-        let present = self.outputs.iter().find(|value| value.name.starts_with("present."));
+        let present = self
+            .outputs
+            .iter()
+            .find(|value| value.name.starts_with("present."));
         present.map_or(0, |value| value.shape.get(2).map_or(0, |dim| dim.fixed))
     }
 }
@@ -70,6 +73,8 @@ pub(crate) fn signatures(
             declared
                 .iter()
                 .filter(|value| value.name.starts_with(&prefix))
+                // An output that this project does not use may be anything.
+                .filter(|value| input || is_used(entry, &value.name[prefix.len()..]))
                 .map(|value| checker.value(name, &entry.name, value, input))
                 .collect()
         };
@@ -96,6 +101,11 @@ pub(crate) fn signatures(
     }
     unknown(graph, contract, &all).map_err(refused)?;
     Ok(all)
+}
+
+/// Whether an output is kept, or part of the KV cache.
+fn is_used(entry: &Entry, output: &str) -> bool {
+    output.starts_with("present.") || entry.outputs.iter().any(|kept| kept == output)
 }
 
 /// Every value belongs to a graph of the family. (A trajectory encoder may come with any of them, to be used elsewhere.)
@@ -181,7 +191,9 @@ impl Checker<'_> {
                 )
             })?;
         let (mut ty, shape) = declaration(declared)?;
-        let len = shape.iter().try_fold(1_usize, |len, dim| dim.known()?.checked_mul(len));
+        let len = shape
+            .iter()
+            .try_fold(1_usize, |len, dim| dim.known()?.checked_mul(len));
         let fields = match bound {
             Bound::Channel(index) => {
                 let channel = &self.contract.channels[index];
@@ -265,7 +277,10 @@ impl Checker<'_> {
         outputs: &[Value],
     ) -> Result<(), String> {
         let state = cache.and_then(|name| {
-            self.blueprint.states.iter().find(|state| state.name == name)
+            self.blueprint
+                .states
+                .iter()
+                .find(|state| state.name == name)
         });
         let network = match state.map(|state| state.keep) {
             Some(Keep::Kv(network)) => Some(network),
@@ -280,7 +295,9 @@ impl Checker<'_> {
             // What reads the instruction begins the cache, and so has no past.
             let begins = what == "past_key_values"
                 && found.is_empty()
-                && inputs.iter().any(|value| Some(value.shape.len()) == words.map(|_| 3));
+                && inputs
+                    .iter()
+                    .any(|value| Some(value.shape.len()) == words.map(|_| 3));
             let layers = match network {
                 Some(_) if begins => 0,
                 Some(network) => network.layers,

@@ -283,5 +283,7 @@ fn one_noise(contract: &Contract) -> Result<(), String> {
     if count == 1 {
         return Ok(());
     }
-    Err(format!("field `channels` has {count} noise channels, it must have one"))
+    Err(format!(
+        "field `channels` has {count} noise channels, it must have one"
+    ))
 }

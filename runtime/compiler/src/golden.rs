@@ -98,7 +98,10 @@ impl Golden {
         let selected = if has("selected") {
             let selected = integers(&tensors, "selected")?;
             if selected.len() != steps {
-                return Err(format!("`selected` has {} steps, not {steps}", selected.len()));
+                return Err(format!(
+                    "`selected` has {} steps, not {steps}",
+                    selected.len()
+                ));
             }
             selected
                 .iter()
@@ -109,8 +112,13 @@ impl Golden {
             vec![]
         };
         let noise = if has("noise") {
-            let shape = tensors.tensor("noise").map(|tensor| tensor.shape().to_vec());
-            let width = shape.ok().and_then(|shape| shape.get(1).copied()).unwrap_or(0);
+            let shape = tensors
+                .tensor("noise")
+                .map(|tensor| tensor.shape().to_vec());
+            let width = shape
+                .ok()
+                .and_then(|shape| shape.get(1).copied())
+                .unwrap_or(0);
             floats(&tensors, "noise", &[steps, width])?
         } else {
             vec![]

@@ -6,9 +6,9 @@ use lads_image::codec::{Field, Writer};
 use lads_image::format::{self, CRC_WORD, Layout, SECTIONS, Tag};
 use lads_image::op::{Op, Place, WeightSpan};
 use lads_image::records::{
-    self, CallRecord, ChannelRecord, ContractRecord, ElementRecord, EntryRecord, Fill, GoldenRecord,
-    InstructionRecord, NONE, PortRecord, Repeat, Scope, Source, SourceKind, StateKind, StateRecord,
-    Text,
+    self, CallRecord, ChannelRecord, ContractRecord, ElementRecord, EntryRecord, Fill,
+    GoldenRecord, InstructionRecord, NONE, PortRecord, Repeat, Scope, Source, SourceKind,
+    StateKind, StateRecord, Text,
 };
 
 use crate::aligned::Aligned;
@@ -137,7 +137,10 @@ fn states(parts: &Parts, contract: &Contract, strings: &mut Strings) -> Vec<Used
                 rows.push(Used { of, record });
             }
             Keep::Kv(_) => {
-                let capacity = parts.caches.get(&state.name).map_or(0, |cache| cache.capacity);
+                let capacity = parts
+                    .caches
+                    .get(&state.name)
+                    .map_or(0, |cache| cache.capacity);
                 (record.kind, record.rows) = (StateKind::Kv, capacity as u32);
                 record.offset = row_end;
                 let halves = if is_cleared(parts, &state.name) { 2 } else { 1 };
@@ -409,7 +412,11 @@ fn entry_words(
         let inputs_len = ports(&made.placed.inputs, true);
         let outputs_len = ports(&made.placed.outputs, false);
         let cache = entry.cache.as_ref().and_then(|name| {
-            let of = parts.blueprint.states.iter().position(|state| state.name == *name)?;
+            let of = parts
+                .blueprint
+                .states
+                .iter()
+                .position(|state| state.name == *name)?;
             place_of(of)
         });
         let record = EntryRecord {
@@ -457,7 +464,11 @@ fn source(
 fn call_words(parts: &Parts, states: &[Used]) -> (Vec<u32>, Vec<u32>) {
     let (mut calls, mut clears) = (vec![], vec![]);
     let state = |name: &String| {
-        let of = parts.blueprint.states.iter().position(|state| state.name == *name)?;
+        let of = parts
+            .blueprint
+            .states
+            .iter()
+            .position(|state| state.name == *name)?;
         let found = states.iter().position(|state| state.of == of);
         found.map(|state| state as u32)
     };

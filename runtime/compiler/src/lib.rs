@@ -13,7 +13,7 @@
 //!
 //! ```text
 //! Abs Add ArgMax ArgMin BatchNormalization Cast Clip Concat Constant ConstantOfShape Div Dropout Erf Exp Expand Flatten Gather
-//! Gelu Gemm Identity LSTM LayerNormalization LeakyRelu Log LogSoftmax MatMul Max Min Mul Neg Pow Reciprocal ReduceL1 ReduceL2
+//! GRU Gelu Gemm Identity LSTM LayerNormalization LeakyRelu Log LogSoftmax MatMul Max Min Mul Neg Pow Reciprocal ReduceL1 ReduceL2
 //! ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare Relu Reshape Shape Sigmoid Slice Softmax Split Sqrt
 //! Squeeze Sub Sum Tanh Transpose Unsqueeze
 //! ```

@@ -12,8 +12,13 @@ use lads_image::records::{
 };
 use lads_image::tables::Tables;
 
+use crate::inputs::MAX_OBSERVATIONS;
+
 /// The most elements that a channel may have: an image of 4,096 by 4,096 pixels of four colours is within it.
 const MAX_CHANNEL_LEN: u64 = 1 << 26;
+
+/// The most channels that a policy may have.
+const MAX_CHANNELS: usize = 128;
 
 /// A checked view on the contract of a policy.
 #[derive(Debug, Clone, Copy)]
@@ -26,6 +31,7 @@ pub struct Contract<'a> {
     action: u32,
     action_len: u32,
     instruction: Option<u32>,
+    noise: Option<u32>,
 }
 
 /// Which channel of a policy: its position among [`Contract::channels`].
@@ -183,7 +189,11 @@ impl<'a> Contract<'a> {
             action: records::NONE,
             action_len: 0,
             instruction: None,
+            noise: None,
         };
+        if tables.channels_len() > MAX_CHANNELS {
+            return Err(ContractError::Channels);
+        }
         let mut elements = 0_u32;
         for (i, channel) in (0_u32..).zip(contract.channels()) {
             channel.check(elements)?;
@@ -210,14 +220,22 @@ impl<'a> Contract<'a> {
                     }
                     contract.instruction = Some(i);
                 }
-                Role::Noise | Role::Demonstration => {
+                Role::Noise => {
+                    if contract.noise.is_some() || channel.dtype() != DType::F32 {
+                        return Err(ContractError::Channels);
+                    }
+                    contract.noise = Some(i);
+                }
+                Role::Demonstration => {
                     if channel.dtype() != DType::F32 {
                         return Err(ContractError::Channels);
                     }
                 }
             }
         }
-        let complete = contract.observations_len > 0 && contract.action != records::NONE;
+        let observations = 1..=MAX_OBSERVATIONS;
+        let complete =
+            observations.contains(&contract.observations_len()) && contract.action != records::NONE;
         if !complete || elements as usize != tables.elements_len() {
             return Err(ContractError::Channels);
         }
@@ -333,6 +351,11 @@ impl<'a> Contract<'a> {
     /// The channel of word embeddings; `None` for a policy that takes no instruction.
     pub fn instruction_channel(&self) -> Option<Channel<'a>> {
         self.channel(ChannelId(self.instruction?))
+    }
+
+    /// The channel of random numbers; `None` for a policy that takes none.
+    pub fn noise_channel(&self) -> Option<Channel<'a>> {
+        self.channel(ChannelId(self.noise?))
     }
 
     /// Words of the longest instruction; 0 for a policy that takes none.
@@ -647,7 +670,8 @@ impl<'a> Channel<'a> {
 pub enum ContractError {
     /// The control period, the temperature or the acceptance threshold is not a number that makes sense.
     Number,
-    /// No observation, no action or more than one, a name twice, or a role whose elements have the wrong type.
+    /// No observation or more than a step has room for, no action, more than one action, instruction or noise, too many channels
+    /// in all, a name twice, or a role whose elements have the wrong type.
     Channels,
     /// The shape of a channel makes no sense, or its elements are not as many.
     Shape {

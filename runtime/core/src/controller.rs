@@ -27,7 +27,7 @@ use crate::errors::{EncodeError, FollowError, InputError, InstructionError, RunE
 use crate::inputs::{self, Data};
 use crate::normal::Normals;
 use crate::policy::Policy;
-use crate::run::{Counters, Draws, Run, due};
+use crate::run::{Counters, Draws, Rows, Run, due};
 use crate::workspace::Workspace;
 
 /// What a policy is told to do.
@@ -223,6 +223,11 @@ impl<'a, 'm> Controller<'a, 'm> {
             memory: &mut self.workspace,
             action: self.policy.contract().action().id().0,
             given,
+            noise: self
+                .policy
+                .contract()
+                .noise_channel()
+                .map(|channel| channel.id().0),
             draws: Draws::Zero,
             counters: Counters::START,
             words,
@@ -262,6 +267,7 @@ impl<'a, 'm> Controller<'a, 'm> {
                 memory: &mut self.workspace,
                 action: self.policy.contract().action().id().0,
                 given: &[],
+                noise: None,
                 draws: Draws::Zero,
                 counters,
                 words: 0,
@@ -296,11 +302,17 @@ impl<'a, 'm> Controller<'a, 'm> {
         cleared.timestep = 0;
         for (i, (rows, &base)) in cleared.rows.iter_mut().zip(&self.base).enumerate() {
             let state = self.policy.tables().state(i);
-            if state.is_some_and(|state| state.scope == Scope::Episode) {
-                rows.len = base;
+            let Some(state) = state.filter(|state| state.scope == Scope::Episode) else {
+                continue;
+            };
+            *rows = match state.kind {
+                StateKind::Ring => rows.emptied(&state),
                 // The instruction's rows lie in the first half; a cache that calls clear has none.
-                rows.start = 0;
-            }
+                _ => Rows {
+                    len: base,
+                    start: 0,
+                },
+            };
         }
         cleared
     }
@@ -454,6 +466,11 @@ impl<'a, 'm> Controller<'a, 'm> {
             memory: &mut self.workspace,
             action: self.policy.contract().action().id().0,
             given,
+            noise: self
+                .policy
+                .contract()
+                .noise_channel()
+                .map(|channel| channel.id().0),
             draws: Draws::Zero,
             counters,
             words: 0,
@@ -503,6 +520,11 @@ impl<'a, 'm> Controller<'a, 'm> {
             memory: &mut self.workspace,
             action: self.policy.contract().action().id().0,
             given,
+            noise: self
+                .policy
+                .contract()
+                .noise_channel()
+                .map(|channel| channel.id().0),
             draws,
             counters,
             words: 0,

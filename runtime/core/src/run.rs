@@ -32,6 +32,16 @@ pub(crate) struct Rows {
     pub start: u32,
 }
 
+impl Rows {
+    /// No rows of a ring: what follows lies behind those that were valid, which stay as they are.
+    pub fn emptied(self, ring: &StateRecord) -> Self {
+        Self {
+            len: 0,
+            start: wrapped(ring, self.start, self.len),
+        }
+    }
+}
+
 /// The counters that a step advances.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Counters {
@@ -79,8 +89,10 @@ pub(crate) struct Run<'r, 'a, 'm, 'd> {
     pub memory: &'r mut Workspace<'m>,
     /// Channel of the action.
     pub action: u32,
-    /// What the caller gave.
+    /// What the caller gave, but for noise, which is drawn.
     pub given: &'r [(ChannelId, Data<'d>)],
+    /// Channel of the noise.
+    pub noise: Option<u32>,
     pub draws: Draws<'d>,
     pub counters: Counters,
     /// Words of the instruction that is taken in.
@@ -158,10 +170,13 @@ impl Run<'_, '_, '_, '_> {
             let (at, len) = (record.offset as usize, record.width as usize);
             part_mut(self.memory.next.plain, at, len)?.fill(0.0);
         } else if let Some(rows) = self.counters.rows_mut(state) {
-            rows.len = 0;
-            if record.kind == StateKind::Kv {
-                rows.start = 1_u32.saturating_sub(rows.start);
-            }
+            *rows = match record.kind {
+                StateKind::Kv => Rows {
+                    len: 0,
+                    start: 1_u32.saturating_sub(rows.start),
+                },
+                _ => rows.emptied(&record),
+            };
         }
         Ok(())
     }
@@ -253,6 +268,7 @@ impl Run<'_, '_, '_, '_> {
                 let given = self.given.iter().find(|(id, _)| id.0 == source.of);
                 let to = elements(self.memory.arena, span)?;
                 match given {
+                    _ if self.noise == Some(source.of) => self.draws.next(to),
                     Some(&(_, Data::F32(values))) => fill(to, values),
                     Some(&(_, Data::U8(values))) => {
                         to.iter_mut()
@@ -265,7 +281,8 @@ impl Run<'_, '_, '_, '_> {
                             .for_each(|(to, &value)| *to = value as f32);
                     }
                     None if source.of == self.action => assign(to, self.memory.now.action),
-                    None => self.draws.next(to),
+                    // Only where nothing is given at all: to warm up.
+                    None => to.fill(0.0),
                 }
                 Ok(())
             }

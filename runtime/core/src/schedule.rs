@@ -28,6 +28,10 @@ const MAX_STATES: usize = 64;
 /// The most control steps of a bounded context, and of two periods of an unbounded one.
 const MAX_STEPS: u32 = 1 << 14;
 
+/// The most entries and the most calls of an image, and the most ports on a side of an entry: going through a context takes time
+/// in proportion.
+const MAX_RECORDS: usize = 128;
+
 /// The most runs of one call.
 const MAX_REPEAT: u32 = 1 << 16;
 
@@ -64,6 +68,7 @@ pub(crate) fn check(tables: &Tables, contract: &Contract) -> Checked<Sizes> {
         period: 1,
         ..Sizes::default()
     };
+    few(tables)?;
     states(tables, &mut sizes)?;
     entries(tables, contract, &mut sizes)?;
     calls(tables, contract, &mut sizes)?;
@@ -78,12 +83,33 @@ pub(crate) fn check(tables: &Tables, contract: &Contract) -> Checked<Sizes> {
     Ok(sizes)
 }
 
+/// There are no more records than can be gone through at every step of a context.
+fn few(tables: &Tables) -> Checked {
+    let lists = tables.states_len() <= MAX_STATES
+        && tables.entries_len() <= MAX_RECORDS
+        && tables.calls_len() <= MAX_RECORDS;
+    if !lists {
+        return Err(ScheduleError::TooMany);
+    }
+    let ports = |entry: EntryRecord| {
+        entry.inputs_len as usize <= MAX_RECORDS && entry.outputs_len as usize <= MAX_RECORDS
+    };
+    let entries = (0..tables.entries_len())
+        .filter_map(|i| tables.entry(i))
+        .all(ports);
+    let clears = tables
+        .calls()
+        .all(|call| call.clears_len as usize <= MAX_STATES);
+    if entries && clears {
+        Ok(())
+    } else {
+        Err(ScheduleError::TooMany)
+    }
+}
+
 /// States lie where their order puts them.
 fn states(tables: &Tables, sizes: &mut Sizes) -> Checked {
     let count = tables.states_len();
-    if count > MAX_STATES {
-        return Err(ScheduleError::TooMany);
-    }
     let (mut rows, mut bank, mut scratch) = (0_u64, 0_u64, 0_u64);
     let mut plain_before = false;
     for i in 0..count {
@@ -111,8 +137,11 @@ fn states(tables: &Tables, sizes: &mut Sizes) -> Checked {
                 (&mut rows, width.saturating_mul(physical), sound)
             }
             StateKind::Kv => {
-                let halves = if is_cleared(tables, i) { 2 } else { 1 };
+                // Half of a cache that calls clear is the next one's, so no row of an instruction would last.
+                let cleared = is_cleared(tables, i);
+                let halves = if cleared { 2 } else { 1 };
                 let sound = state.scope == Scope::Episode
+                    && !(cleared && is_instructed(tables, i))
                     && state.fill == Fill::Zero
                     && !plain_before
                     && i < MAX_ROW_STATES;
@@ -141,8 +170,18 @@ pub(crate) fn is_cleared(tables: &Tables, state: usize) -> bool {
         .any(|call| tables.clears(&call).iter().any(|&i| i as usize == state))
 }
 
-/// Every entry is a sound program with sound ports.
+/// Whether an instruction appends to a state.
+fn is_instructed(tables: &Tables, state: usize) -> bool {
+    tables
+        .calls()
+        .filter(|call| call.event == Event::Instruct)
+        .filter_map(|call| tables.entry(call.entry as usize))
+        .any(|entry| entry.cache as usize == state)
+}
+
+/// Every entry is a sound program with sound ports, and every KV cache is as large as what the programs use of it.
 fn entries(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked {
+    let mut used = [0; MAX_ROW_STATES];
     for i in 0..tables.entries_len() {
         let at = i as u32;
         let entry = tables.entry(i).ok_or(ScheduleError::Entry { entry: at })?;
@@ -170,9 +209,11 @@ fn entries(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked {
         )
         .map_err(|error| ScheduleError::Program { entry: at, error })?;
         let appends = entry.tokens > 0;
-        let whole = cache.is_none_or(|state| program.cache_end() <= u64::from(state.width));
-        if program.is_empty() || appends != cache.is_some() || !whole {
+        if program.is_empty() || appends != cache.is_some() {
             return Err(ScheduleError::Entry { entry: at });
+        }
+        if let Some(end) = used.get_mut(entry.cache as usize) {
+            *end = program.cache_end().max(*end);
         }
         for (side, ports) in [
             (Side::Input, entry.inputs_len),
@@ -191,6 +232,14 @@ fn entries(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked {
             }
         }
         sizes.arena_len = sizes.arena_len.max(program.arena_len());
+    }
+    for (i, end) in (0_u32..).zip(used) {
+        let kv = tables
+            .state(i as usize)
+            .filter(|state| state.kind == StateKind::Kv);
+        if kv.is_some_and(|state| u64::from(state.width) != end) {
+            return Err(ScheduleError::State { state: i });
+        }
     }
     Ok(())
 }
@@ -286,16 +335,26 @@ fn calls(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked {
         if !ordered || !period || !chained || !plain || !repeats || !clears {
             return Err(refused);
         }
-        if step && call.when == When::Every && !bounded {
-            if sizes.period > 1 && call.every != sizes.period {
+        let phases = tables
+            .inputs(&entry)
+            .filter(|port| port.source.kind == SourceKind::Phase);
+        let periods = phases.map(|port| port.source.of);
+        let own = (call.when == When::Every).then_some(call.every);
+        for period in periods
+            .chain(own)
+            .filter(|&period| step && !bounded && period > 1)
+        {
+            // Timesteps without end go back by whole periods.
+            if sizes.period > 1 && period != sizes.period {
                 return Err(refused);
             }
-            sizes.period = call.every;
+            sizes.period = period;
         }
         if call.select != records::NONE {
             let state = tables.state(call.select as usize).ok_or(refused)?;
             let same = sizes.scores.is_none_or(|scores| scores == state);
-            if state.kind != StateKind::Plain || !same {
+            // Scores are shown until the next selection.
+            if state.kind != StateKind::Plain || state.scope == Scope::Step || !same {
                 return Err(refused);
             }
             sizes.scores = Some(state);
@@ -405,17 +464,7 @@ impl Walk<'_, '_> {
                 *rows = 0;
             }
         }
-        let most = match call.repeat {
-            Repeat::Times => call.count,
-            Repeat::Rows => self
-                .tables
-                .state(call.count as usize)
-                .map_or(0, |ring| ring.rows),
-        };
-        let times = match call.repeat {
-            Repeat::Rows if self.bounded => self.rows(call.count).map_or(0, |rows| *rows),
-            _ => most,
-        };
+        let (least, times, most) = self.runs(call).ok_or(refused)?;
         let entry = self.tables.entry(call.entry as usize).ok_or(refused)?;
         self.reads(&entry, times, refused)?;
         if entry.cache != records::NONE {
@@ -429,15 +478,23 @@ impl Walk<'_, '_> {
         self.work = self
             .work
             .saturating_add(run.saturating_mul(u64::from(most)));
-        self.writes(&entry, refused)?;
-        if call.select != records::NONE {
-            let state = self.tables.state(call.select as usize).ok_or(refused)?;
-            if state.scope == Scope::Step && self.written & bit(call.select) == 0 {
-                return Err(refused);
-            }
-            self.selected = true;
+        if least > 0 {
+            self.writes(&entry, refused)?;
         }
+        self.selected |= call.select != records::NONE;
         Ok(())
+    }
+
+    /// How often a call runs: at least, at most at this step of a context, at most at any step.
+    fn runs(&mut self, call: &CallRecord) -> Option<(u32, u32, u32)> {
+        if call.repeat == Repeat::Times {
+            return Some((call.count, call.count, call.count));
+        }
+        let ring = self.tables.state(call.count as usize)?;
+        let rows = *self.rows(call.count)?;
+        // One that outlives the context, or knows no end of it, may be full already.
+        let known = self.bounded && ring.scope == Scope::Episode;
+        Some((rows, if known { rows } else { ring.rows }, ring.rows))
     }
 
     /// What an entry reads is there.

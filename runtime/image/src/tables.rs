@@ -288,6 +288,11 @@ impl<'a> Tables<'a> {
         self.ops.len()
     }
 
+    /// How many calls the schedule has.
+    pub fn calls_len(&self) -> usize {
+        self.calls.len()
+    }
+
     /// The schedule, in order.
     #[inline]
     pub fn calls(&self) -> impl Iterator<Item = CallRecord> + use<'a> {

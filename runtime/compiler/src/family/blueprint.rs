@@ -38,9 +38,7 @@ pub(crate) enum Origin {
     /// Graph of the bundle.
     Graph(String),
     /// A copy of a channel, to be appended to a ring.
-    Copy {
-        channel: String,
-    },
+    Copy { channel: String },
 }
 
 /// One program.
@@ -274,10 +272,15 @@ impl Blueprint {
                 return Some(found);
             }
             let ring = state(name)?;
-            let row = self.calls.iter().any(|call| {
-                call.entry == entry && call.times == Times::Rows(name.into())
+            let row = self
+                .calls
+                .iter()
+                .any(|call| call.entry == entry && call.times == Times::Rows(name.into()));
+            return Some(if row {
+                Bound::Row(ring)
+            } else {
+                Bound::State(ring)
             });
-            return Some(if row { Bound::Row(ring) } else { Bound::State(ring) });
         }
         if name == "index" {
             return Some(Bound::Selected);
@@ -330,7 +333,9 @@ impl Blueprint {
             }
         };
         run(Event::Instruct, 0);
-        let steps = contract.context.map_or(self.period.max(1), |context| context.steps);
+        let steps = contract
+            .context
+            .map_or(self.period.max(1), |context| context.steps);
         for timestep in 0..steps {
             run(Event::Step, timestep);
         }

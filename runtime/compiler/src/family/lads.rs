@@ -63,7 +63,12 @@ impl Kind for Lads {
             .entry(Entry::new("high_level/instruct", &[]).cache("context"))
             .call(Call::on(Event::Instruct, "high_level/instruct"))
             .call(Call::step(start).first().select("logits"))
-            .call(Call::step(step).every(self.horizon).otherwise().select("logits"))
+            .call(
+                Call::step(step)
+                    .every(self.horizon)
+                    .otherwise()
+                    .select("logits"),
+            )
             .call(Call::step(record).otherwise())
             .call(Call::step(lookup).every(self.horizon))
             .call(Call::step(act))

@@ -21,7 +21,11 @@ impl Kind for LangDt {
             .kv("context", contract.network)
             .entry(Entry::new(start, &["action"]).cache("context").acts())
             .entry(Entry::new(step, &["action"]).cache("context").acts())
-            .entry(Entry::new("high_level/instruct", &[]).cache("context").acts())
+            .entry(
+                Entry::new("high_level/instruct", &[])
+                    .cache("context")
+                    .acts(),
+            )
             .call(Call::on(Event::Instruct, "high_level/instruct"))
             .call(Call::step(start).first())
             .call(Call::step(step).otherwise())

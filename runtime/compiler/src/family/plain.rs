@@ -46,7 +46,10 @@ impl Kind for Plain {
                 },
             };
             let (width, field) = match &state.source {
-                Some(channel) => (contract.channel(channel).map_or(0, Channel::len), "channels"),
+                Some(channel) => (
+                    contract.channel(channel).map_or(0, Channel::len),
+                    "channels",
+                ),
                 None => (state.shape.iter().product(), "states"),
             };
             blueprint = blueprint.state(&state.name, keep, scope).wide(width, field);

@@ -61,7 +61,11 @@ impl Kind for SkillDiffuser {
             .plain("queue")
             .handed("embedding")
             .handed("x")
-            .entry(Entry::new(step, &["logits", "embedding"]).cache("context").acts())
+            .entry(
+                Entry::new(step, &["logits", "embedding"])
+                    .cache("context")
+                    .acts(),
+            )
             .entry(Entry::variant(record, step, &[]).cache("context"))
             .entry(Entry::new(init, &["x"]).acts())
             .entry(Entry::new(denoise, &["next_x"]).acts())

@@ -79,7 +79,11 @@ impl Kind for Vae {
             .entry(Entry::variant(record, step, &[]).cache("context").acts())
             .entry(Entry::new("plan/sample", &["plan"]).acts())
             .entry(Entry::new("low_level/act", &["action"]).acts())
-            .entry(Entry::new("high_level/instruct", &[]).cache("context").acts())
+            .entry(
+                Entry::new("high_level/instruct", &[])
+                    .cache("context")
+                    .acts(),
+            )
             .call(Call::on(Event::Instruct, "high_level/instruct"))
             .call(Call::step(start).first())
             .call(Call::step(step).every(self.horizon).otherwise())

@@ -2,7 +2,7 @@
 
 mod support;
 
-use lads_core::{Controller, Instruction, PlanIndex};
+use lads_core::{Controller, Instruction};
 use support::assemble::parts;
 use support::{Memory, Model, Random, Spec};
 
@@ -29,10 +29,11 @@ fn compare(model: &Model, words: &[f32], steps: usize, controller: &mut Controll
             .step(&observations[t], &mut action)
             .expect("the step is sound");
         assert_eq!(report.timestep as usize, t);
-        assert_eq!(report.decided, t.is_multiple_of(spec.horizon));
-        if report.decided {
+        let selected = report.selected.expect("it selects");
+        assert_eq!(selected.fresh, t.is_multiple_of(spec.horizon));
+        if selected.fresh {
             let logits = model.logits(words, &observations, &actions);
-            for (&logit, expected) in controller.logits().iter().zip(&logits) {
+            for (&logit, expected) in controller.scores().iter().zip(&logits) {
                 assert!(
                     (f64::from(logit) - expected).abs() < 1e-4,
                     "step {step}: {logit} against {expected}"
@@ -40,13 +41,13 @@ fn compare(model: &Model, words: &[f32], steps: usize, controller: &mut Controll
             }
             let mut sorted = logits.clone();
             sorted.sort_by(|a, b| b.total_cmp(a));
-            assert!((f64::from(report.margin) - (sorted[0] - sorted[1])).abs() < 2e-4);
+            assert!((f64::from(selected.margin) - (sorted[0] - sorted[1])).abs() < 2e-4);
             plan = logits
                 .iter()
                 .position(|&logit| logit == sorted[0])
                 .expect("one is the largest");
         }
-        assert_eq!(report.plan, PlanIndex(plan as u32), "step {step}");
+        assert_eq!(selected.index, plan as u32, "step {step}");
         for (&got, expected) in action.iter().zip(model.act(&observations[t], plan)) {
             largest = largest.max((f64::from(got) - expected).abs());
         }
@@ -139,7 +140,7 @@ fn the_executed_action_reaches_the_naive_model_too() {
         }
     }
     let expected = model.logits(&model.instructions[0], &observations, &executed);
-    for (&got, expected) in controller.logits().iter().zip(expected) {
+    for (&got, expected) in controller.scores().iter().zip(expected) {
         assert!((f64::from(got) - expected).abs() < 1e-4);
     }
 }
