@@ -5,6 +5,7 @@ import hashlib
 import sys
 from pathlib import Path
 
+from . import output
 from .config import UserError
 
 
@@ -15,11 +16,23 @@ def _encode(setting):
 
 
 def _random(arguments):
-    from . import bundle, config, random_policy
+    from . import bundle, config, kinds, random_policy
 
-    setting = config.load(arguments.config)
-    _, model = random_policy.export(setting, _encode(setting), arguments.seed)
+    read = [] if arguments.kind else [arguments.config]
+    output.check_apart(read, [arguments.output])
+    if arguments.kind:
+        _, model = kinds.export(arguments.kind, arguments.seed)
+    else:
+        setting = config.load(arguments.config)
+        _, model = random_policy.export(setting, _encode(setting), arguments.seed)
     print(f"{arguments.output}: random weights, sha256 {bundle.save(model, arguments.output)}")
+
+
+def _episode(arguments):
+    from . import episode
+
+    margin = episode.write(arguments.model, arguments.output, arguments.steps, arguments.seed)
+    print(f"{arguments.output}: {arguments.steps} steps, selections with a margin of {margin:.4g}")
 
 
 def _growth(arguments):
@@ -55,8 +68,16 @@ def _train(arguments):
     return 0
 
 
+def _check_card(arguments, more):
+    """Refuses a bundle or card in the place of something that the card is made from."""
+    path = Path(arguments.output)
+    results = [pair.rpartition("=")[2] for pair in arguments.beside]
+    read = [arguments.results, *results, path.with_suffix(".notes.md")]
+    output.check_apart(read, [*more, path.with_suffix(".md")])
+
+
 def _card(arguments, saved, sha256):
-    from . import bundle, card
+    from . import acceptance, card
 
     beside = []
     for pair in arguments.beside:
@@ -68,14 +89,15 @@ def _card(arguments, saved, sha256):
     path = Path(arguments.output).with_suffix(".md")
     notes = Path(arguments.output).with_suffix(".notes.md")
     notes = notes.read_text(encoding="utf-8") if notes.is_file() else ""
-    bundle.write_atomically(path, card.write(arguments.run, saved, sha256, results, beside, notes).encode())
+    output.write_atomically(path, card.write(arguments.run, saved, sha256, results, beside, notes, acceptance.beside(arguments.output)).encode())
     print(f"{path}: model card")
 
 
 def _export(arguments):
-    from . import bundle, training
+    from . import acceptance, bundle, training
     from .model import Lads
 
+    _check_card(arguments, [arguments.output])
     saved, setting = training.load_run(arguments.run)
     encoded = _encode(setting)
     identity = saved["identity"]
@@ -90,7 +112,11 @@ def _export(arguments):
         "steps": {name: getattr(setting.config.training, name).steps for name in names},
     }
     candidates = ((instruction, observations.numpy()) for instruction, observations in saved["golden"])
-    sha256 = bundle.save(bundle.assemble(lads, setting, encoded, provenance, candidates), arguments.output)
+    model = bundle.assemble(lads, setting, encoded, provenance, candidates)
+    calibrated = acceptance.beside(arguments.output)
+    if calibrated:
+        acceptance.into(model, calibrated)
+    sha256 = bundle.save(model, arguments.output)
     print(f"{arguments.output}: sha256 {sha256}")
     _card(arguments, saved, sha256)
 
@@ -98,6 +124,7 @@ def _export(arguments):
 def _card_alone(arguments):
     from . import training
 
+    _check_card(arguments, [])
     saved, _ = training.load_run(arguments.run)
     if not Path(arguments.output).is_file():
         raise UserError(f"no bundle at {arguments.output}; export one first (make export)")
@@ -107,6 +134,7 @@ def _card_alone(arguments):
 def _reference(arguments):
     from . import reference
 
+    output.check_apart([arguments.model], [arguments.output, f"{arguments.output}.progress"])
     if arguments.complete:
         from . import questions
 
@@ -118,6 +146,12 @@ def _reference(arguments):
     print(f"{arguments.output}: written; next: lads-run --model {arguments.model} --verify {arguments.output}")
 
 
+def _upgrade(arguments):
+    from . import upgrade
+
+    print(upgrade.write(arguments.model, arguments.output, arguments.environment))
+
+
 def _language(arguments):
     from . import language_graph
 
@@ -125,15 +159,34 @@ def _language(arguments):
     print(f"{folder}: {'written' if language_graph.write(arguments.encoder, folder) else 'up to date'}")
 
 
+def _calibrate(arguments):
+    from . import acceptance, config
+
+    setting = config.load(arguments.config)
+    calibrated = acceptance.calibrate(setting, acceptance.read_sentences(config.find(arguments.sentences), setting))
+    acceptance.write(calibrated, arguments.output)
+    print("\n".join(acceptance.lines(calibrated)))
+    print(f"{arguments.output}: written")
+
+
 def _parser():
     parser = argparse.ArgumentParser(prog="python -m lads_exporter", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     random = commands.add_parser("random", help="a bundle with random weights, for tests")
-    random.add_argument("--config", required=True)
+    network = random.add_mutually_exclusive_group(required=True)
+    network.add_argument("--config", help="a LADS policy of this configuration")
+    network.add_argument("--kind", help="a small policy of this kind: lads, lang_dt, lisa, vae, lcsd, skilldiffuser, history, plain, recurrent, stacked, camera")
     random.add_argument("-o", "--output", required=True)
     random.add_argument("--seed", type=int, default=0)
     random.set_defaults(run_command=_random)
+
+    episode = commands.add_parser("episode", help="a made-up episode of a bundle and what it does there, for tests of the runtime")
+    episode.add_argument("model", metavar="MODEL", help="the bundle")
+    episode.add_argument("-o", "--output", required=True, help="the .safetensors file; lads_exporter/episode.py says what is in it")
+    episode.add_argument("--steps", type=int, default=200)
+    episode.add_argument("--seed", type=int, default=0)
+    episode.set_defaults(run_command=_episode)
 
     growth = commands.add_parser("growth", help="random bundles in which one dimension grows, for the benchmarks")
     growth.add_argument("--config", required=True, help="the sizes of everything else")
@@ -171,10 +224,22 @@ def _parser():
     rollouts.add_argument("--noise", default="v0", help="observation noise: v0, v1 or none")
     rollouts.set_defaults(run_command=_reference)
 
+    upgraded = commands.add_parser("upgrade", help="a bundle of contract version 1 to version 2; graphs and weights stay as they are")
+    upgraded.add_argument("model", metavar="MODEL", help="the bundle")
+    upgraded.add_argument("-o", "--output", help="the file to write; left out, MODEL and what names its sha256 beside it")
+    upgraded.add_argument("--environment", metavar="FILE", help="says what an action means; left out, the one in exporter/configs of the bundle's environment")
+    upgraded.set_defaults(run_command=_upgrade)
+
     spoken = commands.add_parser("language", help="the language encoder as ONNX, so that lads-run takes any sentence")
     spoken.add_argument("--encoder", default="all-MiniLM-L6-v2", help="as in a config's language.encoder (all-MiniLM-L6-v2)")
     spoken.add_argument("-o", "--output", help="the folder; left out, language/ENCODER in $LADS_CACHE, else in the user's cache folder")
     spoken.set_defaults(run_command=_language)
+
+    calibrate = commands.add_parser("calibrate", help="how like a known instruction a free sentence must be to be followed")
+    calibrate.add_argument("--config", required=True, help="the policy's configuration")
+    calibrate.add_argument("--sentences", required=True, help="sentences that ask for what the policy knows, and others: configs/*.sentences.json")
+    calibrate.add_argument("-o", "--output", required=True, help="models/NAME.acceptance.json; `export` takes the one beside the bundle")
+    calibrate.set_defaults(run_command=_calibrate)
     return parser
 
 

@@ -6,127 +6,133 @@
 import base64
 import hashlib
 import json
-import os
-import tempfile
-from pathlib import Path
 
 import numpy as np
 import onnx
 from onnx import helper
 from safetensors.numpy import save as save_safetensors
 
-from . import __version__, graphs
+from . import __version__, contract as contracts, graphs, twin
 from .config import UserError
-from .replay import Bundle
+from .output import write_atomically
 
 GOLDEN_TOLERANCE = 1e-4
 GOLDEN_MARGIN = 1e-2  # smallest difference between the two best logits at any decision of a golden episode
 
 
-def contract(setting, encoded, provenance):
-    """The JSON object `lads.contract`."""
-    config, environment = setting.config, setting.environment
-    keep = ("name", "unit", "min", "max", "joint")
-    element = lambda row: {key: row[key] for key in keep if key in row}
-    high = config.high_level
-    return {
-        "version": 1,
-        "kind": "lads",
+def describe(family, environment, instructions, encoded, provenance, layer=-1, pooling="none", **parts):
+    """The JSON object `lads.contract` of any family; `parts` are further fields, those that are None are left out.
+
+    instructions: rows {id, text, sub_tasks, split}, none for a policy without.
+    """
+    language = None
+    if instructions:
+        language = {"encoder": encoded.encoder, "sha256": encoded.sha256, "dim": encoded.dim, "layer": layer, "pooling": pooling}
+    fields = {
+        "version": contracts.VERSION,
+        "family": family,
         "environment": {"id": environment["id"], "version": environment["version"]},
         "control_period_s": environment["control_period_s"],
-        "horizon": config.encoder.horizon,
-        "codebook": {"size": config.encoder.codebook_size, "dim": config.encoder.codebook_dim},
-        "decision": {"rule": config.decision, "temperature": 1.0, "seed": 0},
-        "observation": [element(row) for row in environment["observation"]],
-        "action": [element(row) for row in environment["action"]],
-        "quaternion_order": environment["quaternion_order"],
-        "context": {"words": encoded.max_words, "steps": high.context_steps, "beyond": config.beyond_context},
-        "instructions": [{key: row[key] for key in ("id", "text", "sub_tasks", "split")} for row in setting.instructions],
-        "language": {
-            "encoder": encoded.encoder,
-            "sha256": encoded.sha256,
-            "dim": encoded.dim,
-            "layer": config.language.layer,
-            "pooling": "mean" if config.language.pool else "none",
-        },
-        "network": {"layers": high.layers, "heads": high.heads, "head_dim": high.hidden // high.heads},
-        "provenance": {"setting": config.name, "code_version": __version__, **provenance},
+        "channels": parts.pop("channels"),
+        "states": parts.pop("states", None),
+        "context": parts.pop("context", None),
+        "instructions": [{key: row[key] for key in ("id", "text")} for row in instructions] or None,
+        "language": language,
+        "network": parts.pop("network", None),
+        "evaluation": {"instructions": [{key: row[key] for key in ("sub_tasks", "split")} for row in instructions]} if instructions else None,
+        "provenance": {"code_version": __version__, **provenance},
     }
+    assert not parts, parts
+    found = {key: value for key, value in fields.items() if value is not None}
+    contracts.check(found, environment["id"])
+    return found
 
 
-def flat_keys(setting):
-    """The comma-separated keys that Isaac Lab and mjlab exports carry, at full precision."""
-    observation, action = setting.environment["observation"], setting.environment["action"]
+def contract(setting, encoded, provenance):
+    """The contract of a LADS policy."""
+    config, environment = setting.config, setting.environment
+    high, encoder = config.high_level, config.encoder
+    family = {
+        "kind": "lads",
+        "horizon": encoder.horizon,
+        "codebook": {"size": encoder.codebook_size, "dim": encoder.codebook_dim},
+        "decision": {"rule": config.decision, "temperature": 1.0, "seed": 0},
+    }
+    return describe(
+        family,
+        environment,
+        setting.instructions,
+        encoded,
+        {"setting": config.name, **provenance},
+        layer=config.language.layer,
+        pooling="mean" if config.language.pool else "none",
+        channels=contracts.channels(environment, words=[encoded.max_words, encoded.dim], segment=encoder.horizon),
+        context={"words": encoded.max_words, "steps": high.context_steps, "beyond": config.beyond_context},
+        network={"layers": high.layers, "heads": high.heads, "head_dim": high.hidden // high.heads},
+    )
+
+
+def flat_keys(found):
+    """The comma-separated keys that Isaac Lab and mjlab exports carry, at full precision; none for what is no vector."""
+    action = contracts.action(found)["elements"]
     column = lambda rows, key, other="": ",".join(str(row.get(key, other)) for row in rows)
-    return {
+    keys = {
         "joint_names": column(action, "joint"),
-        "observation_names": column(observation, "name"),
-        "observation_min": column(observation, "min"),
-        "observation_max": column(observation, "max"),
         "action_names": column(action, "name"),
         "action_min": column(action, "min"),
         "action_max": column(action, "max"),
         "action_scale": column(action, "scale", 1.0),
     }
+    seen = contracts.of_role(found, "observation")
+    if len(seen) == 1 and "elements" in seen[0]:
+        rows = seen[0]["elements"]
+        keys |= {"observation_names": column(rows, "name"), "observation_min": column(rows, "min"), "observation_max": column(rows, "max")}
+    return keys
 
 
-def margin(logits, horizon):
-    """The smallest lead of the best over the second best logit, over all decisions of an episode [T, M]."""
-    best = np.sort(logits[::horizon], -1)
-    return float((best[:, -1] - best[:, -2]).min())
+def golden_tensors(rollout, instruction, channels):
+    """The tensors of a golden episode: {`channel.<name>`: [T, ...]}, what the policy did, and of which instruction."""
+    tensors = {f"channel.{name}": rows for name, rows in channels.items()} | rollout.tensors()
+    return tensors if instruction is None else tensors | {"instruction": np.array([instruction], np.int64)}
 
 
-def golden(model, contract_, candidates):
-    """The first candidate (instruction index, observations [T, O]) whose decisions are clear, as safetensors bytes.
+def golden(model, candidates):
+    """The first candidate whose decisions are clear, as safetensors bytes. `model` has its contract in it.
 
-    An episode longer than the context is cut; a close decision would make the self-test depend on rounding.
+    A candidate is an instruction's index, None for a policy without, and {name of a channel: [T, ...]}, or the array of the one
+    observation. An episode longer than the context is cut; a close decision would make the self-test depend on rounding.
     """
-    bundle = Bundle(model)
+    runner = twin.Twin(model)
+    rows = {row["name"]: row for row in contracts.of_role(runner.contract, "observation")}
     closest = []
-    for instruction, observations in candidates:
-        observations = np.ascontiguousarray(observations[: contract_["context"]["steps"]], np.float32)
-        plans, actions, logits = bundle.open_loop(contract_, instruction, observations)
-        lead = margin(logits, contract_["horizon"])
-        if lead >= GOLDEN_MARGIN:
-            tensors = {
-                "instruction": np.array([instruction], np.int64),
-                "observations": observations,
-                "plans": plans.astype(np.int64),
-                "actions": actions.astype(np.float32),
-            }
-            return save_safetensors(tensors, metadata={"tolerance": str(GOLDEN_TOLERANCE)})
-        closest.append(lead)
+    for instruction, given in candidates:
+        given = given if isinstance(given, dict) else {next(iter(rows)): given}
+        kind = lambda name: contracts.DTYPES[rows[name]["dtype"]]
+        channels = {name: np.ascontiguousarray(array[: runner.steps], kind(name)) for name, array in given.items()}
+        rollout = twin.open_loop(runner, instruction, channels)
+        if rollout.margin >= GOLDEN_MARGIN:
+            return save_safetensors(golden_tensors(rollout, instruction, channels), metadata={"tolerance": str(GOLDEN_TOLERANCE)})
+        closest.append(rollout.margin)
     raise UserError(
         f"none of {len(closest)} episodes decides with a margin of {GOLDEN_MARGIN} at every decision"
         f" (best {max(closest, default=0):.4f}); train longer or give more episodes"
     )
 
 
-def assemble(lads, setting, encoded, provenance, candidates):
-    """The complete, checked bundle. `candidates` yields (instruction index, observations) for the golden episode."""
-    lads.eval()
-    model = graphs.build(lads, encoded, setting.config.encoder.horizon)
-    facts = contract(setting, encoded, provenance)
-    blob = golden(model, facts, candidates)
-    properties = {"lads.contract": json.dumps(facts), "lads.golden": base64.b64encode(blob).decode()}
-    helper.set_model_props(model, properties | flat_keys(setting))
+def seal(model, found, candidates):
+    """Puts a contract and a golden episode into a model of entry graphs, and checks the whole."""
+    helper.set_model_props(model, {contracts.KEY: json.dumps(found)})
+    blob = base64.b64encode(golden(model, candidates)).decode()
+    helper.set_model_props(model, {contracts.KEY: json.dumps(found), contracts.GOLDEN_KEY: blob} | flat_keys(found))
     onnx.checker.check_model(model, full_check=True)
     return model
 
 
-def write_atomically(path, data):
-    """Writes beside the target and renames: a reader sees the old file or the new one, never a part."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+def assemble(lads, setting, encoded, provenance, candidates):
+    """The complete, checked bundle. `candidates` yields (instruction index, observations) for the golden episode."""
+    lads.eval()
+    model = graphs.build(lads, encoded, setting.config.encoder.horizon)
+    return seal(model, contract(setting, encoded, provenance), candidates)
 
 
 def save(model, path):

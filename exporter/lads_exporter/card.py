@@ -4,6 +4,7 @@ import csv
 import json
 from pathlib import Path
 
+from . import acceptance
 from .config import UserError
 from .training import CURVES, SUMMARY
 
@@ -73,8 +74,15 @@ def _curves(folder):
     return lines
 
 
-def write(folder, saved, sha256, results=None, beside=(), notes=""):
-    """The card as Markdown. `folder` is the run's, `saved` its checkpoint, `notes` what a person has to say."""
+def free_sentences(calibrated):
+    """The card's section on sentences outside the table."""
+    if calibrated is None:
+        return ["", "## Free sentences", "", "Not calibrated: sentences outside the table are refused unless the caller insists."]
+    return ["", "## Free sentences", "", *acceptance.lines(calibrated)]
+
+
+def write(folder, saved, sha256, results=None, beside=(), notes="", calibrated=None):
+    """The card as Markdown. `folder` is the run's, `saved` its checkpoint, `notes` what a person has to say, `calibrated` which sentences it follows."""
     summary = json.loads((Path(folder) / SUMMARY).read_text(encoding="utf-8"))
     tables, environment, _ = saved["identity"]["tables"]
     steps = ", ".join(f"{name} {count} ({summary['seconds'][name]:.0f} s)" for name, count in summary["steps"].items())
@@ -95,6 +103,7 @@ def write(folder, saved, sha256, results=None, beside=(), notes=""):
         f"- held out: {held_out}",
         f"- versions: {', '.join(f'{name} {version}' for name, version in summary['versions'].items())}",
         *_results(results, sha256, beside),
+        *free_sentences(calibrated),
         *(["", notes.strip()] if notes else []),
         "",
         "## Curves",

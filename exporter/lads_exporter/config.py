@@ -162,6 +162,11 @@ def _parse(path, parser):
         raise UserError(f"{path}: {error}") from error
 
 
+def read_toml(path):
+    """A TOML file as a table."""
+    return _parse(find(path), tomllib.loads)
+
+
 @dataclass(frozen=True)
 class Setting:
     """A configuration with the environment and the instructions it names."""
@@ -193,6 +198,12 @@ def from_tables(table, environment, instructions, where):
             raise UserError(f"{where}: {name} = {value!r}: must be one of {', '.join(allowed)}")
     if config.high_level.hidden % config.high_level.heads:
         raise UserError("high_level.hidden must be a multiple of high_level.heads")
+    steps, horizon = config.high_level.context_steps, config.encoder.horizon
+    if horizon < 1 or steps < 1 or steps % horizon:
+        raise UserError(
+            f"{where}: high_level.context_steps = {steps} is no multiple of encoder.horizon = {horizon}: where the context starts anew,"
+            " a plan would begin off the grid that the policy was trained on"
+        )
     for key in ("id", "version", "control_period_s", "quaternion_order", "observation", "action"):
         if key not in environment:
             raise UserError(f"{config.environment}: key {key!r} is missing")

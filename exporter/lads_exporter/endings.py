@@ -18,13 +18,13 @@ JOIN = " and "
 
 
 def texts(instructions, variants, seed=0):
-    """Seen instructions -> {(index, phrases kept): other texts with the same first phrases}."""
-    seen = [row["text"].split(JOIN) for row in instructions if row["split"] == "seen"]
-    phrases = sorted({phrase for row in seen for phrase in row})
+    """Instructions -> {(index of a seen one among all, phrases kept): other texts with the same first phrases}."""
+    seen = {index: row["text"].split(JOIN) for index, row in enumerate(instructions) if row["split"] == "seen"}
+    phrases = sorted({phrase for row in seen.values() for phrase in row})
     real = {row["text"] for row in instructions}
     draw = random.Random(seed)
     made = {}
-    for index, row in enumerate(seen):
+    for index, row in seen.items():
         for kept in range(1, len(row)):
             others = [phrase for phrase in phrases if phrase not in row[:kept]]
             if len(others) < len(row) - kept:

@@ -1,8 +1,8 @@
 """The entry graphs of a bundle, written node by node from the trained networks.
 
 Invariants: every value of an entry is named `entry/...`; initializers are shared between entries, under
-`weights/` and `constants/`, and none is stored twice; all shapes are static except the context length P
-of `high_level/start` and `high_level/step`. Normalisation is inside: observations come in raw units.
+`weights/` and `constants/`, and none is stored twice; all shapes are static except the number P of keys and
+values that an entry is given. Normalisation is inside: observations come in raw units.
 """
 
 import numpy as np
@@ -64,6 +64,9 @@ class Entry:
     def integers(self, name, values):
         return self.graph.constant(f"constants/{name}", np.array(values, np.int64))
 
+    def scalar(self, name, value):
+        return self.graph.constant(f"constants/{name}", np.float32(value))
+
     def gemm(self, x, weight, bias, out):
         """x [m, k] times weight [n, k] (as PyTorch stores it) transposed, plus bias."""
         return self.op("Gemm", [x, weight, bias], out, transB=1)
@@ -87,15 +90,15 @@ def to_numpy(tensor):
     return array.astype(np.float32)
 
 
-def _double(tensor):
+def double(tensor):
     return tensor.detach().cpu().double().numpy()
 
 
-def _fold_std(weight, normalizer):
+def fold_std(weight, normalizer):
     """weight [n, O + rest] on normalised observations -> the same map on centred ones."""
-    folded = _double(weight)
+    folded = double(weight)
     observations = len(normalizer.std)
-    folded[:, :observations] /= _double(normalizer.std)
+    folded[:, :observations] /= double(normalizer.std)
     return folded
 
 
@@ -109,11 +112,11 @@ def instruction_lookup(graph, words, lengths):
     entry.output("length", [1], TensorProto.INT64)
 
 
-class _Transformer:
-    """The high level's transformer over `new` tokens, with or without a cache of past keys and values."""
+class Transformer:
+    """A level's transformer over `new` tokens, with or without a cache of past keys and values."""
 
-    def __init__(self, entry, policy, new, cached):
-        self.entry, self.policy, self.new, self.cached = entry, policy, new, cached
+    def __init__(self, entry, policy, new, cached, level="high_level"):
+        self.entry, self.policy, self.new, self.cached, self.level = entry, policy, new, cached, level
         self.hidden = policy.norm.normalized_shape[0]
         self.heads = policy.blocks[0].heads
         self.head_dim = self.hidden // self.heads
@@ -127,7 +130,7 @@ class _Transformer:
     def block(self, x, number, record_only=False):
         """Adds block `number`; returns its output rows, or None when only keys and values are wanted."""
         entry, block, name = self.entry, self.policy.blocks[number], f"block.{number}"
-        weights = f"high_level.block.{number}"
+        weights = f"{self.level}.block.{number}"
         normed = entry.layer_norm(x, weights + ".norm1", block.norm1, name + ".norm1")
         joint = entry.linear(normed, weights + ".qkv", block.qkv, name + ".qkv")
         q, k, v = entry.op("Split", [joint], [f"{name}.{t}_rows" for t in "qkv"], axis=-1, num_outputs=3)
@@ -143,6 +146,17 @@ class _Transformer:
         up = entry.op("Relu", [entry.linear(normed, weights + ".up", block.up, name + ".up")], name + ".relu")
         down = entry.linear(up, weights + ".down", block.down, name + ".down")
         return entry.op("Add", [x, down], name + ".sum")
+
+    def run(self, x, record_only=False):
+        """All blocks over tokens [1, new, d] -> the last token's row [1, d] after the final norm, None when only recording."""
+        last = len(self.policy.blocks) - 1
+        for number in range(last + 1):
+            x = self.block(x, number, record_only=record_only and number == last)
+        if record_only:
+            return None
+        place = self.entry.graph.constant(f"constants/last_token.{self.new}", np.int64(self.new - 1))
+        x = self.entry.op("Gather", [x, place], "state_token", axis=1)
+        return self.entry.layer_norm(x, f"{self.level}.norm", self.policy.norm, "state_normed")
 
     def _to_heads(self, rows, out, number):
         """[1, new, hidden] -> [1, heads, new, head_dim]. Without a cache, new keys and values are the present ones."""
@@ -189,47 +203,56 @@ def high_level_instruct(graph, policy, words_len):
     words = entry.input("words", [1, words_len, policy.embed_word.in_features])
     x = entry.linear(words, "high_level.embed_word", policy.embed_word, "word_tokens")
     x = entry.layer_norm(x, "high_level.embed_norm", policy.embed_norm, "tokens")
-    transformer = _Transformer(entry, policy, words_len, cached=False)
-    last = len(policy.blocks) - 1
-    for number in range(last + 1):
-        x = transformer.block(x, number, record_only=number == last)
+    Transformer(entry, policy, words_len, cached=False).run(x, record_only=True)
 
 
-def high_level_step(graph, policy, normalizer, first):
-    """`high_level/start` (first: the observation only) and `high_level/step` (previous action, then observation)."""
+def high_level_state(graph, policy, normalizer, first=False, previous=None):
+    """The nodes of `high_level/start` or `high_level/step` up to the state token -> the entry, its row [1, d], the observation's embedding.
+
+    previous: the name of the input for the previous action; without it the history is of observations only.
+    """
     entry = Entry(graph, "high_level/start" if first else "high_level/step")
     tokens = []
-    if not first:
-        action = entry.input("action", [1, policy.embed_action.in_features])
+    if previous and not first:
+        action = entry.input(previous, [1, policy.embed_action.in_features])
     observation = entry.input("observation", [1, policy.embed_observation.in_features])
     timestep = entry.input("timestep", [1], TensorProto.INT64)
     times = entry.weight("high_level.embed_timestep", policy.embed_timestep.weight)
-    if not first:
+    if previous and not first:
         before = entry.op("Sub", [timestep, entry.integers("one", [1])], "timestep_before")
-        tokens.append(_token(entry, action, policy.embed_action, (times, before), "action"))
-    centred = entry.centred(observation, normalizer, "observation_centred")
-    folded = _fold_std(policy.embed_observation.weight, normalizer)
-    tokens.append(_token(entry, centred, policy.embed_observation, (times, timestep), "observation", folded))
-    x = tokens[0] if first else entry.op("Concat", tokens, "token_pair", axis=1)
+        tokens.append(token(entry, action, policy.embed_action, (times, before), "action"))
+    tokens.append(observed_token(entry, observation, policy, normalizer, (times, timestep)))
+    x = tokens[0] if len(tokens) == 1 else entry.op("Concat", tokens, "token_pair", axis=1)
     x = entry.layer_norm(x, "high_level.embed_norm", policy.embed_norm, "tokens")
-    transformer = _Transformer(entry, policy, len(tokens), cached=True)
-    for number in range(len(policy.blocks)):
-        x = transformer.block(x, number)
-    last = entry.graph.constant(f"constants/last_token.{len(tokens)}", np.int64(len(tokens) - 1))
-    x = entry.op("Gather", [x, last], "state_token", axis=1)
-    x = entry.layer_norm(x, "high_level.norm", policy.norm, "state_normed")
-    head = policy.head
-    entry.gemm(x, entry.weight("high_level.head.weight", head.weight), entry.weight("high_level.head.bias", head.bias), "logits")
-    entry.output("logits", [1, head.out_features])
+    return entry, Transformer(entry, policy, len(tokens), cached=True).run(x), f"{entry.name}/observation_embedded"
 
 
-def _token(entry, x, module, time, name, weight=None):
-    """x [1, k] -> token [1, 1, d]: linear embedding plus the timestep's row."""
-    weight = entry.weight(f"high_level.embed_{name}.weight", module.weight if weight is None else weight)
-    embedded = entry.gemm(x, weight, entry.weight(f"high_level.embed_{name}.bias", module.bias), name + "_embedded")
+def head(entry, x, module, out, name="high_level.head"):
+    """A linear output of a row [1, d]."""
+    entry.gemm(x, entry.weight(name + ".weight", module.weight), entry.weight(name + ".bias", module.bias), out)
+    entry.output(out, [1, module.out_features])
+
+
+def high_level_step(graph, policy, normalizer, first, out="logits", previous="action"):
+    """`high_level/start` (first: the observation only) and `high_level/step` (previous action, then observation)."""
+    entry, x, _ = high_level_state(graph, policy, normalizer, first, previous)
+    head(entry, x, policy.head, out)
+
+
+def observed_token(entry, observation, policy, normalizer, time, level="high_level"):
+    """The token of an observation in raw units."""
+    centred = entry.centred(observation, normalizer, "observation_centred")
+    folded = fold_std(policy.embed_observation.weight, normalizer)
+    return token(entry, centred, policy.embed_observation, time, "observation", folded, level)
+
+
+def token(entry, x, module, time, name, weight=None, level="high_level"):
+    """x [1, k] -> token [1, 1, d]: linear embedding plus the row `time` = (table, index)."""
+    weight = entry.weight(f"{level}.embed_{name}.weight", module.weight if weight is None else weight)
+    embedded = entry.gemm(x, weight, entry.weight(f"{level}.embed_{name}.bias", module.bias), name + "_embedded")
     row = entry.op("Gather", list(time), name + "_time", axis=0)
-    token = entry.op("Add", [embedded, row], name + "_flat")
-    return entry.op("Unsqueeze", [token, entry.integers("axis_one", [1])], name + "_token")
+    flat = entry.op("Add", [embedded, row], name + "_flat")
+    return entry.op("Unsqueeze", [flat, entry.integers("axis_one", [1])], name + "_token")
 
 
 def codebook_lookup(graph, codes):
@@ -247,11 +270,11 @@ def low_level_act(graph, policy, normalizer):
     plan = entry.input("plan", [1, policy.first.in_features - observations])
     centred = entry.centred(observation, normalizer, "observation_centred")
     x = entry.op("Concat", [centred, plan], "observation_and_plan", axis=1)
-    layers = [(_fold_std(policy.first.weight, normalizer), policy.first.bias)]
+    layers = [(fold_std(policy.first.weight, normalizer), policy.first.bias)]
     for linear, norm in zip(policy.middle, policy.norms):
-        scale = _double(norm.weight) / np.sqrt(_double(norm.running_var) + norm.eps)
-        bias = _double(norm.bias) - scale * _double(norm.running_mean)
-        layers.append((scale[:, None] * _double(linear.weight), bias))
+        scale = double(norm.weight) / np.sqrt(double(norm.running_var) + norm.eps)
+        bias = double(norm.bias) - scale * double(norm.running_mean)
+        layers.append((scale[:, None] * double(linear.weight), bias))
     layers.append((policy.last.weight, policy.last.bias))
     for number, (weight, bias) in enumerate(layers):
         name = f"low_level.layer.{number}"
@@ -264,7 +287,7 @@ def low_level_act(graph, policy, normalizer):
 
 
 def trajectory_encode(graph, encoder, codes, normalizer, horizon):
-    """A whole segment of H steps to its latent and the index of the nearest code."""
+    """A whole segment of H steps to its latent and, where there are codes, the index of the nearest one."""
     entry = Entry(graph, "trajectory_encoder/encode")
     observation_len, hidden = len(normalizer.mean), encoder.lstm.hidden_size
     observations = entry.input("observations", [1, horizon, observation_len])
@@ -278,9 +301,9 @@ def trajectory_encode(graph, encoder, codes, normalizer, horizon):
     sequence = entry.op("Transpose", [joined], "sequence", perm=[1, 0, 2])
     weight, bias = encoder.input_weights()
     order = lambda array: np.concatenate([np.split(array, 4)[gate] for gate in (0, 3, 1, 2)])  # ONNX: i, o, f, c
-    inputs = entry.weight("encoder.lstm.input", order(_fold_std(weight, normalizer))[None])
-    recurrent = entry.weight("encoder.lstm.recurrent", order(_double(encoder.lstm.weight_hh_l0))[None])
-    biases = np.concatenate([order(_double(bias)), order(_double(encoder.lstm.bias_hh_l0))])[None]
+    inputs = entry.weight("encoder.lstm.input", order(fold_std(weight, normalizer))[None])
+    recurrent = entry.weight("encoder.lstm.recurrent", order(double(encoder.lstm.weight_hh_l0))[None])
+    biases = np.concatenate([order(double(bias)), order(double(encoder.lstm.bias_hh_l0))])[None]
     lstm = [sequence, inputs, recurrent, entry.weight("encoder.lstm.bias", biases)]
     _, final = entry.op("LSTM", lstm, ["lstm_outputs", "lstm_final"], hidden_size=hidden)
     x = entry.op("Reshape", [final, entry.integers("encoder.flat", [1, hidden])], "lstm_flat")
@@ -293,7 +316,9 @@ def trajectory_encode(graph, encoder, codes, normalizer, horizon):
         x = entry.gemm(x, weight, bias, out)
         if not final:
             x = entry.op("LeakyRelu", [x], out + ".leaky", alpha=encoder.mlp[1].negative_slope)
-    entry.output("latent", [1, codes.shape[1]])
+    entry.output("latent", [1, linears[-1].out_features])
+    if codes is None:
+        return
     offset = entry.op("Sub", [x, entry.weight("codebook", codes)], "offset")
     square = entry.op("Mul", [offset, offset], "offset_squared")
     distance = entry.op("ReduceSum", [square, entry.integers("axis_one", [1])], "distance", keepdims=0)
@@ -301,16 +326,21 @@ def trajectory_encode(graph, encoder, codes, normalizer, horizon):
     entry.output("index", [1], TensorProto.INT64)
 
 
-def build(lads, encoded, horizon):
-    """All entries of one policy as one checked ONNX model, without metadata."""
-    graph = Graph()
+def known_instructions(graph, policy, encoded):
+    """The table of instructions, and the entry that puts one into the high level's context."""
     words = np.zeros((len(encoded.instructions), encoded.max_words, encoded.dim), np.float32)
     for row, instruction in enumerate(encoded.instructions):
         words[row, : len(instruction.words)] = instruction.words
     lengths = [len(instruction.words) for instruction in encoded.instructions]
-    codes = to_numpy(lads.codebook.codes)
     instruction_lookup(graph, words, lengths)
-    high_level_instruct(graph, lads.high_level, encoded.max_words)
+    high_level_instruct(graph, policy, encoded.max_words)
+
+
+def build(lads, encoded, horizon):
+    """All entries of one policy as one checked ONNX model, without metadata."""
+    graph = Graph()
+    codes = to_numpy(lads.codebook.codes)
+    known_instructions(graph, lads.high_level, encoded)
     high_level_step(graph, lads.high_level, lads.normalizer, first=True)
     high_level_step(graph, lads.high_level, lads.normalizer, first=False)
     codebook_lookup(graph, codes)

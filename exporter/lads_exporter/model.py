@@ -87,14 +87,17 @@ class Block(nn.Module):
 
 
 class HighLevelPolicy(nn.Module):
-    """pi_h: a causal transformer over words, states and actions; plan logits at every state token (equation 8)."""
+    """pi_h: a causal transformer over words, states and actions; plan logits at every state token (equation 8).
+
+    Without an `action_len` the history is of states only, as LISA's.
+    """
 
     def __init__(self, config, word_dim, observation_len, action_len, codes):
         super().__init__()
         hidden = config.hidden
         self.embed_word = nn.Linear(word_dim, hidden)
         self.embed_observation = nn.Linear(observation_len, hidden)
-        self.embed_action = nn.Linear(action_len, hidden)
+        self.embed_action = nn.Linear(action_len, hidden) if action_len else None
         self.embed_timestep = nn.Embedding(config.context_steps, hidden)
         self.embed_norm = nn.LayerNorm(hidden)
         self.drop = Dropout(config.dropout)
@@ -107,8 +110,8 @@ class HighLevelPolicy(nn.Module):
             if isinstance(module, nn.Linear):
                 nn.init.zeros_(module.bias)
 
-    def forward(self, words, observations, actions):
-        """words: B tensors [L_i, E]; observations [B, T, O]; actions [B, T, A] -> logits [B, T, M].
+    def forward(self, words, observations, actions=None):
+        """words: B tensors [L_i, E]; observations [B, T, O]; actions [B, T, A], or None -> logits [B, T, M].
 
         Each sequence is its words, then s_0, a_0, s_1, a_1, ...; shorter instructions are padded at the front
         and the padding is masked, so that state tokens stand in the same rows throughout a batch. Shorter
@@ -116,16 +119,18 @@ class HighLevelPolicy(nn.Module):
         """
         steps = observations.shape[1]
         time = self.embed_timestep.weight[:steps]
-        pairs = torch.stack([self.embed_observation(observations) + time, self.embed_action(actions) + time], 2)
-        pairs = pairs.flatten(1, 2)[:, :-1]  # nothing follows the last action
+        history = self.embed_observation(observations) + time
+        if self.embed_action is not None:
+            pairs = torch.stack([history, self.embed_action(actions) + time], 2)
+            history = pairs.flatten(1, 2)[:, :-1]  # nothing follows the last action
         prefix = max(len(row) for row in words)
         padded = torch.stack([F.pad(row, (0, 0, prefix - len(row), 0)) for row in words])
-        x = torch.cat([self.embed_word(padded), pairs], 1)
+        x = torch.cat([self.embed_word(padded), history], 1)
         mask = self._mask([prefix - len(row) for row in words], x.shape[1], x.device)
         x = self.drop(self.embed_norm(x.float()))
         for block in self.blocks[:-1]:
             x = block(x, mask)
-        states = self.blocks[-1](x, mask, slice(prefix, None, 2))
+        states = self.blocks[-1](x, mask, slice(prefix, None, 1 if self.embed_action is None else 2))
         return self.head(self.norm(states)).float()
 
     @staticmethod

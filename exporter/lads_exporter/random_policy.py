@@ -3,47 +3,82 @@
 import numpy as np
 import torch
 
-from . import bundle
+from . import bundle, contract as contracts
 from .model import Lads
 
 
-def _limits(setting):
-    rows = setting.environment["observation"]
-    low, high = (np.array([row[key] for row in rows], np.float64) for key in ("min", "max"))
-    return (low + high) / 2, (high - low) / 2
-
-
-def randomize(lads, setting, seed):
+def draw_weights(module, generator):
     """Weights of healthy size everywhere, so that every token and every term matters in the outputs."""
-    generator = torch.Generator().manual_seed(seed)
     draw = lambda tensor: torch.randn(tensor.shape, generator=generator)
     with torch.no_grad():
-        for name, value in lads.named_parameters():
+        for name, value in module.named_parameters():
             if "norm" in name and name.endswith("weight"):
                 value.copy_(1 + 0.2 * draw(value))
             elif value.dim() > 1:
                 value.copy_(draw(value) / value.shape[-1] ** 0.5)
             elif name.endswith("bias"):
                 value.copy_(0.2 * draw(value))
+
+
+def place_normalizer(normalizer, rows):
+    """Statistics of observations that fill a good part of their limits."""
+    centre, half = _limits(*([row[key] for row in rows] for key in ("min", "max")))
+    normalizer.mean.copy_(torch.from_numpy(centre + 0.1 * half))
+    normalizer.std.copy_(torch.from_numpy(0.3 * half))
+
+
+def _limits(low, high):
+    low, high = np.array(low, np.float64), np.array(high, np.float64)
+    return (low + high) / 2, (high - low) / 2
+
+
+def randomize(lads, setting, seed):
+    """Random weights for a LADS policy."""
+    generator = torch.Generator().manual_seed(seed)
+    draw = lambda tensor: torch.randn(tensor.shape, generator=generator)
+    draw_weights(lads, generator)
+    with torch.no_grad():
         lads.high_level.embed_timestep.weight.copy_(0.3 * draw(lads.high_level.embed_timestep.weight))
         lads.high_level.head.weight.mul_(2)
         for norm in lads.low_level.norms:
             norm.running_mean.copy_(0.2 * draw(norm.running_mean))
             norm.running_var.copy_(0.5 + torch.rand(norm.running_var.shape, generator=generator))
-        centre, half = _limits(setting)
-        lads.normalizer.mean.copy_(torch.from_numpy(centre + 0.1 * half))
-        lads.normalizer.std.copy_(torch.from_numpy(0.3 * half))
+        place_normalizer(lads.normalizer, setting.environment["observation"])
         lads.codebook.codes.copy_(draw(lads.codebook.codes))
         lads.codebook.started.fill_(True)
 
 
-def observations(setting, steps, seed):
-    """Smooth made-up observations [steps, O] well inside the limits."""
-    centre, half = _limits(setting)
+def wave(low, high, steps, seed):
+    """Smooth made-up values [steps, n] well inside the limits."""
+    centre, half = _limits(low, high)
     rng = np.random.default_rng(seed)
     phase, speed = rng.uniform(0, 2 * np.pi, len(centre)), rng.uniform(0.01, 0.2, len(centre))
     wave = np.sin(phase + speed * np.arange(steps)[:, None]) * rng.uniform(0.1, 0.6, len(centre))
     return (centre + half * (wave + 0.01 * rng.uniform(-1, 1, wave.shape))).astype(np.float32)
+
+
+def observations(setting, steps, seed):
+    """Smooth made-up observations [steps, O] well inside the limits."""
+    rows = setting.environment["observation"]
+    return wave(*([row[key] for row in rows] for key in ("min", "max")), steps, seed)
+
+
+def channels(contract, steps, seed):
+    """Made-up observations for every channel of a contract: {name: [steps, ...]}."""
+    found = {}
+    for number, row in enumerate(contracts.of_role(contract, "observation")):
+        low, high = contracts.limits(row)
+        if row["dtype"] == "f32":
+            flat = wave(low, high, steps, [seed, number]) if "elements" in row else wave(low * _size(row), high * _size(row), steps, [seed, number])
+        else:
+            draw = np.random.default_rng([seed, number])
+            flat = draw.integers(low[0], high[0], (steps, _size(row)), contracts.DTYPES[row["dtype"]], endpoint=True)
+        found[row["name"]] = flat.reshape(steps, *row["shape"])
+    return found
+
+
+def _size(row):
+    return int(np.prod(row["shape"]))
 
 
 def export(setting, encoded, seed, steps=None):

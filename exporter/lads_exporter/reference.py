@@ -24,13 +24,15 @@ import onnx
 import torch
 from tqdm import tqdm
 
-from . import __version__, config, language, official, questions, weights
-from .bundle import write_atomically
+from . import __version__, config, contract as contracts, language, official, questions, weights
+from .output import write_atomically
 
 FORMAT, FORMAT_VERSION = "lads-reference", 2
 TRACED_STATES = 50
-# What a policy is for; the rest of a contract says how it is built, which is what a verification compares.
-PURPOSE = ("environment", "control_period_s", "observation", "action", "quaternion_order", "instructions", "language")
+# What a policy is for; the rest of a contract says how it is built, which is what a verification compares. Of the channels, those that
+# the environment gives and takes; of the language, what makes words of a sentence, and not which sentences are refused.
+PURPOSE = ("environment", "control_period_s", "channels", "instructions", "language", "evaluation")
+PURPOSE_ROLES = ("observation", "action")
 
 
 def purpose_sha256(contract):
@@ -62,7 +64,11 @@ def purpose_sha256(contract):
         else:
             digest.update(struct.pack(">d", value).hex().encode())
 
-    add({key: contract[key] for key in PURPOSE if key in contract})
+    purpose = {key: contract[key] for key in PURPOSE if key in contract}
+    purpose["channels"] = [row for row in contract["channels"] if row["role"] in PURPOSE_ROLES]
+    if "language" in purpose:
+        purpose["language"] = {key: value for key, value in purpose["language"].items() if key != "acceptance"}
+    add(purpose)
     return digest.hexdigest()
 
 
@@ -72,8 +78,7 @@ class FullSequencePolicy:
     def __init__(self, acting, contract, words):
         """words: one tensor [L, E] per instruction."""
         self.acting, self.contract, self.words = acting, contract, words
-        limits = ((row["min"], row["max"]) for row in contract["action"])
-        self.low, self.high = (torch.tensor(column, dtype=torch.float32) for column in zip(*limits))
+        self.low, self.high = (torch.tensor(side, dtype=torch.float32) for side in contracts.limits(contracts.action(contract)))
 
     def start(self, instruction):
         self.instruction = instruction
@@ -90,7 +95,7 @@ class FullSequencePolicy:
             self.observations, self.actions = [], []
         acting = self.acting
         self.observations.append(acting.normalizer(torch.from_numpy(observation)))
-        if (len(self.observations) - 1) % self.contract["horizon"] == 0:
+        if (len(self.observations) - 1) % contracts.period(self.contract) == 0:
             logits = self._logits()
             best = logits.topk(2).values
             self.plans.append(int(logits.argmax()))
@@ -229,11 +234,13 @@ def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0"):
     data = Path(bundle).read_bytes()
     try:
         model = onnx.load_from_string(data)
-        contract = json.loads({row.key: row.value for row in model.metadata_props}["lads.contract"])
     except Exception as error:
         raise config.UserError(f"{bundle}: not a bundle with a contract ({type(error).__name__}); export one first") from error
-    if contract["decision"]["rule"] != "argmax":
-        raise config.UserError(f"{bundle}: plans are decided by {contract['decision']['rule']}; a reference needs argmax")
+    contract = contracts.of(model, bundle)
+    if contract["family"]["kind"] != "lads":
+        raise config.UserError(f"{bundle}: a {contract['family']['kind']} policy; a reference is made of lads policies")
+    if contracts.rule(contract) != "argmax":
+        raise config.UserError(f"{bundle}: plans are decided by {contracts.rule(contract)}; a reference needs argmax")
     make = official.ENVIRONMENTS.get(contract["environment"]["id"])
     if make is None:
         raise config.UserError(f"{bundle}: no official environment for {contract['environment']['id']!r}")
@@ -242,16 +249,17 @@ def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0"):
     acting, weights_from = _acting(model, contract, run)
     words, words_from, words_difference = _words(model, contract)
     policy = FullSequencePolicy(acting, contract, words)
+    known = contracts.splits(contract)
     head = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "bundle_sha256": hashlib.sha256(data).hexdigest(),
         "purpose_sha256": purpose_sha256(contract),
-        "environment": {"id": environment.ID, "version": environment.VERSION, "max_steps": max(environment.max_steps(row["split"]) for row in contract["instructions"])},
+        "environment": {"id": environment.ID, "version": environment.VERSION, "max_steps": max(environment.max_steps(row["split"]) for row in known)},
         "seed": seed,
         "noise": noise,
         "decision": "argmax",
-        "horizon": contract["horizon"],
+        "horizon": contracts.period(contract),
         "episodes_per_instruction": episodes,
         "traced_episodes": traced,
         "weights_from": weights_from,
@@ -266,7 +274,6 @@ def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0"):
         },
     }
     progress = Progress(output, head)
-    known = contract["instructions"]
     with tqdm(total=len(known) * episodes, initial=len(progress.done), unit="episode") as bar:
         for number in range(episodes):
             for index, instruction in enumerate(known):

@@ -12,6 +12,7 @@ import torch
 from onnx import numpy_helper
 from torch import nn
 
+from . import contract as contracts
 from .config import HighLevel, LowLevel, UserError
 from .model import HighLevelPolicy, LowLevelPolicy, Normalizer
 
@@ -44,12 +45,17 @@ def _slope(model):
     return 0.0  # two layers have no activation between them but the first's; a bundle always has one
 
 
+def _lengths(contract):
+    """Elements of the observation and of the action."""
+    return contracts.observation(contract)["shape"][0], contracts.action(contract)["shape"][0]
+
+
 def _high_level(tensors, contract):
     network, context = contract["network"], contract["context"]
     hidden = network["heads"] * network["head_dim"]
     setting = HighLevel(hidden, network["layers"], network["heads"], 0.0, context["steps"], 0.0)
-    lengths = len(contract["observation"]), len(contract["action"])
-    policy = HighLevelPolicy(setting, contract["language"]["dim"], *lengths, contract["codebook"]["size"])
+    lengths = _lengths(contract)
+    policy = HighLevelPolicy(setting, contract["language"]["dim"], *lengths, contract["family"]["codebook"]["size"])
     # As stored for `linear`, [k, n]; PyTorch wants [n, k]. Embeddings of observation and action and the head are stored [n, k].
     state = {"embed_timestep.weight": tensors["high_level.embed_timestep"]}
     for name in ("embed_observation", "embed_action", "head"):
@@ -69,8 +75,8 @@ def _high_level(tensors, contract):
 def _low_level(tensors, contract, slope):
     layers = sum(name.startswith("low_level.layer.") and name.endswith(".weight") for name in tensors)
     hidden = len(tensors["low_level.layer.0.bias"])
-    observations, actions = len(contract["observation"]), len(contract["action"])
-    policy = LowLevelPolicy(LowLevel(hidden, layers, slope, 1.0), observations, contract["codebook"]["dim"], actions)
+    observations, actions = _lengths(contract)
+    policy = LowLevelPolicy(LowLevel(hidden, layers, slope, 1.0), observations, contract["family"]["codebook"]["dim"], actions)
     last = layers - 1
     state = dict(policy.state_dict())
     for ours, number in (("first", 0), ("last", last)):
@@ -88,10 +94,10 @@ def from_bundle(model, contract):
     """The acting networks of an ONNX bundle, with the normaliser's scale and batch norm folded into their neighbours."""
     tensors = _tensors(model)
     try:
-        normalizer = Normalizer(len(contract["observation"]))
+        normalizer = Normalizer(_lengths(contract)[0])
         normalizer.mean.copy_(tensors["observation_mean"])
         slope = _slope(model)
         low_level = _low_level(tensors, contract, slope)
         return Acting(normalizer.eval(), _high_level(tensors, contract), tensors["codebook"], low_level)
     except (KeyError, RuntimeError) as error:
-        raise UserError(f"the bundle's weights are not those of a {contract.get('kind')} policy of this exporter: {error}") from error
+        raise UserError(f"the bundle's weights are not those of a {contract['family']['kind']} policy of this exporter: {error}") from error

@@ -1,7 +1,6 @@
 """The exported graphs against PyTorch, and the file against its contract."""
 
 import base64
-import json
 
 import numpy as np
 import onnx
@@ -9,14 +8,25 @@ import pytest
 import torch
 from safetensors.numpy import load as load_safetensors
 
-from lads_exporter import bundle, random_policy
+from lads_exporter import bundle, contract as contracts, random_policy
 from lads_exporter.codebook import nearest
 from lads_exporter.config import UserError
-from lads_exporter.replay import ENTRIES, Bundle, extract
+from lads_exporter.contract import properties
+from lads_exporter.twin import Entry, Twin, extract, open_loop
+
+ENTRIES = (
+    "instruction/lookup",
+    "high_level/instruct",
+    "high_level/start",
+    "high_level/step",
+    "codebook/lookup",
+    "low_level/act",
+    "trajectory_encoder/encode",
+)
 
 
-def properties(model):
-    return {row.key: row.value for row in model.metadata_props}
+def golden_of(model):
+    return load_safetensors(base64.b64decode(properties(model)["lads.golden"]))
 
 
 def largest(a, b):
@@ -51,30 +61,30 @@ def test_each_entry_can_be_cut_out(policy, entry):
 
 def test_lookups(policy):
     setting, encoded, lads, model = policy
-    runner = Bundle(model)
+    lookup, codebook = Entry(model, "instruction/lookup"), Entry(model, "codebook/lookup")
     for index, known in enumerate(encoded.instructions):
-        found = runner.run("instruction/lookup", {"id": np.array([index])})
+        found = lookup(id=np.array([index]))
         length = int(found["length"][0])
         assert length == len(known.words) <= encoded.max_words
         assert np.array_equal(found["words"][0, :length], known.words)
         assert not found["words"][0, length:].any()
     for index, code in enumerate(lads.codebook.codes):
-        assert np.array_equal(runner.run("codebook/lookup", {"index": np.array([index])})["plan"][0], code.numpy())
+        assert np.array_equal(codebook(index=np.array([index]))["plan"][0], code.numpy())
 
 
 @torch.no_grad()
 def test_low_level_and_encoder(policy):
     setting, _, lads, model = policy
-    runner, horizon = Bundle(model), setting.config.encoder.horizon
+    act, horizon = Entry(model, "low_level/act"), setting.config.encoder.horizon
     observations = random_policy.observations(setting, horizon, seed=5)
     actions = np.random.default_rng(0).uniform(-1, 1, (horizon, setting.action_len)).astype(np.float32)
     normed = lads.normalizer(torch.from_numpy(observations))
     plans = lads.codebook.codes[torch.arange(horizon) % len(lads.codebook.codes)]
     expected = lads.low_level(normed, plans)
     for t in range(horizon):
-        got = runner.run("low_level/act", {"observation": observations[t : t + 1], "plan": plans[t : t + 1].numpy()})
+        got = act(observation=observations[t : t + 1], plan=plans[t : t + 1].numpy())
         assert largest(got["action"], expected[t : t + 1]) <= 1e-5
-    got = runner.run("trajectory_encoder/encode", {"observations": observations[None], "actions": actions[None]})
+    got = Entry(model, "trajectory_encoder/encode")(observations=observations[None], actions=actions[None])
     latent = lads.encoder(normed[None], torch.from_numpy(actions)[None], torch.tensor([horizon]))
     assert largest(got["latent"], latent) <= 1e-5
     assert got["index"].tolist() == nearest(latent, lads.codebook.codes).tolist()
@@ -95,10 +105,11 @@ def past_of(lads, x):
 @torch.no_grad()
 def test_instruct(policy):
     _, encoded, lads, model = policy
-    runner, high = Bundle(model), lads.high_level
+    runner, high = Twin(model), lads.high_level
     for index in (0, len(encoded.instructions) - 1):
         expected = past_of(lads, high.embed_norm(high.embed_word(words_of(encoded, index))[None]))
-        got = runner.instruct(index)
+        runner.set_instruction(index)
+        got = runner.caches["high_level"]
         assert got.keys() == expected.keys()
         assert max(largest(got[name], expected[name]) for name in got) <= 1e-5
 
@@ -113,38 +124,51 @@ def test_steps_with_cache_equal_the_whole_sequence(policy, instruction):
     actions = np.random.default_rng(1).uniform(-1, 1, (steps, setting.action_len)).astype(np.float32)
     normed = lads.normalizer(torch.from_numpy(observations))[None]
     expected = lads.high_level([words_of(encoded, instruction)], normed, torch.from_numpy(actions)[None])[0]
-    runner = Bundle(model)
-    context = runner.instruct(instruction)
+    runner = Twin(model)
+    runner.set_instruction(instruction)
     for t in range(steps):
-        logits, context = runner.advance(context, actions[t - 1] if t else None, observations[t], t)
-        assert largest(logits, expected[t]) <= (1e-5 if t < 2 else 1e-4), f"step {t}"
+        runner.step(observations[t])
+        runner.executed(actions[t])
+        assert largest(runner.logits, expected[t]) <= (1e-5 if t < 2 else 1e-4), f"step {t}"
     length = len(encoded.instructions[instruction].words) + 2 * steps - 1
-    assert all(rows.shape[2] == length for rows in context.values())
+    assert all(rows.shape[2] == length for rows in runner.caches["high_level"].values())
 
 
 def test_contract_and_flat_keys(policy):
     setting, encoded, _, model = policy
-    found = properties(model)
-    contract = json.loads(found["lads.contract"])
-    assert contract["version"] == 1 and contract["kind"] == "lads"
-    assert contract["horizon"] == setting.config.encoder.horizon
+    found, contract = properties(model), contracts.of(model)
+    assert contract["version"] == 2 and contract["family"]["kind"] == "lads"
+    assert contracts.period(contract) == setting.config.encoder.horizon
     assert [row["id"] for row in contract["instructions"]] == [row["id"] for row in setting.instructions]
+    assert [row["sub_tasks"] for row in contracts.splits(contract)] == [row["sub_tasks"] for row in setting.instructions]
     assert contract["context"] == {"words": encoded.max_words, "steps": setting.config.high_level.context_steps, "beyond": "restart"}
-    assert len(contract["observation"]) == setting.observation_len and len(contract["action"]) == setting.action_len
-    assert all(row["min"] < row["max"] for row in contract["observation"] + contract["action"])
-    assert found["action_names"].split(",") == [row["name"] for row in contract["action"]]
-    assert [float(x) for x in found["observation_min"].split(",")] == [row["min"] for row in contract["observation"]]
+    observation, action = contracts.observation(contract), contracts.action(contract)
+    assert observation["shape"] == [setting.observation_len] and action["shape"] == [setting.action_len]
+    assert all(row["min"] < row["max"] for row in observation["elements"] + action["elements"])
+    assert action["reference"] == setting.environment["reference"]
+    assert found["action_names"].split(",") == [row["name"] for row in action["elements"]]
+    assert [float(x) for x in found["observation_min"].split(",")] == [row["min"] for row in observation["elements"]]
+    assert [float(x) for x in found["action_scale"].split(",")] == [row.get("scale", 1.0) for row in setting.environment["action"]]
+
+
+def test_inputs_of_the_graphs_are_channels_states_or_integers(policy):
+    """Every name that an entry of the control loop reads is bound to something."""
+    model = policy[3]
+    names = {row["name"] for row in contracts.of(model)["channels"]} | {"id", "timestep", "index", "plan"}
+    local = {value.name.rsplit("/", 1)[1] for value in model.graph.input}
+    assert {name for name in local if not name.startswith("past_key_values.")} <= names
 
 
 @torch.no_grad()
 def test_golden_episode_replays_in_pytorch(policy):
     setting, encoded, lads, model = policy
-    golden = load_safetensors(base64.b64decode(properties(model)["lads.golden"]))
-    observations, plans, actions = (torch.from_numpy(golden[key]) for key in ("observations", "plans", "actions"))
+    golden = golden_of(model)
+    observations, plans, actions = (torch.from_numpy(golden[key]) for key in ("channel.observation", "selected", "actions"))
     normed = lads.normalizer(observations)
     logits = lads.high_level([words_of(encoded, int(golden["instruction"][0]))], normed[None], actions[None])[0]
     horizon = setting.config.encoder.horizon
-    assert bundle.margin(logits.numpy(), horizon) >= 0.9 * bundle.GOLDEN_MARGIN
+    best = logits[::horizon].topk(2).values
+    assert (best[:, 0] - best[:, 1]).min() >= 0.9 * bundle.GOLDEN_MARGIN
     decided = logits[::horizon].argmax(-1).repeat_interleave(horizon)[: len(plans)]
     assert torch.equal(decided, plans)
     low, high = (torch.tensor([row[key] for row in setting.environment["action"]]) for key in ("min", "max"))
@@ -153,12 +177,10 @@ def test_golden_episode_replays_in_pytorch(policy):
 
 
 def test_golden_episode_replays_in_onnx_runtime(tiny):
-    model = tiny[3]
-    contract = json.loads(properties(model)["lads.contract"])
-    golden = load_safetensors(base64.b64decode(properties(model)["lads.golden"]))
-    plans, actions, _ = Bundle(model).open_loop(contract, int(golden["instruction"][0]), golden["observations"])
-    assert np.array_equal(plans, golden["plans"])
-    assert largest(actions, golden["actions"]) <= bundle.GOLDEN_TOLERANCE
+    golden = golden_of(tiny[3])
+    done = open_loop(Twin(tiny[3]), int(golden["instruction"][0]), {"observation": golden["channel.observation"]}).tensors()
+    assert np.array_equal(done["selected"], golden["selected"])
+    assert largest(done["actions"], golden["actions"]) <= bundle.GOLDEN_TOLERANCE
 
 
 def test_the_same_policy_gives_the_same_bytes(tiny):
@@ -169,10 +191,9 @@ def test_the_same_policy_gives_the_same_bytes(tiny):
 
 def test_close_decisions_make_no_golden_episode(tiny):
     setting, encoded, lads, model = tiny
-    contract = json.loads(properties(model)["lads.contract"])
     flat = onnx.ModelProto.FromString(model.SerializeToString())
     for tensor in flat.graph.initializer:
         if tensor.name.startswith("weights/high_level.head"):
             tensor.raw_data = bytes(len(tensor.raw_data))
     with pytest.raises(UserError, match="margin"):
-        bundle.golden(flat, contract, [(0, random_policy.observations(setting, 8, 0))])
+        bundle.golden(flat, [(0, random_policy.observations(setting, 8, 0))])

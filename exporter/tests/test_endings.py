@@ -29,6 +29,16 @@ def test_endings_keep_the_beginning_and_make_no_real_instruction(kitchen):
     assert made == texts(kitchen.instructions, 40), "the same texts every time"
 
 
+def test_the_order_of_the_splits_does_not_matter(kitchen):
+    """An index is one of all instructions, wherever the seen ones stand in the file."""
+    unseen_first = sorted(kitchen.instructions, key=lambda row: row["split"] == "seen")
+    made = texts(unseen_first, 5)
+    assert {index for index, _ in made} == {index for index, row in enumerate(unseen_first) if row["split"] == "seen"}
+    for (index, kept), group in made.items():
+        beginning = unseen_first[index]["text"].split(JOIN)[:kept]
+        assert all(text.split(JOIN)[:kept] == beginning for text in group)
+
+
 def test_only_steps_before_the_ending_count(kitchen):
     parts = kitchen.config
     data = dataclasses.replace(parts.data, ending_rate=0.5, ending_variants=5, ending_margin=0.6)

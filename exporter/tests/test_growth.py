@@ -5,11 +5,11 @@ import json
 import onnx
 import pytest
 
-from lads_exporter import config, growth
+from lads_exporter import config, contract as contracts, growth
 
 
 def contract(path):
-    return json.loads(next(e.value for e in onnx.load(path).metadata_props if e.key == "lads.contract"))
+    return contracts.of(onnx.load(path))
 
 
 @pytest.mark.parametrize("series", growth.SERIES)
@@ -35,5 +35,5 @@ def test_bundles_and_their_index(tmp_path, monkeypatch):
     written = list(growth.export(config.load("configs/tiny.toml"), tmp_path, steps=8))
     index = json.loads((tmp_path / "index.json").read_text())
     assert [name for _, _, name in index] == written == ["actions-2.onnx", "actions-5.onnx", "codebook-8.onnx"]
-    assert [len(contract(tmp_path / name)["action"]) for name in written] == [2, 5, 3]
-    assert contract(tmp_path / "codebook-8.onnx")["codebook"]["size"] == 8
+    assert [contracts.action(contract(tmp_path / name))["shape"][0] for name in written] == [2, 5, 3]
+    assert contract(tmp_path / "codebook-8.onnx")["family"]["codebook"]["size"] == 8

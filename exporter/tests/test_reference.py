@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.numpy import load
 
-from lads_exporter import config, questions, reference, training, weights
+from lads_exporter import config, contract as contracts, questions, reference, training, weights
 
 
 def contract_of(model):
@@ -21,11 +21,11 @@ def words(encoded):
 
 def test_a_bundle_gives_the_networks_back(policy):
     _, encoded, lads, model = policy
-    contract = contract_of(model)
+    contract = contracts.of(model)
     trained, loaded = weights.from_lads(lads), weights.from_bundle(model, contract)
     torch.manual_seed(0)
-    observations = trained.normalizer.mean + torch.randn(1, 7, len(contract["observation"]))
-    actions = torch.rand(1, 7, len(contract["action"])) - 0.5
+    observations = trained.normalizer.mean + torch.randn(1, 7, contracts.observation(contract)["shape"][0])
+    actions = torch.rand(1, 7, contracts.action(contract)["shape"][0]) - 0.5
     word = words(encoded)[0]
     with torch.no_grad():
         logits = [acting.high_level([word], acting.normalizer(observations), actions) for acting in (trained, loaded)]
@@ -37,25 +37,30 @@ def test_a_bundle_gives_the_networks_back(policy):
 
 def test_the_full_sequence_gives_the_golden_episode(policy):
     _, encoded, _, model = policy
-    contract = contract_of(model)
+    contract = contracts.of(model)
     golden = load(base64.b64decode({row.key: row.value for row in model.metadata_props}["lads.golden"]))
     acting = reference.FullSequencePolicy(weights.from_bundle(model, contract), contract, words(encoded))
     acting.start(int(golden["instruction"][0]))
-    actions = np.stack([acting.act(observation) for observation in golden["observations"]])
-    assert acting.plans == golden["plans"][:: contract["horizon"]].tolist()
+    actions = np.stack([acting.act(observation) for observation in golden["channel.observation"]])
+    assert acting.plans == golden["selected"][:: contracts.period(contract)].tolist()
     assert np.abs(actions - golden["actions"]).max() < 1e-4
 
 
 def test_the_purpose_is_what_it_is_for(tiny):
-    contract = contract_of(tiny[3])
-    same = contract | {"horizon": contract["horizon"] + 1}
-    other = contract | {"control_period_s": 2 * contract["control_period_s"]}
-    assert reference.purpose_sha256(contract) == reference.purpose_sha256(same) != reference.purpose_sha256(other)
+    contract = contracts.of(tiny[3])
+    purpose = reference.purpose_sha256(contract)
+    words = [row | {"shape": [99, 8]} if row["role"] == "instruction" else row for row in contract["channels"]]
+    refusing = contract["language"] | {"acceptance": {"threshold": 0.5}}
+    for same in ({"family": {"kind": "lang_dt"}}, {"channels": words}, {"language": refusing}):
+        assert reference.purpose_sha256(contract | same) == purpose
+    meant = [row | {"reference": "something else"} if row["role"] == "action" else row for row in contract["channels"]]
+    for other in ({"control_period_s": 2 * contract["control_period_s"]}, {"channels": meant}, {"evaluation": {}}):
+        assert reference.purpose_sha256(contract | other) != purpose
 
 
 def test_only_the_bundles_own_run_is_rolled_out(policy, monkeypatch):
     setting, encoded, lads, model = policy
-    contract = contract_of(model)
+    contract = contracts.of(model)
     saved = {"identity": {"dataset_sha256": contract["provenance"]["dataset_sha256"]}, "lads": lads.state_dict()}
     monkeypatch.setattr(training, "load_run", lambda folder: (saved, setting))
     monkeypatch.setattr(reference.language, "encode", lambda language, texts: encoded)

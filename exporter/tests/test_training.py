@@ -91,7 +91,7 @@ def test_cross_entropy_does_not_move_the_plans(tmp_path):
 
 def test_trajectories_longer_than_the_context_are_cut_where_the_controller_restarts_it(tmp_path):
     setting = setting_for("staged")
-    setting.tables[0]["high_level"]["context_steps"] = 10
+    setting.tables[0]["high_level"]["context_steps"] = 12
     trainer = trainer_for(tmp_path / "run", config.from_tables(*setting.tables, "test"))
     trainer.lads.eval()
     corpus, high_level = trainer.corpus, trainer.lads.high_level
@@ -100,11 +100,11 @@ def test_trajectories_longer_than_the_context_are_cut_where_the_controller_resta
     losses, hits = [], []
     for row, episode in enumerate(episodes.tolist()):
         length = int(corpus.lengths[episode])
-        assert length > 10
+        assert length > 12
         codes[row, length:] = -1
         words = [corpus.words[corpus.instruction[episode]]]
-        for start in range(0, length, 10):
-            part = slice(start, min(start + 10, length))
+        for start in range(0, length, 12):
+            part = slice(start, min(start + 12, length))
             logits = high_level(words, corpus.observations[[episode], part], corpus.executed[[episode], part])[0]
             losses.append(torch.nn.functional.cross_entropy(logits, codes[row, part], reduction="none"))
             hits.append(logits.argmax(-1) == codes[row, part])
@@ -278,6 +278,14 @@ def test_unknown_and_missing_keys_are_named():
         config.from_tables(*tables, "test")
     del tables[0]["encoder"]["horizn"], tables[0]["encoder"]["horizon"]
     with pytest.raises(UserError, match="'horizon' is missing"):
+        config.from_tables(*tables, "test")
+
+
+@pytest.mark.parametrize("steps", [10, 0])
+def test_a_context_off_the_grid_of_plans_is_refused(steps):
+    tables = copy.deepcopy(config.load("configs/tiny.toml").tables)
+    tables[0]["high_level"]["context_steps"] = steps
+    with pytest.raises(UserError, match=f"context_steps = {steps} is no multiple of encoder.horizon = 4"):
         config.from_tables(*tables, "test")
 
 

@@ -13,7 +13,8 @@ import subprocess
 import pytest
 
 language = pytest.importorskip("lads_exporter.language")
-from lads_exporter import config, language_graph  # noqa: E402
+import onnx  # noqa: E402
+from lads_exporter import acceptance, config, language_graph  # noqa: E402
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
@@ -35,6 +36,9 @@ SENTENCES = (
 @pytest.fixture(scope="session")
 def cache(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cache")
+    for name in ("kitchen", "lorel"):
+        calibrated = acceptance.read(ROOT / f"models/{name}.acceptance.json")
+        onnx.save(acceptance.into(onnx.load(ROOT / f"models/{name}.onnx"), calibrated), folder / f"{name}.onnx")
     assert language_graph.write(language.DEFAULT, folder / "language" / language.DEFAULT)
     yield folder
     shutil.rmtree(folder)
@@ -46,8 +50,12 @@ def test_embeddings_are_the_exporters(cache):
     cases = []
     for name in ("kitchen", "lorel"):
         setting = config.load(ROOT / f"exporter/configs/{name}.toml")
+        texts = [row["text"] for row in setting.instructions]
+        known = [embedded.words for embedded in language.encode(setting.config.language, texts).instructions]
         for text, embedded in zip(SENTENCES, language.encode(setting.config.language, SENTENCES).instructions, strict=True):
-            cases.append({"bundle": name, "text": text, "words": embedded.words.ravel().tolist()})
+            index, similarity = acceptance.nearest(embedded.words, known)
+            like = {"nearest": setting.instructions[index]["id"], "similarity": similarity}
+            cases.append({"bundle": name, "text": text, "words": embedded.words.ravel().tolist(), **like})
     (folder / "cases.json").write_text(json.dumps(cases))
     command = ["cargo", "test", *SELECTION, "--test", "exporter", "--", "--nocapture"]
     done = subprocess.run(command, cwd=ROOT, env=os.environ | {"LADS_LANGUAGE": str(folder)}, capture_output=True, text=True)
@@ -58,11 +66,12 @@ def test_embeddings_are_the_exporters(cache):
 
 
 def lads_run(cache, model, *arguments):
-    """-> exit code, stdout, stderr."""
+    """-> exit code, stdout, stderr; of the shipped bundle with its calibration, where the cache has that."""
     program = TARGET / "debug/lads-run"
     if not program.is_file():
         pytest.skip("lads-run is not built: run `make test-exporter`")
-    command = [program, "--model", ROOT / f"models/{model}.onnx", *arguments]
+    calibrated = cache / f"{model}.onnx"
+    command = [program, "--model", calibrated if calibrated.is_file() else ROOT / f"models/{model}.onnx", *arguments]
     done = subprocess.run(command, env=os.environ | {"LADS_CACHE": str(cache)}, capture_output=True, text=True, timeout=300)
     if "built without the language encoder" in done.stderr:
         pytest.skip("lads-run is built without the feature `language`: run `make test-exporter`")
@@ -104,7 +113,10 @@ def test_a_sentence_outside_the_table_runs_without_a_success_rate(cache, tmp_pat
     assert row["full_success"] is None and row["n_rate"] is None and run["success"] is None
     assert run["steps"] == 40 and len(run["plans"]) == 8, "the benchmark's longest episode, to its end"
     assert found["splits"]["free"]["episodes"] == 1 and found["heard_by"]["largest_difference"] is None
-    assert "is heard most like" in table and "no success rate" in table
+    assert table.startswith("'pull the drawer out': the nearest known instruction is 'pull ") and "no success rate" in table
+    assert "of these un-instructed by 'pull " in table
+    nearest = found["heard_by"]["nearest"]
+    assert nearest["accepted"] and nearest["similarity"] >= nearest["threshold"] > 0.5
 
 
 def test_a_sentence_is_judged_by_the_sub_tasks_that_are_named(cache, tmp_path):
@@ -116,6 +128,51 @@ def test_a_sentence_is_judged_by_the_sub_tasks_that_are_named(cache, tmp_path):
     _, other = results(cache, tmp_path, "kitchen", "--instruction", "open the microwave, please", "--sub-tasks", "microwave")
     assert other["instructions"][0]["runs"][0]["steps"] <= 280
     assert "no success rate" not in table
+
+
+def test_a_sentence_unlike_what_is_known_is_refused_unless_insisted_on(cache, tmp_path):
+    for model in ("kitchen", "lorel"):
+        threshold = acceptance.read(ROOT / f"models/{model}.acceptance.json")["acceptance"]["threshold"]
+        for text in ("asdf qwerty", "do nothing, stay where you are", "bring me a cup of coffee"):
+            wrong = refusal(cache, model, "--instruction", text)
+            for part in (text, "nearest known instruction is '", "similarity 0.", f"from {threshold} on", "--sentence-anyway"):
+                assert part in wrong, wrong
+    table, found = results(cache, tmp_path, "lorel", "--instruction", "asdf qwerty", "--sentence-anyway")
+    first, *rest = table.splitlines()
+    assert "nearest known" in first and "followed because of --sentence-anyway" in first
+    nearest = found["heard_by"]["nearest"]
+    assert not nearest["accepted"] and nearest["similarity"] < nearest["threshold"]
+    done = [of["sub_task"] for of in found["instructions"][0]["un_instructed_completions"]]
+    (line,) = [line for line in rest if line.startswith("completed in 1 episodes: ")]
+    assert all(f"{sub_task} 1" in line for sub_task in done) and (done or "nothing" in line)
+
+
+def test_without_a_threshold_no_sentence_is_followed_without_insistence(cache, tmp_path):
+    model = onnx.load(ROOT / "models/lorel.onnx")
+    (row,) = [row for row in model.metadata_props if row.key == "lads.contract"]
+    contract = json.loads(row.value)
+    contract["language"].pop("acceptance", None)
+    row.value = json.dumps(contract)
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    (bare / "language").symlink_to(cache / "language")
+    onnx.save(model, bare / "lorel.onnx")
+    wrong = refusal(bare, "lorel", "--instruction", "pull the drawer out")
+    assert "does not say from where on" in wrong and "--sentence-anyway" in wrong
+    _, found = results(bare, tmp_path, "lorel", "--instruction", "pull the drawer out", "--sentence-anyway")
+    assert found["heard_by"]["nearest"]["threshold"] is None and not found["heard_by"]["nearest"]["accepted"]
+
+
+@pytest.mark.parametrize("name", ["kitchen", "kitchen-small", "lorel"])
+def test_calibrations_can_be_made_again(name):
+    kept = acceptance.read(ROOT / f"models/{name}.acceptance.json")
+    setting = config.load(ROOT / f"exporter/configs/{name}.toml")
+    sentences = ROOT / f"exporter/configs/{name.removesuffix('-small')}.sentences.json"
+    again = acceptance.calibrate(setting, acceptance.read_sentences(sentences, setting))
+    assert again["language"] == kept["language"] and again["instructions_sha256"] == kept["instructions_sha256"]
+    assert abs(again["acceptance"]["threshold"] - kept["acceptance"]["threshold"]) <= 0.002
+    for one, other in zip(again["sentences"], kept["sentences"], strict=True):
+        assert one["text"] == other["text"] and abs(one["similarity"] - other["similarity"]) <= 0.001, one
 
 
 def test_a_log_of_a_sentence_replays(cache, tmp_path):
@@ -133,7 +190,7 @@ def test_refusals(cache, tmp_path):
     wrong = refusal(tmp_path / "no", "lorel", "--instruction", "open teh drawer")
     assert "make language" in wrong and "open drawer" in wrong and str(tmp_path / "no") in wrong
     assert "make language" in refusal(tmp_path / "no", "lorel", "--encode-language")
-    assert "open drawer, close drawer" in refusal(cache, "lorel", "--instruction", "shut it", "--sub-tasks", "shut it")
+    assert "open drawer, close drawer" in refusal(cache, "lorel", "--instruction", "pull the drawer out", "--sub-tasks", "shut it")
     other = tmp_path / "other"
     other.mkdir()
     for file in ("encoder.onnx", "tokenizer.json"):

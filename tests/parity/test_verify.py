@@ -16,7 +16,7 @@ import pytest
 
 np = pytest.importorskip("numpy")
 onnx = pytest.importorskip("onnx")
-replay = pytest.importorskip("lads_exporter.replay")
+exporter = pytest.importorskip("lads_exporter.bundle")
 from onnx import helper, numpy_helper  # noqa: E402
 from safetensors.numpy import load, save  # noqa: E402
 
@@ -84,8 +84,13 @@ def joints_swapped(model):
 def horizon_off(model):
     """Plans are decided every H + 1 steps; the trajectory encoder drops the last step of its longer window."""
     contract = json.loads(properties(model)["lads.contract"])
-    horizon, graph = contract["horizon"], model.graph
-    contract["horizon"] += 1
+    horizon, graph = contract["family"]["horizon"], model.graph
+    contract["family"]["horizon"] += 1
+    # A context ends with a plan.
+    contract["context"]["steps"] -= contract["context"]["steps"] % (horizon + 1)
+    for channel in contract["channels"]:
+        if channel["role"] == "demonstration":
+            channel["shape"][0] += 1
     set_property(model, "lads.contract", json.dumps(contract))
     bounds = {"damage/from": [0], "damage/to": [horizon], "damage/axis": [1]}
     graph.initializer.extend(numpy_helper.from_array(np.array(value, np.int64), name) for name, value in bounds.items())
@@ -130,13 +135,12 @@ def set_property(model, key, value):
 
 def record_golden(model):
     """The golden episode as an exporter with this fault would have recorded it."""
-    contract = json.loads(properties(model)["lads.contract"])
     golden = load(base64.b64decode(properties(model)["lads.golden"]))
-    bundle = replay.Bundle(model)
-    index = int(golden["instruction"][0])
-    plans, actions, _ = bundle.open_loop(contract, index, golden["observations"])
-    golden |= {"plans": plans.astype(np.int64), "actions": actions.astype(np.float32)}
-    set_property(model, "lads.golden", base64.b64encode(save(golden, metadata={"tolerance": "0.0001"})).decode())
+    runner = exporter.twin.Twin(model)
+    index, channels = int(golden["instruction"][0]), {"observation": golden["channel.observation"][: runner.steps]}
+    rollout = exporter.twin.open_loop(runner, index, channels)
+    tensors = exporter.golden_tensors(rollout, index, channels)
+    set_property(model, "lads.golden", base64.b64encode(save(tensors, metadata={"tolerance": "0.0001"})).decode())
 
 
 @pytest.mark.parametrize("damage", [scale_off, joints_swapped, horizon_off, second_best], ids=lambda damage: damage.__name__)

@@ -18,7 +18,7 @@ use std::fmt;
 use std::hash::{Hash, Hasher};
 use std::sync::Arc;
 
-use lads_core::op::{BinaryKind, ReduceKind, UnaryKind};
+use lads_image::op::{BinaryKind, ReduceKind, UnaryKind};
 
 use crate::tensor::{Data, Tensor};
 

@@ -13,7 +13,7 @@ mod programs;
 
 use std::collections::HashMap;
 
-use lads_core::op::Port;
+use lads_image::op::Port;
 
 use crate::entries::Signature;
 use crate::error::CompileError;

@@ -5,9 +5,9 @@
 //! still is the one meant. So if two values that are both still read overlapped, or something was read that nobody had written,
 //! some read would find something else. The ops themselves must be the same but for their offsets.
 
-use lads_core::op::{INT_SLOTS, Op, Place, Port, Span};
+use lads_image::op::{INT_SLOTS, Op, Place, Span};
+use lads_image::{Access, AccessKind};
 
-use crate::access::{self, Access, each_span};
 use crate::lower::Lowered;
 use crate::plan::Placed;
 
@@ -99,8 +99,8 @@ pub(crate) fn verify(planned: &Lowered, placed: &Placed) -> Result<(), PlanFault
 
 /// The places of the same ports.
 fn ports(
-    planned: &[(Port, Place)],
-    placed: &[(Port, Place)],
+    planned: &[(String, Place)],
+    placed: &[(String, Place)],
     op: usize,
 ) -> Result<Vec<(Place, Place)>, PlanFault> {
     let same = planned.len() == placed.len()
@@ -118,8 +118,15 @@ fn ports(
 /// An op with all its offsets zero.
 fn without_offsets(op: &Op) -> Op {
     let mut op = *op;
-    each_span(&mut op, &mut |span| span.offset = 0);
+    op.each_span(&mut |span| span.offset = 0);
     op
+}
+
+/// What an op reads, then what it writes.
+fn accesses(op: &Op) -> Vec<Access> {
+    let mut all = vec![];
+    op.accesses(&mut |access| all.push(access));
+    all
 }
 
 type Touch = fn(&mut State, usize, usize, usize) -> Result<(), PlanFault>;
@@ -167,25 +174,26 @@ impl State {
         if without_offsets(from) != without_offsets(to) {
             return Err(PlanFault::Changed { op: i });
         }
-        let (reads_int, writes_int) = access::slots(from);
-        if reads_int.is_some_and(|slot| !self.ints[usize::from(slot.0)]) {
+        let slots = from.slots();
+        if slots
+            .read
+            .is_some_and(|slot| !self.ints[usize::from(slot.0)])
+        {
             return Err(PlanFault::Unset { op: i });
         }
-        for (from, to) in access::reads(from).into_iter().zip(access::reads(to)) {
+        let pairs: Vec<(Access, Access)> = accesses(from).into_iter().zip(accesses(to)).collect();
+        let of = |kind: AccessKind| pairs.iter().filter(move |(from, _)| from.kind == kind);
+        for &(from, to) in of(AccessKind::Read) {
             self.pairs(i, from, to, Self::read)?;
         }
-        let written: Vec<(Access, Access)> = access::writes(from)
-            .into_iter()
-            .zip(access::writes(to))
-            .collect();
-        for &(from, to) in &written {
+        for &(from, to) in of(AccessKind::Write) {
             self.pairs(i, from, to, Self::write)?;
         }
         // What one op writes to two places must not be the same place.
-        for (from, to) in written {
+        for &(from, to) in of(AccessKind::Write) {
             self.pairs(i, from, to, Self::read)?;
         }
-        if let Some(slot) = writes_int {
+        if let Some(slot) = slots.written {
             self.ints[usize::from(slot.0)] = true;
         }
         Ok(())

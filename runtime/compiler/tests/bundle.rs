@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use lads_compiler::{Bundle, BundleError, compile};
+use lads_compiler::contract::Similarity;
+use lads_compiler::{Bundle, BundleError, Contract, compile};
 use lads_core::{Controller, Instruction, Policy, Workspace};
 
 const TINY: &[u8] = include_bytes!("data/tiny.onnx");
@@ -274,6 +275,43 @@ fn contracts_that_miss_or_contradict_something_are_refused() {
         &edited("\"joint2_velocity\"", "\"joint1_velocity\""),
         &["action[1].name", "repeats"],
     );
+}
+
+/// The tiny bundle's contract with this `language.acceptance`.
+fn with_acceptance(acceptance: serde_json::Value) -> Result<Contract, BundleError> {
+    let start = br#"{"version""#;
+    let at = TINY.windows(start.len()).position(|part| part == start);
+    let json = &TINY[at.expect("the contract")..];
+    let mut values = serde_json::Deserializer::from_slice(json).into_iter();
+    let mut contract: serde_json::Value = values.next().unwrap().unwrap();
+    contract["language"]["acceptance"] = acceptance;
+    Contract::parse(&contract.to_string())
+}
+
+#[test]
+fn a_contract_may_say_which_sentences_are_followed() {
+    let acceptance = serde_json::json!({
+        "similarity": "alignment", "threshold": 0.608, "accepted_known": 0.925, "accepted_other": 0.1125
+    });
+    let read = with_acceptance(acceptance.clone()).unwrap();
+    let read = read.language.acceptance.expect("it says so");
+    assert_eq!(read.similarity, Similarity::Alignment);
+    assert!((read.threshold - 0.608).abs() < 1e-6 && read.accepted_other < read.accepted_known);
+    let none = with_acceptance(serde_json::Value::Null).unwrap();
+    assert_eq!(none.language.acceptance, None);
+    for (part, value) in [
+        ("threshold", serde_json::json!(1.5)),
+        ("threshold", serde_json::json!(-1.01)),
+        ("accepted_known", serde_json::json!(-0.1)),
+        ("accepted_other", serde_json::json!(92.5)),
+        ("similarity", serde_json::json!("guess")),
+    ] {
+        let mut wrong = acceptance.clone();
+        wrong[part] = value;
+        let error = with_acceptance(wrong).unwrap_err().to_string();
+        let named = if part == "similarity" { "guess" } else { part };
+        assert!(error.contains(named) && !error.contains('\n'), "{error}");
+    }
 }
 
 #[test]

@@ -6,8 +6,8 @@ use lads_compiler::{
     Bundle, CacheFormat, CompileError, Image, Memory, Options, WeightFormat, compile_with,
 };
 use lads_core::image::ProgramKind;
-use lads_core::op::Op;
 use lads_core::{Isa, Policy, SelfTestError};
+use lads_image::op::Op;
 
 fn tiny() -> Bundle {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/tiny.onnx");

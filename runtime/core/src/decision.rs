@@ -1,22 +1,10 @@
-//! Picking a plan from the logits of the high level.
-
-use core::fmt;
+//! Picking an index from scores.
 
 use lads_kernels::{arg_max, math};
 use rand_pcg::Pcg64;
 use rand_pcg::rand_core::Rng;
 
 use crate::contract::Decision;
-
-/// Which entry of the codebook.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default)]
-pub struct PlanIndex(pub u32);
-
-impl fmt::Display for PlanIndex {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        self.0.fmt(f)
-    }
-}
 
 /// A decision rule and the state of its random numbers.
 #[derive(Debug, Clone)]
@@ -26,7 +14,7 @@ pub(crate) struct Decider {
 }
 
 /// Stream of the generator: the default of PCG's reference implementation.
-const STREAM: u128 = 0x0a02_bdbf_7bb3_c0a7_ac28_fa16_a64a_bf96;
+pub(crate) const STREAM: u128 = 0x0a02_bdbf_7bb3_c0a7_ac28_fa16_a64a_bf96;
 
 impl Decider {
     pub fn new(rule: Decision) -> Self {
@@ -44,44 +32,44 @@ impl Decider {
         self.rule
     }
 
-    /// The plan of a decision step; the logits are finite and there is at least one.
-    pub fn pick(&mut self, logits: &[f32]) -> PlanIndex {
+    /// The index of a selection; the scores are finite and there is at least one.
+    pub fn pick(&mut self, scores: &[f32]) -> u32 {
         match self.rule {
             Decision::Sample { temperature, .. } if temperature > 0.0 => {
-                self.sample(logits, temperature)
+                self.sample(scores, temperature)
             }
-            _ => PlanIndex(arg_max(logits) as u32),
+            _ => arg_max(scores) as u32,
         }
     }
 
     /// Index `i` with probability `exp(l_i / T) / sum over j of exp(l_j / T)`: the first index at which the running sum of the
     /// weights passes a uniform share of the whole.
-    fn sample(&mut self, logits: &[f32], temperature: f32) -> PlanIndex {
-        let best = arg_max(logits);
-        let max = logits.get(best).copied().unwrap_or(0.0);
-        let weight = |logit: f32| f64::from(math::exp((logit - max) / temperature));
-        let total: f64 = logits.iter().map(|&logit| weight(logit)).sum();
+    fn sample(&mut self, scores: &[f32], temperature: f32) -> u32 {
+        let best = arg_max(scores);
+        let max = scores.get(best).copied().unwrap_or(0.0);
+        let weight = |score: f32| f64::from(math::exp((score - max) / temperature));
+        let total: f64 = scores.iter().map(|&score| weight(score)).sum();
         // 53 random bits: every double in [0, 1) of that spacing is equally likely.
         let uniform = (self.random.next_u64() >> 11) as f64 / (1_u64 << 53) as f64;
         let mut left = uniform * total;
         let mut passed = 0;
-        for &logit in logits {
-            // To the end, so that the time does not depend on the plan: once passed, always passed.
-            left -= weight(logit);
+        for &score in scores {
+            // To the end, so that the time does not depend on the index: once passed, always passed.
+            left -= weight(score);
             passed = usize::from(left < 0.0).saturating_add(passed);
         }
-        let index = logits.len().saturating_sub(passed);
-        PlanIndex(if passed == 0 { best } else { index } as u32)
+        let index = scores.len().saturating_sub(passed);
+        (if passed == 0 { best } else { index }) as u32
     }
 }
 
-/// The largest logit minus the second largest; infinite for a single one.
-pub(crate) fn margin(logits: &[f32]) -> f32 {
+/// The largest score minus the second largest; infinite for a single one.
+pub(crate) fn margin(scores: &[f32]) -> f32 {
     let (mut first, mut second) = (f32::NEG_INFINITY, f32::NEG_INFINITY);
-    for &logit in logits {
-        // No branch that depends on the logits.
-        second = second.max(first.min(logit));
-        first = first.max(logit);
+    for &score in scores {
+        // No branch that depends on the scores.
+        second = second.max(first.min(score));
+        first = first.max(score);
     }
     first - second
 }
@@ -98,8 +86,8 @@ mod tests {
     #[test]
     fn argmax_takes_the_first_of_equal_logits() {
         let mut decider = Decider::new(Decision::Argmax);
-        assert_eq!(decider.pick(&[0.5, 2.0, -1.0, 2.0]), PlanIndex(1));
-        assert_eq!(decider.pick(&[3.0]), PlanIndex(0));
+        assert_eq!(decider.pick(&[0.5, 2.0, -1.0, 2.0]), 1);
+        assert_eq!(decider.pick(&[3.0]), 0);
     }
 
     #[test]
@@ -120,7 +108,7 @@ mod tests {
             });
             let mut counts = [0_u32; 4];
             for _ in 0..draws {
-                counts[decider.pick(&logits).0 as usize] += 1;
+                counts[decider.pick(&logits) as usize] += 1;
             }
             let weights = logits.map(|l: f32| f64::from(l / temperature).exp());
             let total: f64 = weights.iter().sum();
@@ -142,7 +130,7 @@ mod tests {
         let logits = [0.1, 0.2, 0.3, 0.2, 0.1];
         let draw = |rule| {
             let mut decider = Decider::new(rule);
-            core::array::from_fn::<u32, 64, _>(|_| decider.pick(&logits).0)
+            core::array::from_fn::<u32, 64, _>(|_| decider.pick(&logits))
         };
         assert_eq!(draw(SAMPLE), draw(SAMPLE));
         assert_ne!(
@@ -161,7 +149,7 @@ mod tests {
                 temperature,
                 seed: 3,
             });
-            assert!((0..50).all(|_| decider.pick(&[1.0, 1.5, 1.2]) == PlanIndex(1)));
+            assert!((0..50).all(|_| decider.pick(&[1.0, 1.5, 1.2]) == 1));
         }
     }
 }

@@ -3,11 +3,145 @@
 use core::error::Error;
 use core::fmt;
 
-use crate::exec::ExecError;
+use lads_image::ExecError;
+
+/// What is wrong with the values that a caller gave for the channels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub enum InputError {
+    /// A channel was not given, or the policy has more than the one that was.
+    Missing {
+        /// Which one.
+        channel: u32,
+    },
+    /// What was given is no channel that this call takes, or was given before.
+    Unknown {
+        /// Its number.
+        channel: u32,
+    },
+    /// The values have another type than the channel.
+    Type {
+        /// Of the channel.
+        channel: u32,
+    },
+    /// The values are more or fewer than the channel's elements.
+    Length {
+        /// Of the channel.
+        channel: u32,
+        /// Elements given.
+        got: usize,
+        /// Elements in the contract.
+        needed: usize,
+    },
+    /// An element is not a number or infinite.
+    NotFinite {
+        /// Of the channel.
+        channel: u32,
+        /// The first such element.
+        index: usize,
+    },
+    /// An element is outside the contract's limits.
+    OutOfLimits {
+        /// Of the channel.
+        channel: u32,
+        /// The first such element.
+        index: usize,
+        /// Its value.
+        value: f32,
+        /// Smallest value allowed.
+        min: f32,
+        /// Largest value allowed.
+        max: f32,
+    },
+}
+
+impl InputError {
+    /// The channel that is at fault.
+    pub fn channel(&self) -> u32 {
+        match *self {
+            Self::Missing { channel }
+            | Self::Unknown { channel }
+            | Self::Type { channel }
+            | Self::Length { channel, .. }
+            | Self::NotFinite { channel, .. }
+            | Self::OutOfLimits { channel, .. } => channel,
+        }
+    }
+
+    /// The element that is at fault, where it is one.
+    pub fn element(&self) -> Option<usize> {
+        match *self {
+            Self::NotFinite { index, .. } | Self::OutOfLimits { index, .. } => Some(index),
+            _ => None,
+        }
+    }
+}
+
+impl fmt::Display for InputError {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self {
+            Self::Missing { channel } => write!(f, "channel {channel} is not given"),
+            Self::Unknown { channel } => {
+                write!(
+                    f,
+                    "channel {channel} is not one to be given here, or is given twice"
+                )
+            }
+            Self::Type { channel } => write!(f, "channel {channel} has elements of another type"),
+            Self::Length {
+                channel,
+                got,
+                needed,
+            } => write!(
+                f,
+                "channel {channel} got {got} elements, the contract says {needed}"
+            ),
+            Self::NotFinite { channel, index } => {
+                write!(f, "element {index} of channel {channel} is not finite")
+            }
+            Self::OutOfLimits {
+                channel,
+                index,
+                value,
+                min,
+                max,
+            } => write!(
+                f,
+                "element {index} of channel {channel} is {value}, the contract's limits are {min} to {max}"
+            ),
+        }
+    }
+}
+
+impl Error for InputError {}
+
+/// Why the programs of a call gave nothing that may be used. A sound image and finite weights never cause it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum RunError {
+    /// A program failed.
+    Program(ExecError),
+    /// A program computed something that is not finite.
+    NotFinite,
+}
+
+impl fmt::Display for RunError {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self {
+            Self::Program(error) => write!(f, "a program failed: {error}"),
+            Self::NotFinite => f.write_str("the policy computed a value that is not finite"),
+        }
+    }
+}
+
+impl Error for RunError {}
 
 /// Why an instruction was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum InstructionError {
+    /// The policy takes no instruction.
+    NotTaken,
     /// The contract has no instruction of this number.
     Unknown {
         /// The number.
@@ -34,28 +168,27 @@ pub enum InstructionError {
         /// The first such element.
         index: usize,
     },
-    /// The program failed; the controller has no instruction now.
-    Program(ExecError),
+    /// The programs failed; the controller has no instruction now.
+    Run(RunError),
 }
 
 impl fmt::Display for InstructionError {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         match self {
+            Self::NotTaken => f.write_str("the policy takes no instruction"),
             Self::Unknown { id, count } => {
                 write!(f, "no instruction {id}; the policy knows {count}")
             }
-            Self::Length { got, word_dim } => {
-                write!(
-                    f,
-                    "{got} elements are no whole number of words of {word_dim} elements"
-                )
-            }
+            Self::Length { got, word_dim } => write!(
+                f,
+                "{got} elements are not a whole number of words of {word_dim} elements"
+            ),
             Self::Words { got, most } => write!(
                 f,
                 "an instruction of {got} words; the policy takes 1 to {most}"
             ),
             Self::NotFinite { index } => write!(f, "word element {index} is not finite"),
-            Self::Program(error) => write!(f, "the instruct program failed: {error}"),
+            Self::Run(error) => write!(f, "the instruction could not be taken in: {error}"),
         }
     }
 }
@@ -64,38 +197,18 @@ impl Error for InstructionError {}
 
 /// Why a control step, or what was said about the executed action, was refused.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub enum StepError {
-    /// No instruction has been set.
+    /// The policy takes an instruction and none has been set.
     NoInstruction,
-    /// The observation has another length than the contract's.
-    ObservationLength {
-        /// Elements given.
-        got: usize,
-        /// Elements in the contract.
-        needed: usize,
-    },
+    /// What was observed, or said to be executed, is not what the contract says.
+    Input(InputError),
     /// The action has another length than the contract's.
     ActionLength {
         /// Elements given.
         got: usize,
         /// Elements in the contract.
         needed: usize,
-    },
-    /// An element that was given is not a number or infinite.
-    NotFinite {
-        /// The first such element.
-        index: usize,
-    },
-    /// An element of the observation is outside the contract's limits.
-    OutOfLimits {
-        /// The first such element.
-        index: usize,
-        /// Its value.
-        value: f32,
-        /// Smallest value allowed.
-        min: f32,
-        /// Largest value allowed.
-        max: f32,
     },
     /// The context holds as many control steps as the policy was trained on, and the contract says to stop there.
     ContextFull {
@@ -104,120 +217,127 @@ pub enum StepError {
     },
     /// There was no step whose action could have been executed.
     NothingExecuted,
-    /// The policy computed something that is not finite.
-    NotFiniteResult,
-    /// A program failed.
-    Program(ExecError),
+    /// The policy computed nothing that may be used.
+    Run(RunError),
 }
 
 impl fmt::Display for StepError {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         match self {
             Self::NoInstruction => f.write_str("no instruction has been set"),
-            Self::ObservationLength { got, needed } => {
-                write!(
-                    f,
-                    "an observation of {got} elements, the contract says {needed}"
-                )
-            }
+            Self::Input(error) => error.fmt(f),
             Self::ActionLength { got, needed } => {
                 write!(f, "an action of {got} elements, the contract says {needed}")
-            }
-            Self::NotFinite { index } => write!(f, "element {index} is not finite"),
-            Self::OutOfLimits {
-                index,
-                value,
-                min,
-                max,
-            } => {
-                write!(
-                    f,
-                    "observation element {index} is {value}, the contract's limits are {min} to {max}"
-                )
             }
             Self::ContextFull { steps } => {
                 write!(f, "the context is full after {steps} control steps: reset")
             }
             Self::NothingExecuted => f.write_str("no step has been taken yet"),
-            Self::NotFiniteResult => f.write_str("the policy computed a value that is not finite"),
-            Self::Program(error) => write!(f, "a program failed: {error}"),
+            Self::Run(error) => error.fmt(f),
         }
     }
 }
 
 impl Error for StepError {}
 
-/// Why the low level alone gave no action.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ActError {
-    /// The observation or the action has another length than the contract's.
-    Length {
+impl From<InputError> for StepError {
+    fn from(error: InputError) -> Self {
+        Self::Input(error)
+    }
+}
+
+impl From<RunError> for StepError {
+    fn from(error: RunError) -> Self {
+        Self::Run(error)
+    }
+}
+
+/// Why a chosen index gave no action.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub enum FollowError {
+    /// The policy has no action for an index alone.
+    NotOffered,
+    /// What was observed is not what the contract says.
+    Input(InputError),
+    /// The action has another length than the contract's.
+    ActionLength {
         /// Elements given.
         got: usize,
         /// Elements in the contract.
         needed: usize,
     },
-    /// The codebook has no such plan.
-    Plan {
+    /// There is no such index.
+    Index {
         /// Index given.
         got: u32,
-        /// Plans in the codebook.
-        size: u32,
+        /// How many there are.
+        count: u32,
     },
-    /// An element of the observation is not a number or infinite.
-    NotFinite {
-        /// The first such element.
-        index: usize,
-    },
-    /// The policy computed something that is not finite.
-    NotFiniteResult,
-    /// The program failed.
-    Program(ExecError),
+    /// The policy computed nothing that may be used.
+    Run(RunError),
 }
 
-impl fmt::Display for ActError {
+impl fmt::Display for FollowError {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         match self {
-            Self::Length { got, needed } => {
-                write!(f, "{got} elements, the contract says {needed}")
+            Self::NotOffered => f.write_str("the policy has no action for an index alone"),
+            Self::Input(error) => error.fmt(f),
+            Self::ActionLength { got, needed } => {
+                write!(f, "an action of {got} elements, the contract says {needed}")
             }
-            Self::Plan { got, size } => write!(f, "plan {got} of a codebook of {size}"),
-            Self::NotFinite { index } => write!(f, "element {index} is not finite"),
-            Self::NotFiniteResult => f.write_str("the policy computed a value that is not finite"),
-            Self::Program(error) => write!(f, "the low level's program failed: {error}"),
+            Self::Index { got, count } => write!(f, "index {got} of {count}"),
+            Self::Run(error) => error.fmt(f),
         }
     }
 }
 
-impl Error for ActError {}
+impl Error for FollowError {}
+
+impl From<InputError> for FollowError {
+    fn from(error: InputError) -> Self {
+        Self::Input(error)
+    }
+}
+
+impl From<RunError> for FollowError {
+    fn from(error: RunError) -> Self {
+        Self::Run(error)
+    }
+}
 
 /// Why a demonstration could not be encoded.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub enum EncodeError {
-    /// The image was compiled without the trajectory encoder.
+    /// The image has no encoder.
     NoEncoder,
-    /// Observations or actions are not one horizon long.
-    Length {
-        /// Elements given.
-        got: usize,
-        /// Elements of one horizon.
-        needed: usize,
-    },
-    /// An element is not a number or infinite.
-    NotFinite,
-    /// The program failed.
-    Program(ExecError),
+    /// What was given is not what the contract says.
+    Input(InputError),
+    /// The policy computed nothing that may be used.
+    Run(RunError),
 }
 
 impl fmt::Display for EncodeError {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         match self {
-            Self::NoEncoder => f.write_str("the image was compiled without the trajectory encoder"),
-            Self::Length { got, needed } => write!(f, "{got} elements, one horizon has {needed}"),
-            Self::NotFinite => f.write_str("an element is not finite"),
-            Self::Program(error) => write!(f, "the encode program failed: {error}"),
+            Self::NoEncoder => f.write_str("the image was compiled without a trajectory encoder"),
+            Self::Input(error) => error.fmt(f),
+            Self::Run(error) => error.fmt(f),
         }
     }
 }
 
 impl Error for EncodeError {}
+
+impl From<InputError> for EncodeError {
+    fn from(error: InputError) -> Self {
+        Self::Input(error)
+    }
+}
+
+impl From<RunError> for EncodeError {
+    fn from(error: RunError) -> Self {
+        Self::Run(error)
+    }
+}

@@ -1,55 +1,128 @@
 //! The recorded episode that a policy replays to test itself on its target.
 
-use crate::codec::{Field, Reader};
-use crate::contract::Contract;
-use crate::image::GoldenRecord;
+use lads_image::codec::{Field, Reader};
+use lads_image::records::{self, GoldenRecord};
 
-/// A checked view on the recorded episode: observations, the plan in force and the action of each control step.
+use crate::contract::{ChannelId, Contract, DType};
+use crate::inputs::{Data, Given, MAX_OBSERVATIONS};
+use crate::schedule::Sizes;
+
+/// A checked view on the recorded episode: what was observed, the index in force and the action of each control step.
 #[derive(Debug, Clone, Copy)]
 pub struct Golden<'a> {
     record: GoldenRecord,
-    observations: &'a [f32],
-    plans: &'a [u32],
+    /// The values of each observation channel over all steps.
+    observations: [Option<Recorded<'a>>; MAX_OBSERVATIONS],
+    selected: &'a [u32],
+    noise: &'a [f32],
     actions: &'a [f32],
-    observation_len: usize,
     action_len: usize,
+}
+
+/// What a channel was over all steps.
+#[derive(Debug, Clone, Copy)]
+struct Recorded<'a> {
+    channel: ChannelId,
+    len: usize,
+    data: Data<'a>,
+}
+
+/// One recorded control step.
+#[derive(Debug, Clone, Copy)]
+pub struct GoldenStep<'a> {
+    pub(crate) given: Given<'a>,
+    /// The index in force, if the policy selects one.
+    pub selected: Option<u32>,
+    /// All draws of noise in the order in which they are used; empty for a policy without noise.
+    pub noise: &'a [f32],
+    /// The action, after clipping to the contract's limits.
+    pub action: &'a [f32],
+}
+
+impl<'a> GoldenStep<'a> {
+    /// What was observed, one row for each observation channel in the contract's order.
+    pub fn observations(&self) -> &[(ChannelId, Data<'a>)] {
+        self.given.all()
+    }
+
+    /// The values of the only observation channel; empty for a policy that has others, or of another type.
+    pub fn observation(&self) -> &'a [f32] {
+        match self.given.all() {
+            [(_, Data::F32(values))] => values,
+            _ => &[],
+        }
+    }
 }
 
 impl<'a> Golden<'a> {
     /// Checks the golden section; `None` when it contradicts the contract.
-    pub(crate) fn new_checked(section: &'a [u32], contract: &Contract<'a>) -> Option<Self> {
-        let (record, rest) = section.split_at_checked(GoldenRecord::WORDS)?;
+    pub(crate) fn new_checked(contract: &Contract<'a>, sizes: &Sizes) -> Option<Self> {
+        let (record, mut rest) = contract
+            .tables
+            .golden()
+            .split_at_checked(GoldenRecord::WORDS)?;
         let record = GoldenRecord::take(&mut Reader::new(record))?;
         let steps = record.steps as usize;
-        let (observation_len, action_len) = (contract.observation_len(), contract.action_len());
-        let (observations, rest) = rest.split_at_checked(steps.checked_mul(observation_len)?)?;
-        let (plans, actions) = rest.split_at_checked(steps)?;
-        let known = (record.instruction as usize) < contract.instruction_count();
+        let mut take = |words: usize| {
+            let (part, behind) = rest.split_at_checked(words)?;
+            rest = behind;
+            Some(part)
+        };
+        let mut observations = [None; MAX_OBSERVATIONS];
+        let mut places = observations.iter_mut();
+        for channel in contract.observations() {
+            let len = channel.len();
+            let all = steps.checked_mul(len)?;
+            let data = match channel.dtype() {
+                DType::F32 => Data::F32(bytemuck::try_cast_slice(take(all)?).ok()?),
+                DType::I32 => Data::I32(bytemuck::try_cast_slice(take(all)?).ok()?),
+                DType::U8 => {
+                    let bytes: &[u8] = bytemuck::try_cast_slice(take(all.div_ceil(4))?).ok()?;
+                    Data::U8(bytes.get(..all)?)
+                }
+            };
+            *places.next()? = Some(Recorded {
+                channel: channel.id(),
+                len,
+                data,
+            });
+        }
+        let selected = take(if record.selects { steps } else { 0 })?;
+        let noise = take(steps.checked_mul(record.noise_len as usize)?)?;
+        let action_len = contract.action_len();
+        let actions = take(steps.checked_mul(action_len)?)?;
+        let known = if contract.instruction_channel().is_some() {
+            (record.instruction as usize) < contract.instruction_count()
+        } else {
+            record.instruction == records::NONE
+        };
         let tolerance = record.tolerance.is_finite() && record.tolerance >= 0.0;
-        let complete = steps > 0 && Some(actions.len()) == steps.checked_mul(action_len);
+        let selects = record.selects == sizes.scores.is_some();
+        let noisy = record.noise_len as usize == sizes.noise_len;
+        let complete = steps > 0 && rest.is_empty() && selects && noisy;
         (known && tolerance && complete).then_some(Self {
             record,
-            observations: bytemuck::try_cast_slice(observations).ok()?,
-            plans,
+            observations,
+            selected,
+            noise: bytemuck::try_cast_slice(noise).ok()?,
             actions: bytemuck::try_cast_slice(actions).ok()?,
-            observation_len,
             action_len,
         })
     }
 
-    /// Number of the instruction that was followed.
-    pub fn instruction(&self) -> u32 {
-        self.record.instruction
+    /// Number of the instruction that was followed; `None` for a policy that takes none.
+    pub fn instruction(&self) -> Option<u32> {
+        (self.record.instruction != records::NONE).then_some(self.record.instruction)
     }
 
     /// Control steps.
     pub fn len(&self) -> usize {
-        self.plans.len()
+        self.record.steps as usize
     }
 
     /// Never true: an episode has at least one step.
     pub fn is_empty(&self) -> bool {
-        self.plans.is_empty()
+        self.record.steps == 0
     }
 
     /// Largest absolute difference of an action that the self-test accepts.
@@ -57,13 +130,27 @@ impl<'a> Golden<'a> {
         self.record.tolerance
     }
 
-    /// For each control step its observation, the plan in force and the action.
-    pub fn steps(&self) -> impl Iterator<Item = (&'a [f32], u32, &'a [f32])> + use<'a> {
-        let observations = self.observations.chunks_exact(self.observation_len.max(1));
-        let actions = self.actions.chunks_exact(self.action_len.max(1));
-        observations
-            .zip(self.plans)
-            .zip(actions)
-            .map(|((observation, &plan), action)| (observation, plan, action))
+    /// Recorded step `i`.
+    pub fn step(&self, i: usize) -> Option<GoldenStep<'a>> {
+        let mut given = Given::default();
+        for recorded in self.observations.iter().flatten() {
+            given.push(recorded.channel, recorded.data.row(i, recorded.len)?);
+        }
+        let row = |values: &'a [f32], len: usize| {
+            let start = i.checked_mul(len)?;
+            values.get(start..start.checked_add(len)?)
+        };
+        Some(GoldenStep {
+            given,
+            selected: self.selected.get(i).copied(),
+            noise: row(self.noise, self.record.noise_len as usize)?,
+            action: row(self.actions, self.action_len)?,
+        })
+    }
+
+    /// All recorded steps in order.
+    pub fn steps(&self) -> impl Iterator<Item = GoldenStep<'a>> + use<'a> {
+        let golden = *self;
+        (0..self.len()).map_while(move |i| golden.step(i))
     }
 }

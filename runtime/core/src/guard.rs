@@ -15,10 +15,11 @@ mod limiter;
 use core::error::Error;
 use core::fmt;
 
+use crate::contract::Contract;
 use crate::controller::StepReport;
-use crate::errors::StepError;
+use crate::errors::{InputError, StepError};
 
-pub use controller::GuardedController;
+pub use controller::{GuardedController, SwapError};
 pub use limiter::Limits;
 
 /// What is written when the policy's action cannot be used. All of them keep the limits and the rate.
@@ -43,10 +44,38 @@ pub struct GuardConfig<'c> {
     pub fallback: Fallback,
     /// Missed control periods that are still tolerated between two steps.
     pub late_after: u32,
+    /// Periods in a row without an observation that can be used, in which the last action is repeated and the policy's state is
+    /// kept before the fallback takes over; 0 for none.
+    pub coast: u32,
+    /// The farthest that a timestamp may lie behind the last one, in its unit; 0 for any distance. One beyond it is refused, and
+    /// does not count as the last one.
+    pub max_jump: u64,
     /// Stops after so many interventions in a row; 0 for never.
     pub stop_after: u32,
     /// Limits, rates and the safe action.
     pub limits: Limits<'c>,
+}
+
+impl GuardConfig<'_> {
+    /// Says what of it contradicts a contract, before a controller with its memory is made.
+    pub fn check(&self, contract: &Contract) -> Result<(), GuardError> {
+        self.share(contract)?;
+        limiter::check(contract, &self.limits)
+    }
+
+    /// The part of what is left to the safe action that a decay takes away in a period.
+    fn share(&self, contract: &Contract) -> Result<f32, GuardError> {
+        match self.fallback {
+            Fallback::Decay { time_constant_s } => {
+                if !time_constant_s.is_finite() || time_constant_s <= 0.0 {
+                    return Err(GuardError::TimeConstant);
+                }
+                let period = contract.control_period_s();
+                Ok(period / (period + time_constant_s))
+            }
+            Fallback::Stop | Fallback::Hold => Ok(1.0),
+        }
+    }
 }
 
 /// The clock of one control period.
@@ -60,6 +89,7 @@ pub struct Tick {
 
 /// Why the policy's action was not used.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub enum Intervention {
     /// The self-test has not passed, and nobody has declined it.
     NotArmed,
@@ -69,6 +99,8 @@ pub enum Intervention {
     NoObservation,
     /// The observation is no later than the last one.
     Stale,
+    /// The timestamp lies farther ahead of the last one than the configuration allows: it is taken for damaged.
+    Jump,
     /// More control periods were missed than tolerated.
     Late {
         /// How many.
@@ -85,6 +117,8 @@ pub struct GuardReport {
     pub step: Option<StepReport>,
     /// Why the action is the fallback's; `None` when it is the policy's.
     pub intervention: Option<Intervention>,
+    /// The action is the last one again, because the configuration lets so many observations be missed.
+    pub coasting: bool,
     /// An element was at a limit or beyond and is now at the limit.
     pub saturated: bool,
     /// An element moves as fast as it may, less far than it should.
@@ -104,8 +138,10 @@ pub struct Counters {
     pub stopped: u64,
     /// Periods without an observation.
     pub no_observation: u64,
-    /// Stale observations.
+    /// Stale observations, and those whose timestamp jumps.
     pub stale: u64,
+    /// Periods in which the last action was repeated.
+    pub coasted: u64,
     /// Interventions because too many periods were missed.
     pub late: u64,
     /// All missed periods.
@@ -129,14 +165,19 @@ impl Counters {
             Some(Intervention::NotArmed) => &mut self.not_armed,
             Some(Intervention::Stopped) => &mut self.stopped,
             Some(Intervention::NoObservation) => &mut self.no_observation,
-            Some(Intervention::Stale) => &mut self.stale,
+            Some(Intervention::Stale | Intervention::Jump) => &mut self.stale,
             Some(Intervention::Late { .. }) => &mut self.late,
-            Some(Intervention::Refused(StepError::NotFinite { .. })) => &mut self.not_finite,
-            Some(Intervention::Refused(StepError::OutOfLimits { .. })) => &mut self.out_of_limits,
+            Some(Intervention::Refused(StepError::Input(InputError::NotFinite { .. }))) => {
+                &mut self.not_finite
+            }
+            Some(Intervention::Refused(StepError::Input(InputError::OutOfLimits { .. }))) => {
+                &mut self.out_of_limits
+            }
             Some(Intervention::Refused(_)) => &mut self.refused,
         };
         *reason = reason.saturating_add(1);
         self.periods = self.periods.saturating_add(1);
+        self.coasted = self.coasted.saturating_add(u64::from(report.coasting));
         self.saturated = self.saturated.saturating_add(u64::from(report.saturated));
         self.rate_limited = self
             .rate_limited
@@ -146,6 +187,7 @@ impl Counters {
 
 /// Why a guard's configuration was refused.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub enum GuardError {
     /// The memory has too few elements.
     Memory {

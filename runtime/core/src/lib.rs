@@ -1,4 +1,4 @@
-//! Runs a compiled LADS policy: program image in, actions out, once every control period.
+//! Runs a compiled policy: program image in, actions out, once every control period.
 //!
 //! - [`Policy::new_checked`] is a view on a program image, all of it checked; it copies nothing.
 //! - [`Workspace::new`] takes the caller's memory: [`Policy::arena_len`] and [`Policy::state_len`] elements.
@@ -10,7 +10,8 @@
 //! Invariants: no `std`, no allocation, no unsafe code, no panic. Sizes (contract), weights (image) and mutable state
 //! (workspace) are three types. Everything about a model is checked when it is opened; afterwards only what the caller passes
 //! can be refused, with one small error enum per operation. The same image and the same calls give the same bits on every
-//! target and on every [`Isa`], which a controller chooses once, when it is made.
+//! target and on every [`Isa`], which a controller chooses once, when it is made; numbers too small for a normal `f32` are the
+//! one exception: x86-64 takes them as zero while a program runs, so that they cost no time, and other targets compute with them.
 //!
 //! ```no_run
 //! use lads_core::{Controller, Instruction, Policy, Workspace};
@@ -34,7 +35,7 @@
 //! }
 //! ```
 //!
-//! [`op`] and [`image`] describe the format for the compiler that writes it.
+//! The crate lads-image describes the format for the compiler that writes it.
 #![no_std]
 #![forbid(unsafe_code)]
 #![cfg_attr(
@@ -51,38 +52,38 @@
 #[cfg(test)]
 extern crate std;
 
-mod check;
-pub mod codec;
 mod contract;
 mod controller;
 mod decision;
 mod errors;
-mod exec;
 mod golden;
 mod guard;
-pub mod image;
-mod low_level;
-pub mod op;
+mod inputs;
+mod lookup;
+mod normal;
 mod policy;
-pub mod program;
+mod run;
+mod schedule;
 mod self_test;
+pub mod similarity;
 mod workspace;
 
-pub use check::Fault;
 pub use contract::{
-    Contract, ContractError, Decision, Element, Interval, KnownInstruction, Network,
+    Beyond, Channel, ChannelId, Contract, ContractError, DType, Decision, Element, Interval,
+    KnownInstruction, Noise, QuaternionOrder, Role,
 };
-pub use controller::{Controller, Instruction, StepReport};
-pub use decision::PlanIndex;
-pub use errors::{ActError, EncodeError, InstructionError, StepError};
-pub use exec::ExecError;
-pub use golden::Golden;
+pub use controller::{Controller, Instruction, Selected, StepReport};
+pub use errors::{EncodeError, FollowError, InputError, InstructionError, RunError, StepError};
+pub use golden::{Golden, GoldenStep};
 pub use guard::{
     ActionLength, Counters, Fallback, GuardConfig, GuardError, GuardReport, GuardedController,
-    Intervention, Limits, Tick,
+    Intervention, Limits, SwapError, Tick,
 };
+pub use inputs::{Data, MAX_OBSERVATIONS};
+pub use lads_image::ExecError;
 pub use lads_kernels::Isa;
+pub use lookup::instructions_called;
 pub use policy::{Policy, PolicyError};
-pub use program::{Program, ProgramError};
+pub use schedule::ScheduleError;
 pub use self_test::{SelfTest, SelfTestError};
 pub use workspace::{Workspace, WorkspaceTooSmall};

@@ -3,10 +3,10 @@
 use core::error::Error;
 use core::fmt;
 
-use crate::contract::Decision;
+use crate::contract::{Decision, Noise, Role};
 use crate::controller::{Controller, Instruction};
-use crate::decision::PlanIndex;
 use crate::errors::{InstructionError, StepError};
+use crate::inputs;
 
 /// The hash of nothing, and the factor, of FNV-1a with 32 bits.
 const FNV_OFFSET: u32 = 0x811c_9dc5;
@@ -26,6 +26,7 @@ pub struct SelfTest {
 
 /// Why a self-test failed; steps count from 0.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub enum SelfTestError {
     /// The image holds no recorded episode.
     NoGolden,
@@ -38,14 +39,14 @@ pub enum SelfTestError {
         /// Why.
         error: StepError,
     },
-    /// The first step with another plan than recorded.
-    Plan {
+    /// The first step with another index in force than recorded.
+    Selected {
         /// Which one.
         step: u32,
-        /// Recorded plan.
-        expected: PlanIndex,
-        /// Plan on this target.
-        got: PlanIndex,
+        /// Recorded index.
+        expected: u32,
+        /// Index on this target.
+        got: u32,
     },
     /// The first step with an action further from the recorded one than the tolerance.
     Action {
@@ -61,33 +62,43 @@ pub enum SelfTestError {
 }
 
 impl Controller<'_, '_> {
-    /// Replays the recorded episode, open loop on its observations and with argmax, and compares plans and actions. Whatever
-    /// the outcome, the controller is afterwards without an instruction, and sampling starts from its seed.
+    /// Replays the recorded episode, open loop on its observations and noise and with argmax, and compares the indices in force and
+    /// the actions. Whatever the outcome, the controller is afterwards without an instruction, and sampling and noise start from
+    /// their seeds.
     pub fn self_test(&mut self) -> Result<SelfTest, SelfTestError> {
-        let rule = self.decision();
-        self.set_decision(Decision::Argmax);
+        let (rule, noise) = (self.decision(), self.noise());
+        self.renew(Decision::Argmax, Noise::Zero);
         let outcome = self.replay();
-        self.renew(rule);
+        self.renew(rule, noise);
+        self.set_tested(outcome.is_ok());
         outcome
     }
 
     fn replay(&mut self) -> Result<SelfTest, SelfTestError> {
         let golden = self.policy().golden().ok_or(SelfTestError::NoGolden)?;
-        let instruction = Instruction::Id(golden.instruction());
-        self.set_instruction(instruction)
-            .map_err(SelfTestError::Instruction)?;
+        if let Some(id) = golden.instruction() {
+            self.set_instruction(Instruction::Id(id))
+                .map_err(SelfTestError::Instruction)?;
+        }
         let (mut largest_error, mut digest) = (0.0_f32, FNV_OFFSET);
-        for (step, (observation, plan, action)) in (0_u32..).zip(golden.steps()) {
-            let report = self
-                .advance(observation)
-                .map_err(|error| SelfTestError::Step { step, error })?;
-            if report.plan.0 != plan {
-                return Err(SelfTestError::Plan {
+        for (step, recorded) in (0_u32..).zip(golden.steps()) {
+            let refused = |error| SelfTestError::Step { step, error };
+            let given = recorded.observations();
+            inputs::check(self.policy().contract(), Role::Observation, given, 0)
+                .map_err(|error| refused(StepError::Input(error)))?;
+            let noise = (!recorded.noise.is_empty()).then_some(recorded.noise);
+            let report = self.advance(given, noise).map_err(refused)?;
+            let selected = report.selected.map(|selected| selected.index);
+            if let (Some(expected), Some(got)) = (recorded.selected, selected)
+                && expected != got
+            {
+                return Err(SelfTestError::Selected {
                     step,
-                    expected: PlanIndex(plan),
-                    got: report.plan,
+                    expected,
+                    got,
                 });
             }
+            let action = recorded.action;
             for (index, (&expected, &got)) in (0_u32..).zip(action.iter().zip(self.last_action())) {
                 let difference = (expected - got).abs();
                 // A recorded value that is not a number compares as different.
@@ -119,11 +130,14 @@ impl fmt::Display for SelfTestError {
             Self::NoGolden => f.write_str("the policy holds no recorded episode"),
             Self::Instruction(error) => write!(f, "the recorded instruction was refused: {error}"),
             Self::Step { step, error } => write!(f, "step {step} was refused: {error}"),
-            Self::Plan {
+            Self::Selected {
                 step,
                 expected,
                 got,
-            } => write!(f, "step {step} chose plan {got}, recorded is {expected}"),
+            } => write!(
+                f,
+                "step {step} selected index {got}, recorded is {expected}"
+            ),
             Self::Action {
                 step,
                 index,

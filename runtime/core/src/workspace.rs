@@ -5,35 +5,38 @@ use core::fmt;
 
 use lads_kernels::{Isa, assign};
 
-use crate::exec::Machine;
-use crate::op::INT_SLOTS;
 use crate::policy::Policy;
 
-/// What a control step replaces as a whole: the plan, the action and the logits.
+/// What a control step replaces as a whole: the plain states that last longer than a step, and the action.
 #[derive(Debug)]
 pub(crate) struct Bank<'m> {
-    pub plan: &'m mut [f32],
+    pub plain: &'m mut [f32],
     pub action: &'m mut [f32],
-    pub logits: &'m mut [f32],
 }
 
 impl Bank<'_> {
     /// Takes over another bank's values.
     pub fn copy_from(&mut self, other: &Bank) {
-        assign(self.plan, other.plan);
+        assign(self.plain, other.plain);
         assign(self.action, other.action);
-        assign(self.logits, other.logits);
     }
 }
 
 /// Memory for one controller: the arena, which holds nothing between two calls, and the state, which does.
 #[derive(Debug)]
 pub struct Workspace<'m> {
-    pub(crate) machine: Machine<'m>,
+    /// What a program computes in.
+    pub(crate) arena: &'m mut [f32],
+    /// Rings and KV caches.
+    pub(crate) rows: &'m mut [f32],
     /// The state in force.
     pub(crate) now: Bank<'m>,
     /// What the step that is being computed would make of it.
     pub(crate) next: Bank<'m>,
+    /// What the programs of one step hand to each other.
+    pub(crate) scratch: &'m mut [f32],
+    /// What the kernels run on.
+    pub(crate) isa: Isa,
 }
 
 impl<'m> Workspace<'m> {
@@ -46,36 +49,33 @@ impl<'m> Workspace<'m> {
         let arena = take(arena, policy.arena_len())?;
         let state = take(state, policy.state_len())?;
         let (got, needed) = (state.len(), policy.state_len());
-        let parts = split(state, policy.contract().cache_len(), policy.bank_lens());
-        let (cache, now, next) = parts.ok_or(WorkspaceTooSmall { got, needed })?;
-        Ok(Self {
-            machine: Machine {
-                arena,
-                cache,
-                ints: [0; INT_SLOTS],
-                isa: Isa::portable(),
-            },
+        Self::split(policy, arena, state).ok_or(WorkspaceTooSmall { got, needed })
+    }
+
+    fn split(policy: &Policy, arena: &'m mut [f32], state: &'m mut [f32]) -> Option<Self> {
+        let (plain, action) = (policy.sizes.bank_len, policy.contract().action_len());
+        let (rows, rest) = state.split_at_mut_checked(policy.sizes.rows_len)?;
+        let (now, rest) = bank(rest, plain, action)?;
+        let (next, rest) = bank(rest, plain, action)?;
+        let (scratch, _) = rest.split_at_mut_checked(policy.sizes.scratch_len)?;
+        Some(Self {
+            arena,
+            rows,
             now,
             next,
+            scratch,
+            isa: Isa::portable(),
         })
     }
 
-    /// Elements of the plan, the action and the logits, as [`Policy::bank_lens`] has them.
-    pub(crate) fn bank_lens(&self) -> [usize; 3] {
-        [&self.now.plan, &self.now.action, &self.now.logits].map(|part| part.len())
+    /// Whether it was made for a policy of these sizes.
+    pub(crate) fn fits(&self, policy: &Policy) -> bool {
+        self.arena.len() >= policy.arena_len()
+            && self.rows.len() == policy.sizes.rows_len
+            && self.now.plain.len() == policy.sizes.bank_len
+            && self.now.action.len() == policy.contract().action_len()
+            && self.scratch.len() == policy.sizes.scratch_len
     }
-}
-
-/// The state: the cache, then both banks.
-fn split(
-    state: &mut [f32],
-    cache_len: usize,
-    bank_lens: [usize; 3],
-) -> Option<(&mut [f32], Bank<'_>, Bank<'_>)> {
-    let (cache, rest) = state.split_at_mut_checked(cache_len)?;
-    let (now, rest) = bank(rest, bank_lens)?;
-    let (next, _) = bank(rest, bank_lens)?;
-    Some((cache, now, next))
 }
 
 /// The first `needed` elements, set to zero.
@@ -89,18 +89,10 @@ fn take(memory: &mut [f32], needed: usize) -> Result<&mut [f32], WorkspaceTooSma
 }
 
 /// Cuts a bank off the front.
-fn bank(memory: &mut [f32], [plan, action, logits]: [usize; 3]) -> Option<(Bank<'_>, &mut [f32])> {
-    let (plan, rest) = memory.split_at_mut_checked(plan)?;
+fn bank(memory: &mut [f32], plain: usize, action: usize) -> Option<(Bank<'_>, &mut [f32])> {
+    let (plain, rest) = memory.split_at_mut_checked(plain)?;
     let (action, rest) = rest.split_at_mut_checked(action)?;
-    let (logits, rest) = rest.split_at_mut_checked(logits)?;
-    Some((
-        Bank {
-            plan,
-            action,
-            logits,
-        },
-        rest,
-    ))
+    Some((Bank { plain, action }, rest))
 }
 
 /// The arena or the state has too few elements.

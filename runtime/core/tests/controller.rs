@@ -2,329 +2,325 @@
 
 mod support;
 
-use lads_core::image::{Beyond, DecisionRule, ProgramKind};
 use lads_core::{
-    ActError, Controller, Decision, Element, EncodeError, Instruction, InstructionError, Interval,
-    PlanIndex, Policy, StepError,
+    ChannelId, Controller, DType, Data, Decision, EncodeError, FollowError, InputError,
+    Instruction, Interval, Noise, Role, StepError,
 };
-use support::assemble::{parts, with_golden};
-use support::{Image, Memory, Model, Random, Spec};
+use lads_image::records::{Beyond, NoiseRule, SelectionRule};
+use support::assemble::{ACTIONS, OBSERVATION, OBSERVATIONS, parts};
+use support::{Image, Memory, Model, Random, Spec, with_controller};
 
 fn tiny() -> Model {
     Model::random(Spec::TINY, 11)
 }
 
+fn demonstration<'d>(observations: &'d [f32], actions: &'d [f32]) -> [(ChannelId, Data<'d>); 2] {
+    [
+        (ChannelId(OBSERVATIONS), Data::F32(observations)),
+        (ChannelId(ACTIONS), Data::F32(actions)),
+    ]
+}
+
+fn observed(observation: &[f32]) -> [(ChannelId, Data<'_>); 1] {
+    [(ChannelId(OBSERVATION), Data::F32(observation))]
+}
+
 #[test]
-fn the_low_level_alone_repeats_the_step_and_disturbs_nothing() {
+fn following_an_index_repeats_the_step_and_disturbs_nothing() {
     let model = tiny();
     let image = parts(&model).image();
     let policy = image.policy();
-    let mut memory = Memory::for_policy(&policy);
+    assert!(policy.follows() && policy.encodes());
     let mut undisturbed = Memory::for_policy(&policy);
-    let mut controller = memory.controller(&policy);
     let mut reference = undisturbed.controller(&policy);
-    let mut random = Random(9);
-    let mut action = vec![0.0; model.spec.action_len];
-    let mut alone = action.clone();
-    let other = PlanIndex(model.spec.codebook_len as u32 - 1);
+    let mut memory = Memory::for_policy(&policy);
+    let mut controller = memory.controller(&policy);
+    let (mut random, mut action, mut alone) = (Random(9), [0.0; 2], [0.0; 2]);
+    // No instruction is needed.
+    assert_eq!(
+        controller.follow(&observed(&[0.1; 3]), 4, &mut alone),
+        Ok(())
+    );
     for controller in [&mut controller, &mut reference] {
         controller
             .set_instruction(Instruction::Id(0))
             .expect("the instruction is known");
     }
-    for _ in 0..model.spec.steps {
-        let observation = random.vec(model.spec.observation_len, 1.0);
+    for _ in 0..2 * model.spec.steps {
+        let observation = random.vec(3, 1.0);
         controller
-            .act(&observation, other, &mut alone)
-            .expect("the plan is in the codebook");
+            .follow(&observed(&observation), 4, &mut alone)
+            .expect("there is such an index");
+        for (&got, expected) in alone.iter().zip(model.act(&observation, 4)) {
+            assert!((f64::from(got) - expected).abs() < 1e-5);
+        }
         let report = controller.step(&observation, &mut action);
-        let mut wanted = action.clone();
+        let mut wanted = [0.0; 2];
         assert_eq!(report, reference.step(&observation, &mut wanted));
         assert_eq!(action, wanted);
-        let plan = report.expect("the observation is accepted").plan;
+        let index = report
+            .expect("the observation is accepted")
+            .selected
+            .expect("it selects")
+            .index;
         controller
-            .act(&observation, plan, &mut alone)
-            .expect("the plan is in the codebook");
+            .follow(&observed(&observation), index, &mut alone)
+            .expect("there is such an index");
         assert_eq!(alone, action);
+        assert_eq!(controller.scores(), reference.scores());
+        assert_eq!(controller.last_action(), action);
     }
-    let observation = random.vec(model.spec.observation_len, 1.0);
-    let size = model.spec.codebook_len as u32;
+    let mut refused = |inputs: &[(ChannelId, Data)], index, action: &mut [f32]| {
+        controller
+            .follow(inputs, index, action)
+            .expect_err("it is refused")
+    };
+    let sound = observed(&[0.0; 3]);
     assert_eq!(
-        controller.act(&observation, PlanIndex(size), &mut alone),
-        Err(ActError::Plan { got: size, size })
+        refused(&sound, 5, &mut alone),
+        FollowError::Index { got: 5, count: 5 }
     );
     assert_eq!(
-        controller.act(&observation, PlanIndex(0), &mut []),
-        Err(ActError::Length {
-            got: 0,
-            needed: model.spec.action_len
-        })
+        refused(&sound, 0, &mut []),
+        FollowError::ActionLength { got: 0, needed: 2 }
     );
-    let broken = vec![f32::NAN; model.spec.observation_len];
+    let not_finite = InputError::NotFinite {
+        channel: OBSERVATION,
+        index: 0,
+    };
     assert_eq!(
-        controller.act(&broken, PlanIndex(0), &mut alone),
-        Err(ActError::NotFinite { index: 0 })
+        refused(&observed(&[f32::NAN; 3]), 0, &mut alone),
+        FollowError::Input(not_finite)
     );
+    let missing = InputError::Missing {
+        channel: OBSERVATION,
+    };
+    assert_eq!(refused(&[], 0, &mut alone), FollowError::Input(missing));
+    assert_eq!(alone, action);
+
+    let image = support::shapes::queue().image();
+    let refused = with_controller(&image, |controller| {
+        controller.follow(&observed(&[0.0; 2]), 0, &mut [0.0; 2])
+    });
+    assert_eq!(refused, Err(FollowError::NotOffered));
 }
 
 #[test]
 fn a_full_context_can_refuse() {
     let mut parts = parts(&tiny());
     parts.contract.beyond = Beyond::Refuse;
-    let image = parts.image();
-    let policy = image.policy();
-    let mut memory = Memory::for_policy(&policy);
-    let mut controller = memory.controller(&policy);
-    controller
-        .set_instruction(Instruction::Id(0))
-        .expect("the instruction is known");
-    let mut action = [0.0; 2];
-    for _ in 0..8 {
-        controller
-            .step(&[0.1; 3], &mut action)
-            .expect("the context has room");
-    }
-    let before = action;
-    assert_eq!(
-        controller.step(&[0.1; 3], &mut action),
-        Err(StepError::ContextFull { steps: 8 })
-    );
-    assert_eq!(action, before);
-    controller.reset();
-    assert_eq!(
-        controller
-            .step(&[0.1; 3], &mut action)
-            .map(|report| report.timestep),
-        Ok(0)
-    );
-}
-
-/// The actions of an episode in which `between` is called before every step.
-fn episode(
-    image: &Image,
-    decision: Decision,
-    mut between: impl FnMut(&mut Controller, usize),
-) -> (Vec<u32>, Vec<f32>) {
-    let policy = image.policy();
-    let mut memory = Memory::for_policy(&policy);
-    let mut controller = memory.controller(&policy);
-    controller.set_decision(decision);
-    controller
-        .set_instruction(Instruction::Id(0))
-        .expect("the instruction is known");
-    let mut random = Random(1);
-    let (mut plans, mut actions) = (Vec::new(), Vec::new());
-    for step in 0..20 {
-        between(&mut controller, step);
+    with_controller(&parts.image(), |controller| {
         let mut action = [0.0; 2];
-        let report = controller
-            .step(&random.vec(3, 1.0), &mut action)
-            .expect("the step is sound");
-        plans.push(report.plan.0);
-        actions.extend(action);
-    }
-    (plans, actions)
-}
-
-#[test]
-fn refused_input_leaves_the_controller_as_it_was() {
-    let image = parts(&tiny()).image();
-    for decision in [
-        Decision::Argmax,
-        Decision::Sample {
-            temperature: 2.0,
-            seed: 5,
-        },
-    ] {
-        let undisturbed = episode(&image, decision, |_, _| {});
-        let disturbed = episode(&image, decision, |controller, step| {
-            let mut action = [7.0; 2];
-            let mut refused =
-                |observation: &[f32]| controller.step(observation, &mut action).unwrap_err();
-            assert_eq!(
-                refused(&[0.0; 2]),
-                StepError::ObservationLength { got: 2, needed: 3 }
-            );
-            assert_eq!(
-                refused(&[0.0, f32::NAN, 9.0]),
-                StepError::NotFinite { index: 1 }
-            );
-            assert_eq!(
-                refused(&[0.0, 0.0, f32::INFINITY]),
-                StepError::NotFinite { index: 2 }
-            );
-            let outside = StepError::OutOfLimits {
-                index: 2,
-                value: -3.5,
-                min: -3.0,
-                max: 3.0,
-            };
-            assert_eq!(refused(&[0.0, 0.0, -3.5]), outside);
-            assert_eq!(action, [7.0; 2]);
-            let short = StepError::ActionLength { got: 1, needed: 2 };
-            assert_eq!(controller.step(&[0.0; 3], &mut action[..1]), Err(short));
-            assert_eq!(controller.executed(&[0.0]), Err(short));
-            assert_eq!(
-                controller.executed(&[f32::NAN, 0.0]),
-                Err(StepError::NotFinite { index: 0 })
-            );
-            if step == 0 {
-                assert_eq!(
-                    controller.executed(&[0.0; 2]),
-                    Err(StepError::NothingExecuted)
-                );
-            }
-            let refused = controller.set_instruction(Instruction::Id(2));
-            assert_eq!(refused, Err(InstructionError::Unknown { id: 2, count: 2 }));
-            let refused = controller.set_instruction(Instruction::Words(&[0.0; 6]));
-            assert_eq!(
-                refused,
-                Err(InstructionError::Length {
-                    got: 6,
-                    word_dim: 4
-                })
-            );
-            let refused = controller.set_instruction(Instruction::Words(&[]));
-            assert_eq!(refused, Err(InstructionError::Words { got: 0, most: 4 }));
-            let refused = controller.set_instruction(Instruction::Words(&[0.0; 20]));
-            assert_eq!(refused, Err(InstructionError::Words { got: 5, most: 4 }));
-            let refused =
-                controller.set_instruction(Instruction::Words(&[0.0, 0.0, f32::NAN, 0.0]));
-            assert_eq!(refused, Err(InstructionError::NotFinite { index: 2 }));
-            // Encoding a demonstration does not disturb the episode either.
-            assert!(controller.encode(&[0.1; 9], &[0.2; 6]).is_ok());
-        });
-        assert_eq!(undisturbed, disturbed);
-    }
-}
-
-#[test]
-fn a_result_that_is_not_finite_is_refused_and_undone() {
-    // Weights that overflow for a large second observation element and are harmless for a small one.
-    let mut model = tiny();
-    let d = model.spec.width();
-    model.low[0].w[d..2 * d].fill(3e38);
-    let image = parts(&model).image();
-    let calm = |step: usize| [0.1, 0.0, 0.02 * step as f32];
-    let run = |disturb: bool| {
-        let policy = image.policy();
-        let mut memory = Memory::for_policy(&policy);
-        let mut controller = memory.controller(&policy);
-        controller.set_decision(Decision::Sample {
-            temperature: 5.0,
-            seed: 2,
-        });
-        controller
-            .set_instruction(Instruction::Id(0))
-            .expect("the instruction is known");
-        let mut seen = Vec::new();
-        // 20 steps: decisions, ordinary steps and restarts of the context.
-        for step in 0..20 {
-            let mut action = [9.0; 2];
-            if disturb {
-                let refused = controller.step(&[0.1, 2.9, 0.0], &mut action);
-                assert_eq!(refused, Err(StepError::NotFiniteResult));
-                assert_eq!(action, [9.0; 2]);
-            }
-            let report = controller
-                .step(&calm(step), &mut action)
-                .expect("the step is sound");
-            seen.push((report, action, controller.logits().to_vec()));
+        for _ in 0..8 {
+            controller
+                .step(&[0.1; 3], &mut action)
+                .expect("the context has room");
         }
-        seen
-    };
-    assert_eq!(run(false), run(true));
+        let before = action;
+        assert_eq!(
+            controller.step(&[0.1; 3], &mut action),
+            Err(StepError::ContextFull { steps: 8 })
+        );
+        assert_eq!(action, before);
+        controller.reset();
+        assert_eq!(
+            controller
+                .step(&[0.1; 3], &mut action)
+                .map(|report| report.timestep),
+            Ok(0)
+        );
+    });
+}
+
+#[test]
+fn what_is_given_has_to_be_what_the_contract_says() {
+    let image = support::shapes::camera().image();
+    with_controller(&image, |controller| {
+        let [floats, bytes, gear, ticks] = [
+            Data::F32(&[0.1, 0.2]),
+            Data::U8(&[1, 2, 3, 4]),
+            Data::I32(&[3]),
+            Data::I32(&[-4, 4]),
+        ];
+        let sound = [floats, bytes, gear, ticks];
+        let ids = [0, 2, 3, 4].map(ChannelId);
+        let mut action = [7.0; 2];
+        let mut step = |data: [Data; 4], ids: [ChannelId; 4]| {
+            let given: [_; 4] = std::array::from_fn(|i| (ids[i], data[i]));
+            controller.step_with(&given, &mut action).map(|_| ())
+        };
+        let refused = |error| Err(StepError::Input(error));
+        let with = |at: usize, data| {
+            let mut changed = sound;
+            changed[at] = data;
+            changed
+        };
+        assert_eq!(
+            step(with(1, Data::F32(&[0.0; 4])), ids),
+            refused(InputError::Type { channel: 2 })
+        );
+        assert_eq!(
+            step(with(3, Data::U8(&[0; 2])), ids),
+            refused(InputError::Type { channel: 4 })
+        );
+        let short = InputError::Length {
+            channel: 2,
+            got: 3,
+            needed: 4,
+        };
+        assert_eq!(step(with(1, Data::U8(&[0; 3])), ids), refused(short));
+        let outside = |channel, index, value, [min, max]: [f32; 2]| InputError::OutOfLimits {
+            channel,
+            index,
+            value,
+            min,
+            max,
+        };
+        assert_eq!(
+            step(with(2, Data::I32(&[4])), ids),
+            refused(outside(3, 0, 4.0, [0.0, 3.0]))
+        );
+        assert_eq!(
+            step(with(2, Data::I32(&[-1])), ids),
+            refused(outside(3, 0, -1.0, [0.0, 3.0]))
+        );
+        let far = outside(4, 1, i32::MIN as f32, [-4.0, 4.0]);
+        assert_eq!(step(with(3, Data::I32(&[0, i32::MIN])), ids), refused(far));
+        let unknown = |channel| refused(InputError::Unknown { channel });
+        for wrong in [1, 2, 9, u32::MAX] {
+            let mut ids = ids;
+            ids[2] = ChannelId(wrong);
+            assert_eq!(step(sound, ids), unknown(wrong), "{wrong}");
+        }
+        assert_eq!(
+            controller
+                .step_with(&[(ids[0], floats)], &mut action)
+                .map(|_| ()),
+            refused(InputError::Missing { channel: 2 })
+        );
+        assert_eq!(
+            controller.step_with(&[], &mut action).map(|_| ()),
+            refused(InputError::Missing { channel: 0 })
+        );
+        assert_eq!(
+            (action, controller.last_action()),
+            ([7.0; 2], &[0.0; 2][..])
+        );
+        let error = outside(4, 1, 9.0, [-4.0, 4.0]);
+        assert_eq!((error.channel(), error.element()), (4, Some(1)));
+        assert_eq!((short.channel(), short.element()), (2, None));
+    });
+    with_controller(&support::shapes::denoise().image(), |controller| {
+        let mut refused = |noise: &[f32]| {
+            let given = [
+                (ChannelId(0), Data::F32(&[0.0; 2])),
+                (ChannelId(support::shapes::NOISE), Data::F32(noise)),
+            ];
+            controller
+                .step_with(&given, &mut [0.0; 2])
+                .expect_err("it is refused")
+        };
+        let channel = support::shapes::NOISE;
+        assert_eq!(
+            refused(&[0.0; 2]),
+            StepError::Input(InputError::Length {
+                channel,
+                got: 2,
+                needed: 8
+            })
+        );
+        let mut draws = [0.0; 8];
+        draws[7] = f32::INFINITY;
+        assert_eq!(
+            refused(&draws),
+            StepError::Input(InputError::NotFinite { channel, index: 7 })
+        );
+    });
 }
 
 #[test]
 fn what_was_executed_goes_into_the_context() {
     let image = parts(&tiny()).image();
-    let logits = |executed: Option<[f32; 2]>| {
-        let policy = image.policy();
-        let mut memory = Memory::for_policy(&policy);
-        let mut controller = memory.controller(&policy);
-        controller
-            .set_instruction(Instruction::Id(0))
-            .expect("the instruction is known");
-        let mut returned = Vec::new();
-        for _ in 0..4 {
-            let mut action = [0.0; 2];
-            controller
-                .step(&[0.3; 3], &mut action)
-                .expect("the step is sound");
-            if let Some(executed) = executed {
-                controller.executed(&executed).expect("the action is sound");
+    let scores = |executed: Option<[f32; 2]>| {
+        with_controller(&image, |controller| {
+            let mut returned = Vec::new();
+            for _ in 0..4 {
+                let mut action = [0.0; 2];
+                controller
+                    .step(&[0.3; 3], &mut action)
+                    .expect("the step is sound");
+                if let Some(executed) = executed {
+                    controller.executed(&executed).expect("the action is sound");
+                }
+                returned.push(action);
             }
-            returned.push(action);
-        }
-        (controller.logits().to_vec(), returned)
+            (controller.scores().to_vec(), returned)
+        })
     };
-    let (plain, actions) = logits(None);
-    assert_ne!(plain, logits(Some([0.9, -0.9])).0);
+    let (plain, actions) = scores(None);
+    assert_ne!(plain, scores(Some([0.9, -0.9])).0);
     // Beyond the limits is at the limits.
-    assert_eq!(logits(Some([1.0, -1.0])).0, logits(Some([5.0, -7.0])).0);
+    assert_eq!(scores(Some([1.0, -1.0])).0, scores(Some([5.0, -7.0])).0);
     // Saying what was returned changes nothing.
     assert_eq!(actions[0], actions[1]);
-    assert_eq!(plain, logits(Some(actions[0])).0);
+    assert_eq!(plain, scores(Some(actions[0])).0);
+}
+
+/// The indices and actions of an episode with this decision rule.
+fn episode(image: &Image, decision: Decision) -> (Vec<u32>, Vec<f32>) {
+    with_controller(image, |controller| {
+        controller.set_decision(decision);
+        let mut random = Random(1);
+        let (mut indices, mut actions) = (Vec::new(), Vec::new());
+        for _ in 0..20 {
+            let mut action = [0.0; 2];
+            let report = controller
+                .step(&random.vec(3, 1.0), &mut action)
+                .expect("the step is sound");
+            indices.extend(report.selected.map(|selected| selected.index));
+            actions.extend(action);
+        }
+        (indices, actions)
+    })
 }
 
 #[test]
 fn sampling_is_a_function_of_the_seed() {
     let image = parts(&tiny()).image();
-    let sample = |seed| {
-        episode(
-            &image,
-            Decision::Sample {
-                temperature: 3.0,
-                seed,
-            },
-            |_, _| {},
-        )
-    };
+    let rule = |temperature, seed| Decision::Sample { temperature, seed };
+    let sample = |seed| episode(&image, rule(3.0, seed));
     assert_eq!(sample(1), sample(1));
     assert!((2..6).any(|seed| sample(seed).0 != sample(1).0));
     // Random numbers are used up: the first decision of each episode is another draw.
-    let policy = image.policy();
-    let mut memory = Memory::for_policy(&policy);
-    let mut controller = memory.controller(&policy);
-    controller.set_decision(Decision::Sample {
-        temperature: 10.0,
-        seed: 1,
+    let draws: Vec<_> = with_controller(&image, |controller| {
+        controller.set_decision(rule(10.0, 1));
+        let mut draw = || {
+            controller.reset();
+            controller
+                .step(&[0.1; 3], &mut [0.0; 2])
+                .expect("the step is sound")
+                .selected
+                .map(|x| x.index)
+        };
+        (0..30).map(|_| draw()).collect()
     });
-    controller
-        .set_instruction(Instruction::Id(0))
-        .expect("the instruction is known");
-    let mut draw = || {
-        controller.reset();
-        controller
-            .step(&[0.1; 3], &mut [0.0; 2])
-            .map(|report| report.plan.0)
-    };
-    let draws: Vec<_> = (0..30)
-        .map(|_| draw().expect("the step is sound"))
-        .collect();
-    assert!((0..5).all(|plan| draws.contains(&plan)), "{draws:?}");
-    // The contract's own rule is what a new controller starts with.
-    let mut parts = parts(&tiny());
-    (
-        parts.contract.rule,
-        parts.contract.temperature,
-        parts.contract.seed,
-    ) = (DecisionRule::Sample, 3.0, 1);
-    let image = parts.image();
-    let policy = image.policy();
-    assert_eq!(
-        memory_decision(&policy),
-        Decision::Sample {
-            temperature: 3.0,
-            seed: 1
-        }
+    assert!(
+        (0..5).all(|index| draws.contains(&Some(index))),
+        "{draws:?}"
     );
-}
-
-fn memory_decision(policy: &Policy) -> Decision {
-    let mut memory = Memory::for_policy(policy);
-    memory.controller(policy).decision()
+    // The contract's own rules are what a new controller starts with.
+    let mut parts = parts(&tiny());
+    let contract = &mut parts.contract;
+    (
+        contract.selection,
+        contract.temperature,
+        contract.selection_seed,
+    ) = (SelectionRule::Sample, 3.0, 1 << 40);
+    (contract.noise, contract.noise_seed) = (NoiseRule::Seeded, 1 << 50);
+    let rules = with_controller(&parts.image(), |controller| {
+        (controller.decision(), controller.noise())
+    });
+    assert_eq!(rules, (rule(3.0, 1 << 40), Noise::Seeded { seed: 1 << 50 }));
 }
 
 #[test]
@@ -334,23 +330,26 @@ fn without_an_instruction_there_is_no_step() {
     let mut memory = Memory::for_policy(&policy);
     let mut controller = memory.controller(&policy);
     let mut action = [0.5; 2];
-    assert_eq!(controller.logits(), [0.0; 5]);
-    assert_eq!(
-        controller.step(&[0.0; 3], &mut action),
-        Err(StepError::NoInstruction)
-    );
-    controller.reset();
-    assert_eq!(
-        controller.step(&[0.0; 3], &mut action),
-        Err(StepError::NoInstruction)
-    );
+    assert_eq!(controller.scores(), [0.0; 5]);
+    for _ in 0..2 {
+        assert!(!controller.is_instructed());
+        assert_eq!(
+            controller.step(&[0.0; 3], &mut action),
+            Err(StepError::NoInstruction)
+        );
+        controller.reset();
+    }
     assert_eq!(action, [0.5; 2]);
 }
 
 #[test]
 fn demonstrations_are_encoded_to_the_nearest_plan() {
     let model = tiny();
-    let image = parts(&model).image();
+    let sound = parts(&model);
+    let encode = |controller: &mut Controller, observations: &[f32], actions: &[f32]| {
+        controller.encode(&demonstration(observations, actions))
+    };
+    let image = sound.image();
     let policy = image.policy();
     let mut memory = Memory::for_policy(&policy);
     let mut controller = memory.controller(&policy);
@@ -360,80 +359,131 @@ fn demonstrations_are_encoded_to_the_nearest_plan() {
         let (observations, actions) = (random.vec(9, 1.0), random.vec(6, 1.0));
         let expected = model.encode(&observations, &actions) as u32;
         assert_eq!(
-            controller.encode(&observations, &actions),
-            Ok(PlanIndex(expected))
+            encode(&mut controller, &observations, &actions),
+            Ok(expected)
         );
         seen.insert(expected);
     }
     assert!(seen.len() > 1, "one plan for everything proves nothing");
+    let length = |channel, got, needed| {
+        Err(EncodeError::Input(InputError::Length {
+            channel,
+            got,
+            needed,
+        }))
+    };
     assert_eq!(
-        controller.encode(&[0.0; 8], &[0.0; 6]),
-        Err(EncodeError::Length { got: 8, needed: 9 })
+        encode(&mut controller, &[0.0; 8], &[0.0; 6]),
+        length(OBSERVATIONS, 8, 9)
     );
     assert_eq!(
-        controller.encode(&[0.0; 9], &[0.0; 7]),
-        Err(EncodeError::Length { got: 7, needed: 6 })
+        encode(&mut controller, &[0.0; 9], &[0.0; 7]),
+        length(ACTIONS, 7, 6)
     );
+    let not_finite = InputError::NotFinite {
+        channel: ACTIONS,
+        index: 0,
+    };
     assert_eq!(
-        controller.encode(&[0.0; 9], &[f32::NAN; 6]),
-        Err(EncodeError::NotFinite)
+        encode(&mut controller, &[0.0; 9], &[f32::NAN; 6]),
+        Err(EncodeError::Input(not_finite))
     );
 
-    let mut parts = parts(&model);
-    parts.programs[ProgramKind::Encode as usize] = support::writer::empty_program();
-    let image = parts.image();
-    let policy = image.policy();
-    let mut memory = Memory::for_policy(&policy);
-    let refused = memory.controller(&policy).encode(&[0.0; 9], &[0.0; 6]);
+    let mut without = sound;
+    without.calls.pop();
+    without.entries.pop();
+    let without = without.sealed();
+    let refused = with_controller(&without.image(), |controller| {
+        encode(controller, &[0.0; 9], &[0.0; 6])
+    });
     assert_eq!(refused, Err(EncodeError::NoEncoder));
 }
 
 #[test]
 fn the_contract_says_what_was_written() {
     let model = tiny();
-    let image = with_golden(parts(&model), 10).image();
+    let mut parts = parts(&model);
+    parts.channels[4].reference = parts.text("where the joint is");
+    parts.elements[4].joint = parts.text("elbow");
+    (parts.elements[4].scale, parts.elements[4].offset) = (2.0, -0.5);
+    let image = parts.with_golden(10).image();
     let policy = image.policy();
     assert!(policy.checksum_matches());
     let contract = policy.contract();
-    assert_eq!(contract.environment_id(), "test");
+    assert_eq!(
+        (contract.family(), contract.environment_id()),
+        ("lads", "test")
+    );
+    assert_eq!(
+        (contract.environment_version(), contract.bundle_sha256()),
+        ("1", "cafe")
+    );
+    assert_eq!((contract.observation_len(), contract.action_len()), (3, 2));
     assert_eq!(
         (
-            contract.observation_len(),
-            contract.action_len(),
-            contract.horizon()
+            contract.words_len(),
+            contract.word_dim(),
+            contract.context_steps()
         ),
-        (3, 2, 3)
+        (4, 4, Some(8))
     );
     assert_eq!(contract.control_period_s(), 0.08);
-    let element = contract.observation(2).expect("there are three");
-    assert_eq!((element.name, element.unit), ("observation2", "rad"));
-    assert_eq!(contract.observation(3), None);
-    let element = contract.action(1).expect("there are two");
-    assert_eq!((element.name, element.unit), ("action1", "rad"));
-    assert_eq!(contract.action(2), None);
+    let channels: Vec<_> = contract
+        .channels()
+        .map(|c| (c.name(), c.role(), c.dtype(), c.len()))
+        .collect();
+    assert_eq!(
+        channels,
+        [
+            ("observation", Role::Observation, DType::F32, 3),
+            ("words", Role::Instruction, DType::F32, 16),
+            ("observations", Role::Demonstration, DType::F32, 9),
+            ("actions", Role::Demonstration, DType::F32, 6),
+            ("action", Role::Action, DType::F32, 2),
+        ]
+    );
+    assert_eq!(
+        contract
+            .find("actions")
+            .map(|channel| channel.shape().to_vec()),
+        Some(vec![3, 2])
+    );
+    assert!(contract.find("joint").is_none());
+    let element = contract.observation().element(2).expect("there are three");
+    assert_eq!(
+        (element.name, element.unit, element.joint, element.scale),
+        ("observation2", "rad", "", 1.0)
+    );
+    assert_eq!(contract.observation().element(3), None);
+    let element = contract.action().element(1).expect("there are two");
+    assert_eq!(
+        (element.name, element.joint, element.scale, element.offset),
+        ("action1", "elbow", 2.0, -0.5)
+    );
+    assert_eq!(contract.action().reference(), "where the joint is");
     // The two ways to the limits agree.
-    let limits = |elements: &mut dyn Iterator<Item = Element<'_>>| -> Vec<Interval> {
-        elements.map(|element| element.limits).collect()
-    };
-    let symmetric = |limit: f32| Interval {
-        min: -limit,
-        max: limit,
-    };
-    assert_eq!(limits(&mut contract.observations()), [symmetric(3.0); 3]);
-    assert_eq!(
-        contract.observation_limits().collect::<Vec<_>>(),
-        [symmetric(3.0); 3]
-    );
-    assert_eq!(limits(&mut contract.actions()), [symmetric(1.0); 2]);
-    assert_eq!(
-        contract.action_limits().collect::<Vec<_>>(),
-        [symmetric(1.0); 2]
-    );
-    assert_eq!(
-        (contract.instruction_count(), contract.instruction_id(1)),
-        (2, Some("id1"))
-    );
-    assert_eq!(contract.instruction_text(0), Some("instruction 0"));
+    for (channel, limit) in [(contract.observation(), 3.0), (contract.action(), 1.0)] {
+        let limits = vec![
+            Interval {
+                min: -limit,
+                max: limit
+            };
+            channel.len()
+        ];
+        assert_eq!(channel.limits().collect::<Vec<_>>(), limits);
+        assert_eq!(
+            channel
+                .elements()
+                .map(|element| element.limits)
+                .collect::<Vec<_>>(),
+            limits
+        );
+    }
+    let known: Vec<_> = contract
+        .instructions()
+        .map(|known| (known.id, known.text))
+        .collect();
+    assert_eq!(known, [("id0", "instruction 0"), ("id1", "instruction 1")]);
     assert_eq!(
         contract.instruction(1).map(|known| known.words),
         Some(&model.instructions[1][..])
@@ -442,11 +492,11 @@ fn the_contract_says_what_was_written() {
     let golden = policy.golden().expect("there is one");
     assert_eq!(
         (golden.len(), golden.instruction(), golden.steps().count()),
-        (10, 1, 10)
+        (10, Some(1), 10)
     );
+    // Values of nineteen tokens, keys in two blocks of sixteen; twice logits, plan and action.
     assert_eq!(
         policy.state_len(),
-        // Values of nineteen tokens; keys in two blocks of sixteen.
-        contract.network().layers * 10 * (19 + 32) + 2 * (3 + 2 + 5)
+        model.spec.layers * 10 * (19 + 32) + 2 * (5 + 3 + 2)
     );
 }

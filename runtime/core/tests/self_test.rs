@@ -2,13 +2,13 @@
 
 mod support;
 
-use lads_core::{Decision, Instruction, PlanIndex, SelfTestError, StepError};
-use support::assemble::{parts, with_golden};
+use lads_core::{Decision, InputError, Instruction, SelfTestError, StepError};
+use support::assemble::parts;
 use support::writer::Parts;
-use support::{Memory, Model, Spec};
+use support::{Memory, Model, Spec, shapes, with_controller};
 
 fn recorded() -> Parts {
-    with_golden(parts(&Model::random(Spec::TINY, 11)), 20)
+    parts(&Model::random(Spec::TINY, 11)).with_golden(20)
 }
 
 fn outcome(parts: &Parts) -> Result<lads_core::SelfTest, SelfTestError> {
@@ -60,14 +60,14 @@ fn the_first_difference_is_named() {
     let episode = sound.golden.as_ref().expect("there is one");
 
     let mut parts = sound.clone();
-    let expected = (episode.plans[13] + 1) % 5;
-    parts.golden.as_mut().expect("there is one").plans[13] = expected;
-    let got = PlanIndex(episode.plans[13]);
+    let expected = (episode.selected[13] + 1) % 5;
+    parts.golden.as_mut().expect("there is one").selected[13] = expected;
+    let got = episode.selected[13];
     assert_eq!(
         outcome(&parts),
-        Err(SelfTestError::Plan {
+        Err(SelfTestError::Selected {
             step: 13,
-            expected: PlanIndex(expected),
+            expected,
             got
         })
     );
@@ -87,32 +87,46 @@ fn the_first_difference_is_named() {
     }
 
     let mut parts = sound;
-    parts.golden.as_mut().expect("there is one").observations[3 * 4] = 50.0;
-    let error = StepError::OutOfLimits {
+    parts.golden.as_mut().expect("there is one").observations[0][3 * 4] = 50.0_f32.to_bits();
+    let error = StepError::Input(InputError::OutOfLimits {
+        channel: 0,
         index: 0,
         value: 50.0,
         min: -3.0,
         max: 3.0,
-    };
+    });
     assert_eq!(outcome(&parts), Err(SelfTestError::Step { step: 4, error }));
 }
 
 #[test]
 fn a_changed_weight_is_found() {
-    let sound = recorded();
-    let mut parts = sound.clone();
-    // The embedding of observations takes part in every step.
-    let at = parts
-        .weights
-        .iter()
-        .rposition(|&w| w != 0.0)
-        .expect("there are weights");
-    let words_from = parts.instructions[0].words.offset as usize;
-    assert!(at >= words_from);
-    for weight in &mut parts.weights[..words_from] {
+    let mut parts = recorded();
+    // What lies behind the words of the instructions takes part in every step.
+    let words = parts.instructions[1].words;
+    for weight in &mut parts.weights[(words.offset + words.len) as usize..] {
         *weight *= 1.01;
     }
     assert!(outcome(&parts).is_err());
+}
+
+#[test]
+fn changed_noise_is_found() {
+    let mut parts = shapes::denoise().with_golden(6);
+    // The noise of the last pass of the last step, 0.25 of which reaches the action.
+    *parts
+        .golden
+        .as_mut()
+        .expect("there is one")
+        .noise
+        .last_mut()
+        .expect("there is some") += 1.0;
+    let failed = with_controller(&parts.image(), |controller| {
+        controller
+            .self_test()
+            .map(|_| ())
+            .map_err(|_| controller.is_tested())
+    });
+    assert_eq!(failed, Err(false));
 }
 
 #[test]
@@ -135,7 +149,7 @@ fn afterwards_the_controller_is_fresh() {
                 controller.step(&[0.1; 3], &mut action),
                 Err(StepError::NoInstruction)
             );
-            assert!(controller.logits().iter().all(|&logit| logit == 0.0));
+            assert!(controller.scores().iter().all(|&logit| logit == 0.0));
         }
         controller
             .set_instruction(Instruction::Id(0))

@@ -5,7 +5,7 @@
 mod support;
 
 use lads_core::{Fallback, GuardConfig, GuardedController, Instruction, Tick};
-use support::assemble::{parts, with_golden};
+use support::assemble::parts;
 use support::{Memory, Model, Random, Spec};
 
 const STEPS: u64 = 1_000_000;
@@ -19,7 +19,9 @@ fn resident() -> Option<u64> {
 #[test]
 #[ignore = "takes a minute even when optimised"]
 fn a_million_steps() {
-    let image = with_golden(parts(&Model::random(Spec::TINY, 11)), 12).image();
+    let image = parts(&Model::random(Spec::TINY, 11))
+        .with_golden(12)
+        .image();
     let policy = image.policy();
     let mut memory = Memory::for_policy(&policy);
     let mut guard = vec![0.0; GuardedController::memory_len(&policy)];

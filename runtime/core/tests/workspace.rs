@@ -108,11 +108,11 @@ fn every_instruction_set_gives_the_same_actions() {
             let report = controller
                 .step(&observation, &mut action)
                 .expect("within limits");
-            bits.push(report.margin.to_bits());
+            bits.push(report.selected.expect("it selects").margin.to_bits());
             bits.extend(
                 action
                     .iter()
-                    .chain(controller.logits())
+                    .chain(controller.scores())
                     .map(|x| x.to_bits()),
             );
         }

@@ -55,11 +55,15 @@ impl Attention<'_> {
         }
         match self.cache {
             Cache::F32 { keys, values } => self.over::<F32>(isa, keys, values, q, y, scratch),
-            Cache::F16 { keys, values } => self.over::<F16>(isa, keys, values, q, y, scratch),
+            Cache::F16 { keys, values } => {
+                if cfg!(feature = "half-cache") {
+                    self.over::<F16>(isa, keys, values, q, y, scratch);
+                }
+            }
         }
     }
 
-    /// The same over a cache of one format.
+    /// Attention over a cache whose format is known when this is compiled.
     fn over<C: Cached>(
         &self,
         isa: Isa,
@@ -82,9 +86,10 @@ impl Attention<'_> {
             if q.iter().take(queries).any(|q| q.is_empty()) {
                 return;
             }
-            // The rows that the last query sees; earlier ones have weight zero there, and cache rows beyond are never read.
+            // The rows that the last query sees. An earlier query gives those that it does not see weight zero.
             let rows = visible + queries - 1;
-            // Scores of a query and head take whole blocks, of which the last may reach beyond the visible rows.
+            // Keys are read in whole blocks, so the last one may bring keys beyond `rows`, such as an earlier episode's. `Probabilities`
+            // replaces their scores, whatever they are, before anything reads them; values beyond `rows` are not read.
             let blocks = rows.div_ceil(LANES);
             let (p, _) = scratch.as_chunks_mut::<LANES>();
             let Some(p) = p.get_mut(..queries * self.heads * blocks) else {

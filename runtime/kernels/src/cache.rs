@@ -77,7 +77,7 @@ pub enum Cache<'c> {
     },
 }
 
-/// The same, to be written.
+/// Keys and values of a cache, to be written.
 #[derive(Debug)]
 pub enum CacheMut<'c> {
     /// [`CacheFormat::F32`]
@@ -97,7 +97,7 @@ pub enum CacheMut<'c> {
 }
 
 impl CacheMut<'_> {
-    /// The same, to be read.
+    /// The cache, to be read.
     pub fn as_ref(&self) -> Cache<'_> {
         match self {
             Self::F32 { keys, values } => Cache::F32 { keys, values },
@@ -110,7 +110,7 @@ impl CacheMut<'_> {
 pub(crate) trait Cached: Stored<Bits: Copy> {
     /// Sixteen numbers as they are stored.
     fn stored<S: Simd>(simd: S, from: &Block) -> [Self::Bits; LANES];
-    /// What is stored as a number.
+    /// The number that stored bits mean.
     fn number(bits: Self::Bits) -> f32;
 }
 
@@ -164,11 +164,15 @@ impl Append<'_> {
         match cache {
             // A mere copy.
             CacheMut::F32 { keys, values } => self.write::<F32, _>(Portable, keys, values),
-            CacheMut::F16 { keys, values } => isa.run(Rounded {
-                append: self,
-                keys,
-                values,
-            }),
+            CacheMut::F16 { keys, values } => {
+                if cfg!(feature = "half-cache") {
+                    isa.run(Rounded {
+                        append: self,
+                        keys,
+                        values,
+                    });
+                }
+            }
         }
     }
 

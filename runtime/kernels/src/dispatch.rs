@@ -145,7 +145,7 @@ mod x86_64 {
 
     /// Bits of XCR0, the register states that the operating system saves: SSE and AVX.
     const YMM_STATE: u64 = 0b110;
-    /// The same, and the mask registers, the upper halves of the first sixteen ZMM registers, the other sixteen.
+    /// Bits of XCR0 for AVX-512: SSE, AVX, the mask registers, the upper halves of the first sixteen ZMM registers, the other sixteen.
     const ZMM_STATE: u64 = 0b1110_0110;
 
     /// Asks the CPU. Bits and leaves are those of Intel's manual, volume 1, sections 14.3, 14.7.1 and 15.2.

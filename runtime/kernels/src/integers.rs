@@ -13,8 +13,8 @@
 //! sum holds, so nothing overflows; the sums go on as floats, in the order of the inputs.
 //!
 //! The integers of a part of `x` differ from `x * 8191 / largest` by half a unit: an error of an input of 2^-14 of the largest
-//! magnitude in its part. A part with an infinite number, or one that is none, has sums that are none; a part whose magnitudes
-//! are all below 2^-100 is read as zero.
+//! magnitude in its part. If a part contains infinity or NaN, its sums are NaN; a part whose magnitudes are all below 2^-100 is
+//! read as zero.
 
 use core::hint::black_box;
 use core::{array, slice};
@@ -30,7 +30,7 @@ pub(crate) const PART: usize = 256;
 /// Pairs of inputs whose products are added before they become floats: `2 * PAIRS * 16383 * 8191 < 2^31`.
 const PAIRS: usize = 8;
 
-/// Of the magnitudes of inputs as integers.
+/// Largest magnitude of an input as an integer.
 const LARGEST: f32 = 8191.0;
 
 /// Two inputs.
@@ -59,12 +59,12 @@ impl Integer for i8 {
 /// A part of a row as integers, followed by zeros.
 pub(crate) struct Part {
     pairs: [Pair; PART / 2],
-    /// What one of them means.
+    /// The input that the integer one stands for.
     scale: f32,
 }
 
 impl Part {
-    /// Of no inputs.
+    /// A part that holds no inputs.
     pub const EMPTY: Self = Self {
         pairs: [[0; 2]; PART / 2],
         scale: 0.0,
@@ -145,7 +145,7 @@ pub(crate) fn panel<S: Simd, W: Integer, const R: usize>(
     }
 }
 
-/// The same for one row where registers are few, block by block: compiled once for any number of rows.
+/// Adds the sums of part `i` of one row, block by block: where registers are few, compiled once for any number of rows.
 #[inline(never)]
 fn one_row<W: Integer>(
     w: &[[W; 2 * LANES]],

@@ -3,8 +3,8 @@
 //! Invariants:
 //! - No allocation, no `std`, no panic, and no unsafe code but in `dispatch`, `simd`, `subnormal` and the loops over weights and cache: a slice
 //!   that is too short leaves the rest of the result as it was.
-//!   Callers that want to be told check shapes beforehand; `lads-core` does so once per program.
-//! - The same bits on every target with IEEE 754 arithmetic: every sum has one fixed order (sixteen lanes, then a tree), no
+//!   Callers that want to be told check shapes beforehand; `lads-image` does so once per program.
+//! - The same bits on every target with IEEE 754 arithmetic, but for subnormal numbers under [`flushed`]: every sum has one fixed order (sixteen lanes, then a tree), no
 //!   multiply-add is fused, and `exp`, `tanh` and `sigmoid` are the polynomials of [`math`].
 //! - Inner loops run over blocks of sixteen elements: plain Rust that compilers vectorise, or the vectors of `simd` where a control
 //!   step spends its time. Those kernels are compiled once per instruction set and take an [`Isa`], which says which of them to run.
@@ -54,4 +54,4 @@ pub use norm::{LayerNorm, softmax};
 pub use reduce::{Axis, ReduceKind, arg_max, arg_min, reduce};
 pub use stored::{Panels, WeightFormat};
 pub use strided::{BinaryKind, Input, StridedCopy, binary};
-pub use subnormal::Flushed;
+pub use subnormal::flushed;

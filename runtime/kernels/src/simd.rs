@@ -52,7 +52,7 @@ pub(crate) trait Simd: Copy {
     fn splat_pair(self, pair: [i16; 2]) -> Self::Pairs;
     /// Sixteen pairs of memory.
     fn load_i16(self, from: &[i16; 2 * LANES]) -> Self::Pairs;
-    /// The same of 8-bit integers.
+    /// Sixteen pairs of memory, widened from 8-bit integers.
     fn load_i8(self, from: &[i8; 2 * LANES]) -> Self::Pairs;
     /// No sum yet.
     fn zeros(self) -> Self::Integers;

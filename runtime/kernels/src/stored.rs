@@ -183,13 +183,13 @@ pub fn round_to_f16(x: f32) -> u16 {
     sign | found as u16
 }
 
-/// Sixteen of them; compiled once, because it is long and a control step needs it for the new tokens only.
+/// Sixteen numbers rounded to half precision; compiled once, because it is long and a control step needs it for the new tokens only.
 #[inline(never)]
 pub(crate) fn round_all_to_f16(x: &Block) -> [u16; LANES] {
     x.map(round_to_f16)
 }
 
-/// The same for one; `None` for what is not finite or rounds to infinity.
+/// The nearest half-precision number, ties to even; `None` for what is not finite or rounds to infinity.
 pub fn to_f16(x: f32) -> Option<u16> {
     (x.abs() < 65520.0).then(|| round_to_f16(x))
 }
@@ -207,10 +207,10 @@ pub fn to_bf16(x: f32) -> Option<u16> {
     (x.is_finite() && rounded & 0x7f80 != 0x7f80).then_some(rounded as u16)
 }
 
-/// Of the magnitudes of `Int16`.
+/// Largest quantised `Int16` magnitude.
 const INT16_LARGEST: f32 = 16383.0;
 
-/// Of the magnitudes of `Int8`.
+/// Largest quantised `Int8` magnitude.
 const INT8_LARGEST: f32 = 127.0;
 
 /// The scale of one output's weights in `Int8`: its largest magnitude / 127; 1 where all are zero.
@@ -218,7 +218,7 @@ pub fn int8_scale(weights: impl Iterator<Item = f32>) -> f32 {
     scale(weights, INT8_LARGEST)
 }
 
-/// The same in `Int16`: its largest magnitude / 16383.
+/// The scale of one output's weights in `Int16`: its largest magnitude / 16383; 1 where all are zero.
 pub fn int16_scale(weights: impl Iterator<Item = f32>) -> f32 {
     scale(weights, INT16_LARGEST)
 }

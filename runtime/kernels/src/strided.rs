@@ -123,7 +123,7 @@ pub struct StridedCopy {
     pub dims: [usize; 4],
     /// Elements from one index to the next in each dimension of the source; 0 broadcasts.
     pub x_strides: [usize; 4],
-    /// The same for the destination; not 0 where the dimension is longer than one.
+    /// Elements from one index to the next in each dimension of the destination; not 0 where the dimension is longer than one.
     pub y_strides: [usize; 4],
 }
 

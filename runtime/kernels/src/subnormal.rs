@@ -2,28 +2,45 @@
 //!
 //! Some processors need a hundred cycles and more for an operation on a number below the normal range, which a controller would
 //! feel as jitter that depends on the data. On x86-64 the two bits of MXCSR that replace such operands and results by zero are set
-//! for the time of a run and what was there comes back afterwards; elsewhere nothing happens. All instruction sets of a processor
-//! share the mode, so results still have the same bits on all of them. Nothing here can fail.
+//! for the time of a run and what was there comes back afterwards. All instruction sets of a processor share the mode, so results
+//! still have the same bits on all of them. Elsewhere nothing happens: a program that meets subnormal numbers may give other bits
+//! there. Arm's mode would not close that gap, because it decides before rounding what is too small, and x86-64 after.
+//!
+//! Invariants:
+//! - The mode ends where [`flushed`] ends, also by a panic. The guard that restores the register never leaves this module, so
+//!   no caller can forget it, move it or drop two of them out of order.
+//! - A thread has a register of its own. Linux gives a new thread its creator's: what runs here starts no threads.
+//! - Rust gives no promise about floating-point arithmetic under another MXCSR; compilers compute constants, and move arithmetic,
+//!   as if subnormal numbers were exact. The switches therefore are assembly that may read and write any memory: what is
+//!   loaded after the first and stored before the second is computed between them, which is all that a program does with
+//!   its arena. A constant that a compiler computes is what it would be without this mode.
+//!
+//! Nothing here can fail.
 #![allow(unsafe_code)]
 
-/// While it lives, subnormal numbers are zero on this thread.
-#[derive(Debug)]
-#[must_use = "the mode ends where this is dropped"]
-pub struct Flushed {
-    #[cfg(target_arch = "x86_64")]
-    before: u32,
-    /// The mode belongs to a thread, so this stays on it.
-    thread: core::marker::PhantomData<*const ()>,
+/// Runs `work` with subnormal numbers taken as zero on this thread, and returns what it returns.
+///
+/// The processor's mode before the call comes back afterwards, also when `work` panics. A guard would not do: safe code may
+/// forget one.
+#[inline(always)]
+pub fn flushed<T>(work: impl FnOnce() -> T) -> T {
+    let _restored = Mode::flush();
+    work()
 }
 
 /// Flush-to-zero for results (bit 15) and denormals-are-zeros for operands (bit 6): Intel's manual, volume 1, section 10.2.3.
 #[cfg(target_arch = "x86_64")]
 const FLUSH: u32 = 1 << 15 | 1 << 6;
 
-impl Flushed {
-    /// Sets the mode.
-    #[inline]
-    pub fn new() -> Self {
+/// The mode to come back to when this is dropped.
+struct Mode {
+    #[cfg(target_arch = "x86_64")]
+    before: u32,
+}
+
+impl Mode {
+    #[inline(always)]
+    fn flush() -> Self {
         #[cfg(target_arch = "x86_64")]
         let before = x86_64::mode();
         #[cfg(target_arch = "x86_64")]
@@ -31,19 +48,12 @@ impl Flushed {
         Self {
             #[cfg(target_arch = "x86_64")]
             before,
-            thread: core::marker::PhantomData,
         }
     }
 }
 
-impl Default for Flushed {
-    fn default() -> Self {
-        Self::new()
-    }
-}
-
-impl Drop for Flushed {
-    #[inline]
+impl Drop for Mode {
+    #[inline(always)]
     fn drop(&mut self) {
         #[cfg(target_arch = "x86_64")]
         x86_64::set_mode(self.before);
@@ -55,7 +65,7 @@ mod x86_64 {
     use core::arch::asm;
 
     /// MXCSR.
-    #[inline]
+    #[inline(always)]
     pub fn mode() -> u32 {
         let mut mode = 0_u32;
         // SAFETY: stores the register to a word that lives here; it is part of SSE, which every x86-64 CPU has.
@@ -64,39 +74,77 @@ mod x86_64 {
     }
 
     /// Sets MXCSR to what `mode` gave, with or without `FLUSH`.
-    #[inline]
+    #[inline(always)]
     pub fn set_mode(mode: u32) {
         // SAFETY: the value has no reserved bit, because it was read from the register but for two bits that every x86-64 CPU has.
-        // Rounding and the masks of exceptions stay as Rust wants them. Compilers take subnormal numbers to be exact when they
-        // compute constants; that such a constant is not flushed is what a program without this mode would see.
+        // Rounding and the masks of exceptions stay as Rust wants them. Neither `readonly` nor `nomem`: loads and stores, and so
+        // the arithmetic between them, stay on their side of the switch, as the head of this module explains.
         unsafe {
-            asm!("ldmxcsr [{}]", in(reg) &raw const mode, options(nostack, readonly, preserves_flags));
+            asm!("ldmxcsr [{}]", in(reg) &raw const mode, options(nostack, preserves_flags));
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
+    extern crate std;
+
     use core::hint::black_box;
 
-    use super::Flushed;
+    use super::flushed;
+
+    /// Half of the smallest normal number, computed now.
+    fn halved() -> f32 {
+        black_box(black_box(f32::MIN_POSITIVE) * black_box(0.5))
+    }
+
+    /// Whether subnormal operands are zero now.
+    fn is_flushed() -> bool {
+        black_box(black_box(f32::from_bits(1)) * black_box(1e20)).to_bits() == 0
+    }
 
     #[test]
     fn subnormal_numbers_are_zero_and_come_back() {
-        let (smallest, half) = (black_box(f32::MIN_POSITIVE), black_box(0.5_f32));
-        let halved = || black_box(black_box(smallest) * black_box(half));
-        assert!(halved() > 0.0);
-        {
-            let _outer = Flushed::new();
-            {
-                let _inner = Flushed::default();
-            }
-            if cfg!(target_arch = "x86_64") {
-                assert_eq!(halved().to_bits(), 0);
-                let subnormal = black_box(f32::from_bits(1));
-                assert_eq!((black_box(subnormal) * black_box(1e20)).to_bits(), 0);
-            }
+        assert!(halved() > 0.0 && !is_flushed());
+        let inside = flushed(|| {
+            let inner = flushed(|| (halved().to_bits(), is_flushed()));
+            // The end of the inner one does not end the outer one.
+            assert_eq!(inner, (halved().to_bits(), is_flushed()));
+            inner
+        });
+        if cfg!(target_arch = "x86_64") {
+            assert_eq!(inside, (0, true));
         }
-        assert!(halved() > 0.0);
+        assert!(halved() > 0.0 && !is_flushed());
+    }
+
+    #[test]
+    fn the_mode_ends_with_an_early_return() {
+        let work = |x: Option<f32>| flushed(|| Some(x? * 2.0));
+        assert_eq!(work(None), None);
+        assert!(halved() > 0.0 && !is_flushed());
+        assert_eq!(work(Some(1.5)), Some(3.0));
+        assert!(halved() > 0.0 && !is_flushed());
+    }
+
+    #[test]
+    fn the_mode_ends_with_a_panic_and_subnormal_numbers_are_zero_until_then() {
+        let mut seen = false;
+        let panicked = std::panic::catch_unwind(core::panic::AssertUnwindSafe(|| {
+            flushed(|| {
+                flushed(|| seen = is_flushed());
+                // No message on the console.
+                std::panic::resume_unwind(std::boxed::Box::new(()));
+            });
+        }));
+        assert!(panicked.is_err());
+        assert_eq!(seen, cfg!(target_arch = "x86_64"));
+        assert!(halved() > 0.0 && !is_flushed());
+        // A thread that starts now inherits no mode either.
+        assert!(
+            !std::thread::spawn(is_flushed)
+                .join()
+                .expect("it ran to its end")
+        );
     }
 }

@@ -2,7 +2,9 @@
 //!
 //! The language encoder is no part of a bundle: `make language` exports it once into a [cache](default_folder), and [`Encoder::open`] takes
 //! it only if its weights are those that made the bundle's own embeddings. It runs on the host, before the first control step, and
-//! allocates; the controller never waits for it. What can fail: the encoder is missing, damaged or another one; a sentence is empty or longer
+//! allocates; the controller never waits for it. A policy follows whatever it hears, nonsense too: before it is told a sentence,
+//! `lads_core::similarity::nearest` says which known instruction the words are most like and how much, and the contract's
+//! `language.acceptance` from where on that is enough. What can fail: the encoder is missing, damaged or another one; a sentence is empty or longer
 //! than encoder or policy can hear. Each is one line with its remedy.
 #![forbid(unsafe_code)]
 
@@ -14,6 +16,11 @@ use std::path::PathBuf;
 
 pub use encoder::Encoder;
 pub use error::LanguageError;
+
+/// README's examples compile as typed.
+#[cfg(doctest)]
+#[doc = include_str!("../../../README.md")]
+pub struct Readme;
 
 /// Names the folder that holds what was downloaded or built once for this user.
 pub const CACHE_VARIABLE: &str = "LADS_CACHE";

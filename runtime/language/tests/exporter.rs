@@ -6,7 +6,7 @@
 use std::path::{Path, PathBuf};
 
 use lads_compiler::{Bundle, compile};
-use lads_core::Policy;
+use lads_core::{Policy, similarity};
 use lads_language::Encoder;
 
 const VARIABLE: &str = "LADS_LANGUAGE";
@@ -18,6 +18,10 @@ struct Case {
     bundle: String,
     text: String,
     words: Vec<f32>,
+    /// Id of the known instruction that it is most like.
+    nearest: String,
+    /// How much.
+    similarity: f32,
 }
 
 fn difference(ours: &[f32], theirs: &[f32]) -> f32 {
@@ -46,7 +50,17 @@ fn embeddings_are_the_exporters() {
             compared += 1;
         }
         for case in cases.iter().filter(|case| case.bundle == name) {
-            worst = worst.max(difference(&encoder.words(&case.text).unwrap(), &case.words));
+            let words = encoder.words(&case.text).unwrap();
+            worst = worst.max(difference(&words, &case.words));
+            let known = contract.instructions().map(|known| known.words);
+            let (place, alike) = similarity::nearest(&words, known, contract.word_dim()).unwrap();
+            assert!((alike - case.similarity).abs() <= TOLERANCE, "{alike}");
+            // Several known instructions may be equally like it.
+            let named = contract
+                .instructions()
+                .find(|known| known.id == case.nearest);
+            let named = similarity::alignment(&words, named.unwrap().words, contract.word_dim());
+            assert!((alike - named).abs() <= TOLERANCE, "{}: {place}", case.text);
             compared += 1;
         }
         println!("{name}: {compared} sentences, largest difference {worst:.1e}");

@@ -238,7 +238,7 @@ pub struct Subject<'s> {
 impl Reference {
     /// Reads and checks a file.
     pub fn open(path: &Path) -> Result<Self, ReferenceError> {
-        let bytes = std::fs::read(path).map_err(|source| ReferenceError::File {
+        let bytes = lads_host::input::read(path).map_err(|source| ReferenceError::File {
             path: path.into(),
             source,
         })?;

@@ -40,6 +40,21 @@ pub struct EnvironmentUsed {
     pub max_steps: usize,
 }
 
+/// What a sentence outside the table is most like.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct NearestKnown {
+    /// Id of the known instruction.
+    pub id: String,
+    /// Its text.
+    pub text: String,
+    /// Similarity of the sentence to it, from -1 to 1.
+    pub similarity: f32,
+    /// Similarity from which on the bundle follows a sentence; `None` where its contract does not say.
+    pub threshold: Option<f32>,
+    /// Whether the bundle accepts the sentence; if not, the caller insisted.
+    pub accepted: bool,
+}
+
 /// Who made the word embeddings, where they are not the bundle's own.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct HeardBy {
@@ -49,6 +64,9 @@ pub struct HeardBy {
     pub sha256: String,
     /// Largest difference of an element from the bundle's table; `None` for a sentence outside it.
     pub largest_difference: Option<f32>,
+    /// What a sentence outside the table is most like; left out for known instructions.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub nearest: Option<NearestKnown>,
 }
 
 /// The whole report of one `lads-run`.

@@ -192,7 +192,7 @@ impl Dataset {
 
     /// Reads a dataset that [`Dataset::write`] wrote.
     pub fn read(path: &Path) -> Result<Self, DatasetError> {
-        let bytes = std::fs::read(path).map_err(|source| DatasetError::Io {
+        let bytes = lads_host::input::read(path).map_err(|source| DatasetError::Io {
             path: path.to_path_buf(),
             source,
         })?;
@@ -263,11 +263,9 @@ pub(crate) fn write(
             path: path.to_path_buf(),
             reason: error.to_string(),
         })?;
-    let mut file = output::temporary_with_folder(path).map_err(io)?;
-    file.write_all(&bytes).map_err(io)?;
-    file.as_file().sync_all().map_err(io)?;
-    file.persist(path).map_err(|error| io(error.error))?;
-    Ok(())
+    let mut draft = output::draft_with_folder(path).map_err(io)?;
+    draft.write_all(&bytes).map_err(io)?;
+    draft.commit().map_err(io)
 }
 
 fn to_bytes(

@@ -1,16 +1,19 @@
 //! Instructions that are not taken from the bundle's table: sentences in any words, and known ones that the language encoder hears anew.
 //!
 //! A sentence outside the table commands no sub-tasks of its own. Without any, its episodes last their full time and have no success rate;
-//! with some, they start, last and succeed as the benchmark's episodes of these sub-tasks. What can fail: a sub-task that nobody knows.
+//! with some, they start, last and succeed as the benchmark's episodes of these sub-tasks. What can fail: a sub-task that nobody knows, and
+//! a sentence that is too little like what the policy knows ([`accept`]).
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use lads_core::{Contract, KnownInstruction};
+use lads_compiler::contract::Acceptance;
+use lads_core::{Contract, KnownInstruction, similarity};
 use thiserror::Error;
 
 use crate::environment::Environment;
 use crate::evaluate::Assignment;
 use crate::fit;
+use crate::results::InstructionResult;
 
 /// Id and split of a sentence outside the table, in results.
 pub const FREE: &str = "free";
@@ -138,48 +141,81 @@ impl Sentence {
     }
 }
 
-/// The known instruction whose embeddings are most like `words`, and how much: the cosine of the means over the words.
-pub fn nearest<'c>(contract: &Contract<'c>, words: &[f32]) -> Option<(KnownInstruction<'c>, f64)> {
-    let heard = mean(words, contract.word_dim());
-    let alike = contract.instructions().map(|known| {
-        (
-            known,
-            cosine(&mean(known.words, contract.word_dim()), &heard),
-        )
-    });
-    alike.max_by(|(_, a), (_, b)| a.total_cmp(b))
+/// The known instruction that `words` are most like, and how much: [`similarity::alignment`].
+pub fn nearest<'c>(contract: &Contract<'c>, words: &[f32]) -> Option<(KnownInstruction<'c>, f32)> {
+    let known = contract.instructions().map(|known| known.words);
+    let (place, alike) = similarity::nearest(words, known, contract.word_dim())?;
+    Some((contract.instructions().nth(place)?, alike))
 }
 
-fn mean(words: &[f32], dim: usize) -> Vec<f64> {
-    let mut sum = vec![0.0; dim];
-    for word in words.chunks_exact(dim) {
-        for (sum, &x) in sum.iter_mut().zip(word) {
-            *sum += f64::from(x);
-        }
-    }
-    sum
+/// Why a sentence is not followed.
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
+pub enum Unaccepted {
+    /// It is less like the nearest known instruction than the bundle asks for.
+    #[error("the bundle follows a sentence from {threshold:.3} on")]
+    Below {
+        /// The contract's threshold.
+        threshold: f32,
+    },
+    /// Nobody has calibrated from where on it may be followed.
+    #[error("the bundle's contract does not say from where on it follows one")]
+    Uncalibrated,
 }
 
-fn cosine(a: &[f64], b: &[f64]) -> f64 {
-    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    let lengths = (dot(a, a) * dot(b, b)).sqrt();
-    if lengths > 0.0 {
-        dot(a, b) / lengths
+/// Whether a sentence of this similarity to the nearest known instruction is followed.
+pub fn accept(acceptance: Option<&Acceptance>, similarity: f32) -> Result<(), Unaccepted> {
+    let threshold = acceptance.ok_or(Unaccepted::Uncalibrated)?.threshold;
+    if similarity >= threshold {
+        Ok(())
     } else {
-        0.0
+        Err(Unaccepted::Below { threshold })
     }
+}
+
+/// What a sentence that names no sub-tasks has completed, as a line: all, and what of it the nearest known instruction does not ask for.
+///
+/// Nobody said what the sentence asks for; beside the nearest instruction a person sees what was done un-instructed.
+pub fn completed(nearest: &KnownInstruction<'_>, result: &InstructionResult) -> String {
+    let asked: BTreeSet<&str> = fit::sub_tasks(nearest.sub_tasks).collect();
+    let list = |beyond: bool| {
+        let all = result.un_instructed_completions.iter();
+        let done = all.filter(|of| !beyond || !asked.contains(of.sub_task));
+        let done: Vec<_> = done
+            .map(|of| format!("{} {}", of.sub_task, of.rate.count))
+            .collect();
+        if done.is_empty() {
+            "nothing".to_owned()
+        } else {
+            done.join(", ")
+        }
+    };
+    format!(
+        "completed in {} episodes: {}; of these un-instructed by '{}', the nearest known instruction: {}",
+        result.score.episodes,
+        list(false),
+        nearest.text,
+        list(true)
+    )
 }
 
 #[cfg(test)]
 mod tests {
+    use lads_compiler::contract::Similarity;
+
     use super::*;
 
     #[test]
-    fn the_nearest_instruction_has_the_largest_cosine() {
-        let cosine = |a: &[f64], b: &[f64]| cosine(a, b);
-        assert!((cosine(&[3.0, 4.0], &[6.0, 8.0]) - 1.0).abs() < 1e-12);
-        assert!(cosine(&[1.0, 0.0], &[0.0, 2.0]).abs() < 1e-12);
-        assert_eq!(cosine(&[0.0, 0.0], &[0.0, 2.0]), 0.0);
-        assert_eq!(mean(&[1.0, 2.0, 3.0, 4.0], 2), [4.0, 6.0]);
+    fn sentences_are_accepted_from_the_threshold_on() {
+        let calibrated = Acceptance {
+            similarity: Similarity::Alignment,
+            threshold: 0.608,
+            accepted_known: 0.9,
+            accepted_other: 0.1,
+        };
+        assert_eq!(accept(Some(&calibrated), 0.608), Ok(()));
+        let below = accept(Some(&calibrated), 0.607).unwrap_err();
+        assert!(below.to_string().contains("from 0.608 on"), "{below}");
+        assert!(accept(Some(&calibrated), f32::NAN).is_err());
+        assert_eq!(accept(None, 1.0), Err(Unaccepted::Uncalibrated));
     }
 }

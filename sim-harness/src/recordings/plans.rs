@@ -1,8 +1,8 @@
 //! Sequences of plans: got from recorded episodes by the trajectory encoder, stored in a file, and given to the low level to follow.
 //!
 //! The encoder maps one horizon of observations and actions to the codebook entry that it was trained to be (the paper's equation 2 and the
-//! nearest entry of the codebook). Steps of a recording beyond its last full horizon have no plan. What can fail: a policy without an
-//! encoder, a recording of other lengths, a file that is none or asks for what the policy does not have.
+//! nearest entry of the codebook). Steps of a recording beyond its last full horizon have the plan of the horizon that ends with the last
+//! step, so that whoever follows the plans acts until the recording's end. What can fail: a policy without an encoder, a recording of other lengths, a file that is none or asks for what the policy does not have.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -112,7 +112,7 @@ impl PlanFile {
 
     /// Reads a file.
     pub fn read(path: &Path) -> Result<Self, PlanError> {
-        let text = std::fs::read_to_string(path).map_err(PlanError::Read)?;
+        let text = lads_host::input::read_to_string(path).map_err(PlanError::Read)?;
         let file: Self =
             serde_json::from_str(&text).map_err(|error| PlanError::Form(error.to_string()))?;
         if file.format != FORMAT || file.format_version != FORMAT_VERSION {
@@ -175,7 +175,10 @@ impl PlanBook {
     }
 }
 
-/// The plan that the trajectory encoder sees in each full horizon of a recording; what was executed counts, not what was asked for.
+/// The plan that the trajectory encoder sees in each horizon of a recording; what was executed counts, not what was asked for.
+///
+/// Steps beyond the last full horizon are the end of one more, which begins earlier: every step has a plan, unless the recording is
+/// shorter than one horizon, which has none.
 pub fn encode<'t>(
     policy: &Policy<'_>,
     recordings: impl IntoIterator<Item = &'t [Step]>,
@@ -191,7 +194,13 @@ pub fn encode<'t>(
     };
     recordings
         .into_iter()
-        .map(|steps| steps.chunks_exact(horizon).map(&mut of_segment).collect())
+        .map(|steps| {
+            let whole = steps.chunks_exact(horizon);
+            let last = steps.len().checked_sub(horizon);
+            let tail = last.filter(|_| !whole.remainder().is_empty());
+            let tail = tail.and_then(|from| steps.get(from..));
+            whole.chain(tail).map(&mut of_segment).collect()
+        })
         .collect()
 }
 
@@ -201,6 +210,7 @@ pub fn agreement(policy: &Policy<'_>, traces: &[Trace]) -> Result<Agreement, Pla
     let horizon = policy.contract().horizon();
     let mut total = Agreement::default();
     for (trace, encoded) in traces.iter().zip(&encoded) {
+        // Without the tail's plan: its horizon has steps of two plans.
         for (segment, &plan) in trace.steps.chunks_exact(horizon).zip(encoded) {
             let commanded = segment.first().map_or(plan, |step| step.plan);
             let of_plan = total.encoded_as.entry(commanded).or_default();

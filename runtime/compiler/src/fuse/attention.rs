@@ -15,7 +15,7 @@
 
 use std::collections::HashMap;
 
-use lads_core::op::BinaryKind;
+use lads_image::op::BinaryKind;
 
 use super::Fused;
 use crate::error::CompileError;

@@ -4,7 +4,7 @@
 
 use std::collections::HashMap;
 
-use lads_core::op::{BinaryKind, UnaryKind};
+use lads_image::op::{BinaryKind, UnaryKind};
 
 use super::Fused;
 use crate::graph::{Dim, Graph, Id, Op, Rewriter, Type, Unary, topological};

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use lads_core::op::{BinaryKind, ReduceKind, UnaryKind};
+use lads_image::op::{BinaryKind, ReduceKind, UnaryKind};
 
 use super::{Op, Unary};
 use crate::tensor::{Data, Tensor, strides};

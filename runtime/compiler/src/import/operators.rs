@@ -3,7 +3,7 @@
 use std::f32::consts::{FRAC_1_SQRT_2, SQRT_2};
 use std::sync::Arc;
 
-use lads_core::op::{BinaryKind, ReduceKind, UnaryKind};
+use lads_image::op::{BinaryKind, ReduceKind, UnaryKind};
 
 use super::attributes::Attributes;
 use super::{Operands, recurrent, shapes};
@@ -68,6 +68,7 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
         "ArgMin" => arg(g, x, a, Op::ArgMin),
         "ArgMax" => arg(g, x, a, Op::ArgMax),
         "LSTM" => recurrent::lstm(g, x, a),
+        "GRU" => recurrent::gru(g, x, a),
         _ => shapes::translate(g, operator, x, a),
     }
 }

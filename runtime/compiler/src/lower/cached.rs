@@ -1,6 +1,6 @@
 //! Attention over the cache, and appending to it.
 
-use lads_core::op::{Attention, Span};
+use lads_image::op::{Attention, Span};
 use lads_kernels::attention_scratch_len;
 
 use super::Lowering;

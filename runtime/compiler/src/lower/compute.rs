@@ -1,6 +1,6 @@
 //! The op or view of each kind of node.
 
-use lads_core::op::{
+use lads_image::op::{
     self, Activation, ArgMax, ArgMin, Binary, BinaryKind, Copy, GatherRow, LayerNorm, Linear,
     MatMul, Reduce, ReduceKind, Softmax, Span, UnaryKind, WeightSpan,
 };
@@ -342,7 +342,11 @@ impl Lowering<'_> {
             .get(&index)
             .ok_or("looks up with an index that is not computed")?;
         let shift = i32::try_from(shift).map_err(|_| "adds too much to an index")?;
-        let table = self.plain(table)?;
+        let table = if self.g.constant(table).is_some() {
+            self.plain(table)?.into()
+        } else {
+            self.contiguous(table)?.into()
+        };
         let y = self.allocate(id, &shape);
         let op = GatherRow {
             table,

@@ -8,7 +8,7 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 
 use bytemuck::NoUninit;
-use lads_core::op::{WeightFormat, WeightSpan};
+use lads_image::op::{WeightFormat, WeightSpan};
 use lads_kernels::{PANEL, pack, packed_len, stored};
 
 use crate::tensor::Tensor;

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use lads_core::op::{CacheFormat, Op, Port};
+use lads_image::op::{CacheFormat, Op, Port};
 use lads_kernels::reference;
 
 use super::machine::Machine;

@@ -1,6 +1,6 @@
 //! What several operators become together: layers, concatenations, tables, the LSTM; and what is refused.
 
-use lads_core::op::Port;
+use lads_image::op::Port;
 
 use super::compiled;
 use super::machine::Machine;

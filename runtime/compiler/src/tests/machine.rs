@@ -1,6 +1,6 @@
 //! A plain interpreter of ops, independent of the core's executor: loops, sums in `f64`.
 
-use lads_core::op::{
+use lads_image::op::{
     Activation, INT_SLOTS, Op, Operand, Place, Port, Space, Span, UnaryKind, WeightSpan,
 };
 use lads_kernels::{PANEL, reference};
@@ -169,7 +169,7 @@ impl<'w> Machine<'w> {
                 self.put(op.y, &y);
             }
             Op::Reduce(op) => {
-                use lads_core::op::ReduceKind;
+                use lads_image::op::ReduceKind;
                 let x = self.operand(op.x);
                 let (len, inner) = (op.axis as usize, op.inner as usize);
                 let mut y = vec![];
@@ -207,7 +207,7 @@ impl<'w> Machine<'w> {
                 let row = (self.ints[usize::from(op.index.0)] + i64::from(op.shift)) as usize;
                 assert!(row < op.rows as usize);
                 let len = op.row_len as usize;
-                let y = self.weights(op.table)[row * len..][..len].to_vec();
+                let y = self.operand(op.table)[row * len..][..len].to_vec();
                 self.put(op.y, &y);
             }
             Op::Copy(op) => {
@@ -228,7 +228,7 @@ impl<'w> Machine<'w> {
         }
     }
 
-    fn attention(&mut self, op: &lads_core::op::Attention, past: usize) {
+    fn attention(&mut self, op: &lads_image::op::Attention, past: usize) {
         let width = (op.heads * op.head_dim) as usize;
         for i in 0..op.tokens as usize {
             for col in 0..width {
@@ -261,8 +261,8 @@ impl<'w> Machine<'w> {
     }
 }
 
-fn lads_kernels_kind(kind: lads_core::op::BinaryKind) -> lads_kernels::BinaryKind {
-    use lads_core::op::BinaryKind as Core;
+fn lads_kernels_kind(kind: lads_image::op::BinaryKind) -> lads_kernels::BinaryKind {
+    use lads_image::op::BinaryKind as Core;
     use lads_kernels::BinaryKind as Kernel;
     match kind {
         Core::Add => Kernel::Add,

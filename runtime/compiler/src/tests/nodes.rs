@@ -7,10 +7,10 @@
 use std::collections::{BTreeMap, HashMap};
 
 use lads_core::Isa;
-use lads_core::codec::{Field, Writer};
 use lads_core::image::{PORTS as MOST, PortRecord, ProgramRecord};
-use lads_core::op::{Place, Port};
-use lads_core::program::{Program, Spaces};
+use lads_image::codec::{Field, Writer};
+use lads_image::op::{Place, Port};
+use lads_image::{Program, Spaces};
 use prost::Message;
 
 use super::models::ENTRY;
@@ -138,7 +138,7 @@ impl Case {
         };
         let mut words = vec![0; ProgramRecord::WORDS];
         record.put(&mut Writer::new(&mut words));
-        let ops: Vec<_> = placed.ops.iter().map(lads_core::op::Op::encode).collect();
+        let ops: Vec<_> = placed.ops.iter().map(lads_image::op::Op::encode).collect();
         let spaces = Spaces {
             weights_len: program.weights.len(),
             cache_len: 0,

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use lads_core::op::{CacheFormat, Port};
+use lads_image::op::{CacheFormat, Port};
 
 use super::machine::Machine;
 use super::models::{Small, float, int, ints, text};
@@ -86,7 +86,7 @@ pub(super) fn names(program: &Compiled) -> Vec<&'static str> {
         .placed
         .ops
         .iter()
-        .map(lads_core::op::Op::name)
+        .map(lads_image::op::Op::name)
         .collect()
 }
 

@@ -1,10 +1,9 @@
 //! The memory plan and the verifier that does not trust it.
 
-use lads_core::op::{CacheFormat, Copy, Op, Operand, Place, Port, Space, Span, Unary, UnaryKind};
+use lads_image::op::{CacheFormat, Copy, Op, Operand, Place, Port, Space, Span, Unary, UnaryKind};
 use proptest::prelude::*;
 
 use super::compiled;
-use crate::access::each_span;
 use crate::bundle::Bundle;
 use crate::compile::RECIPES;
 use crate::entries;
@@ -37,7 +36,7 @@ fn programs() -> Vec<(Lowered, Placed)> {
 
 fn offsets(op: &Op) -> Vec<u32> {
     let mut offsets = vec![];
-    each_span(&mut op.clone(), &mut |span| offsets.push(span.offset));
+    op.clone().each_span(&mut |span| offsets.push(span.offset));
     offsets
 }
 
@@ -50,7 +49,7 @@ fn every_moved_span_is_found() {
                 for to in [0, 7, 16, 64, placed.arena_len.saturating_sub(8)] {
                     let mut wrong = placed.clone();
                     let mut at = 0;
-                    each_span(&mut wrong.ops[i], &mut |span| {
+                    wrong.ops[i].each_span(&mut |span| {
                         if at == which {
                             span.offset = to;
                         }
@@ -76,7 +75,7 @@ fn two_live_buffers_in_one_place_are_found() {
         // Everything at the start of the arena: whatever lives beside something else clashes.
         let mut wrong = placed.clone();
         for op in &mut wrong.ops {
-            each_span(op, &mut |span| span.offset = 0);
+            op.each_span(&mut |span| span.offset = 0);
         }
         if lowered.ops.len() > 1 {
             assert!(verify(&lowered, &wrong).is_err());

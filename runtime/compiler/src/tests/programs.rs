@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use lads_core::op::{CacheFormat, Port};
+use lads_image::op::{CacheFormat, Port};
 use lads_kernels::reference;
 use tract_onnx::prelude::Tensor;
 

@@ -4,13 +4,23 @@ use super::limiter::{Changed, Limiter};
 use super::{
     ActionLength, Counters, Fallback, GuardConfig, GuardError, GuardReport, Intervention, Tick,
 };
-use crate::contract::Decision;
+use core::error::Error;
+use core::fmt;
+
+use crate::contract::{ChannelId, Contract, Decision, Noise};
 use crate::controller::{Controller, Instruction, StepReport};
 use crate::errors::{InstructionError, StepError};
+use crate::inputs::Data;
 use crate::policy::Policy;
 use crate::self_test::{SelfTest, SelfTestError};
 
-/// A [`Controller`] whose inputs are watched and whose output is limited. See the module's description for what it promises.
+/// A [`Controller`] whose inputs are watched and whose output is limited.
+///
+/// In every control period it writes an action that is finite, inside the limits, and no further from the last one than the rate
+/// allows, whatever the observation, the clock or the policy do. When the policy's action cannot be used (an [`Intervention`]) the
+/// [`Fallback`] decides what is written instead. Before the self-test has passed and an instruction is set there is nothing but the
+/// safe action. What can fail is [`GuardedController::new`], when the configuration contradicts the contract ([`GuardError`]), and a
+/// step only when the caller's action has the wrong length, so that nothing can be written.
 ///
 /// ```no_run
 /// # use lads_core::{Controller, GuardConfig, GuardedController, Instruction, Tick};
@@ -33,11 +43,15 @@ pub struct GuardedController<'a, 'm> {
     /// Of what is left, per period, when decaying.
     share: f32,
     late_after: u32,
+    coast: u32,
+    max_jump: u64,
     stop_after: u32,
     armed: bool,
     stopped: bool,
     /// Interventions since the last action of the policy.
     in_a_row: u32,
+    /// Periods in a row in which the last action was repeated.
+    coasted: u32,
     timestamp: Option<u64>,
     counters: Counters,
 }
@@ -55,25 +69,21 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         memory: &'m mut [f32],
     ) -> Result<Self, GuardError> {
         let contract = controller.policy().contract();
-        let share = match config.fallback {
-            Fallback::Decay { time_constant_s } => {
-                if !time_constant_s.is_finite() || time_constant_s <= 0.0 {
-                    return Err(GuardError::TimeConstant);
-                }
-                contract.control_period_s() / (contract.control_period_s() + time_constant_s)
-            }
-            Fallback::Stop | Fallback::Hold => 1.0,
-        };
+        let share = config.share(contract)?;
+        let limiter = Limiter::new(contract, &config.limits, memory)?;
         Ok(Self {
-            limiter: Limiter::new(&contract, &config.limits, memory)?,
+            limiter,
             controller,
             fallback: config.fallback,
             share,
             late_after: config.late_after,
+            coast: config.coast,
+            max_jump: config.max_jump,
             stop_after: config.stop_after,
             armed: false,
             stopped: false,
             in_a_row: 0,
+            coasted: 0,
             timestamp: None,
             counters: Counters::default(),
         })
@@ -132,14 +142,78 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         self.controller.set_decision(decision);
     }
 
-    /// As [`Controller::reset`]. A stop stays a stop.
+    /// Changes where noise comes from, as [`Controller::set_noise`] does.
+    pub fn set_noise(&mut self, noise: Noise) {
+        self.controller.set_noise(noise);
+    }
+
+    /// Starts a new episode, as [`Controller::reset`] does; timestamps may start anew. A stop stays a stop.
     pub fn reset(&mut self) {
         self.controller.reset();
+        self.timestamp = None;
+        self.coasted = 0;
+    }
+
+    /// Puts another policy in the place of this one, between two steps; the old controller is given back. The other policy has to
+    /// have the same channels and the same control period. Limits, rates and the last executed action stay, so the first
+    /// action of the new policy is no further from it than the rate allows. The guard stays armed if the new controller
+    /// has passed its self-test. Refused, the old policy goes on as if nothing had been asked.
+    #[expect(
+        clippy::result_large_err,
+        reason = "nothing is allocated: both controllers are moved"
+    )]
+    pub fn swap(
+        &mut self,
+        controller: Controller<'a, 'm>,
+    ) -> Result<Controller<'a, 'm>, (SwapError, Controller<'a, 'm>)> {
+        if let Err(error) = replaceable(&self.controller, &controller) {
+            return Err((error, controller));
+        }
+        self.armed &= controller.is_tested();
+        Ok(core::mem::replace(&mut self.controller, controller))
+    }
+
+    /// Takes the place of another guarded controller, between two steps, with a policy and memory of its own; the other is idle
+    /// afterwards. The other's limits, rates, fallback, counters, clock and last executed action go on here, so the first action
+    /// is no further from that one than the rate allows. It is armed if both were. Refused, nothing changes on either side, for the
+    /// reasons of [`swap`](Self::swap).
+    pub fn take_over(&mut self, running: &GuardedController) -> Result<(), SwapError> {
+        replaceable(&running.controller, &self.controller)?;
+        self.limiter.copy_from(&running.limiter);
+        self.fallback = running.fallback;
+        self.share = running.share;
+        self.late_after = running.late_after;
+        self.coast = running.coast;
+        self.max_jump = running.max_jump;
+        self.stop_after = running.stop_after;
+        self.armed &= running.armed;
+        self.stopped = running.stopped;
+        self.in_a_row = running.in_a_row;
+        self.coasted = running.coasted;
+        self.timestamp = running.timestamp;
+        self.counters = running.counters;
+        Ok(())
     }
 
     /// As [`Controller::warm`].
     pub fn warm(&mut self) {
         self.controller.warm();
+    }
+
+    /// One control period of a policy with any observation channels: writes an action that may be executed, whatever the report
+    /// says. Without a tick, an observation is neither stale nor late.
+    pub fn step_with(
+        &mut self,
+        inputs: &[(ChannelId, Data)],
+        tick: Option<Tick>,
+        action: &mut [f32],
+    ) -> Result<GuardReport, ActionLength> {
+        self.fits(action)?;
+        let outcome = self.watch(tick).and_then(|()| {
+            let stepped = self.controller.step_with(inputs, action);
+            stepped.map_err(Intervention::Refused)
+        });
+        Ok(self.conclude(outcome, action))
     }
 
     /// As [`Controller::executed`]; the rate counts from there. What the guard itself has changed it has told the controller.
@@ -166,7 +240,17 @@ impl<'a, 'm> GuardedController<'a, 'm> {
 
     /// One control period without an observation.
     pub fn step_blind(&mut self, action: &mut [f32]) -> Result<GuardReport, ActionLength> {
+        self.step_blind_after(0, action)
+    }
+
+    /// One control period without an observation, after periods that have passed without a step.
+    pub fn step_blind_after(
+        &mut self,
+        missed: u32,
+        action: &mut [f32],
+    ) -> Result<GuardReport, ActionLength> {
         self.fits(action)?;
+        self.counters.missed = self.counters.missed.saturating_add(u64::from(missed));
         let outcome = self.watch(None).and(Err(Intervention::NoObservation));
         Ok(self.conclude(outcome, action))
     }
@@ -184,15 +268,22 @@ impl<'a, 'm> GuardedController<'a, 'm> {
     fn watch(&mut self, tick: Option<Tick>) -> Result<(), Intervention> {
         let missed = tick.map_or(0, |tick| tick.missed);
         self.counters.missed = self.counters.missed.saturating_add(u64::from(missed));
-        let stale = tick.is_some_and(|tick| {
-            let last = self.timestamp;
-            self.timestamp = last.max(Some(tick.timestamp));
-            last.is_some_and(|last| tick.timestamp <= last)
+        let last = self.timestamp;
+        let jumps = tick.zip(last).is_some_and(|(tick, last)| {
+            self.max_jump > 0 && tick.timestamp.saturating_sub(last) > self.max_jump
         });
+        let stale = tick
+            .zip(last)
+            .is_some_and(|(tick, last)| tick.timestamp <= last);
+        if !jumps {
+            self.timestamp = last.max(tick.map(|tick| tick.timestamp));
+        }
         if !self.armed {
             Err(Intervention::NotArmed)
         } else if self.stopped {
             Err(Intervention::Stopped)
+        } else if jumps {
+            Err(Intervention::Jump)
         } else if stale {
             Err(Intervention::Stale)
         } else if missed > self.late_after {
@@ -218,16 +309,22 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         outcome: Result<StepReport, Intervention>,
         action: &mut [f32],
     ) -> GuardReport {
+        let coasting = outcome.is_err_and(|intervention| self.coasts(intervention));
         let changed = match outcome {
             Ok(_) => {
-                self.in_a_row = 0;
+                (self.in_a_row, self.coasted) = (0, 0);
                 self.limiter.write(action)
+            }
+            Err(_) if coasting => {
+                self.coasted = self.coasted.saturating_add(1);
+                self.limiter.write_towards_safe(0.0, action)
             }
             Err(intervention) => self.intervene(intervention, action),
         };
         let report = GuardReport {
             step: outcome.ok(),
             intervention: outcome.err(),
+            coasting,
             saturated: changed.saturated,
             rate_limited: changed.rate_limited,
         };
@@ -235,6 +332,18 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         // Fails before the first step of an episode, when there is no token of an action yet.
         let _ = self.controller.executed(action);
         report
+    }
+
+    /// Whether the last action is repeated instead of falling back: the observation is at fault, nothing else, and not for long.
+    fn coasts(&self, intervention: Intervention) -> bool {
+        let observation = matches!(
+            intervention,
+            Intervention::NoObservation
+                | Intervention::Stale
+                | Intervention::Jump
+                | Intervention::Refused(StepError::Input(_))
+        );
+        observation && self.armed && !self.stopped && self.coasted < self.coast
     }
 
     fn intervene(&mut self, intervention: Intervention, action: &mut [f32]) -> Changed {
@@ -258,3 +367,60 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         self.limiter.write_towards_safe(share, action)
     }
 }
+
+/// Whether a controller may take the place of another one between two steps.
+fn replaceable(old: &Controller, new: &Controller) -> Result<(), SwapError> {
+    let (before, after) = (old.policy().contract(), new.policy().contract());
+    if before.control_period_s().to_bits() != after.control_period_s().to_bits() {
+        return Err(SwapError::ControlPeriod);
+    }
+    if let Some(channel) = difference(before, after) {
+        return Err(SwapError::Channels { channel });
+    }
+    if old.is_instructed() && !new.is_instructed() {
+        return Err(SwapError::NoInstruction);
+    }
+    Ok(())
+}
+
+/// The first channel in which two contracts differ for those who give observations and execute actions.
+fn difference(old: &Contract, new: &Contract) -> Option<u32> {
+    let count = old.channels().count().max(new.channels().count());
+    (0_u32..)
+        .take(count)
+        .map(|i| (i, old.channel(ChannelId(i)), new.channel(ChannelId(i))))
+        .find(|(_, old, new)| match (old, new) {
+            (Some(old), Some(new)) => !old.is_like(new),
+            _ => true,
+        })
+        .map(|(i, ..)| i)
+}
+
+/// Why another policy did not take the place of this one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum SwapError {
+    /// It has another control period.
+    ControlPeriod,
+    /// It has other channels.
+    Channels {
+        /// The first that differs.
+        channel: u32,
+    },
+    /// It has no instruction yet, and the old one has.
+    NoInstruction,
+}
+
+impl fmt::Display for SwapError {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self {
+            Self::ControlPeriod => f.write_str("the other policy has another control period"),
+            Self::Channels { channel } => {
+                write!(f, "channel {channel} of the other policy differs")
+            }
+            Self::NoInstruction => f.write_str("the other policy has no instruction yet"),
+        }
+    }
+}
+
+impl Error for SwapError {}

@@ -1,21 +1,34 @@
-//! Assembles the programs of a [`Model`] from ops, by hand.
+//! Assembles a [`Model`] into the parts of an image: programs from ops by hand, the schedule of LADS around them.
 
-use lads_core::image::{
-    Beyond, ContractRecord, DecisionRule, ElementRecord, GoldenRecord, InstructionRecord,
-    PolicyKind, PortRecord, ProgramKind, ProgramRecord, QuaternionOrder, Text,
-};
-use lads_core::op::{
-    self, Activation, BinaryKind, CacheFormat, IntSlot, Op, Place, Port, Span, StateSpan,
-    WeightSpan,
-};
-use lads_kernels::{attention_scratch_len, pack, packed_len};
+use lads_image::op::{self, Activation, BinaryKind, CacheFormat, Span, StateSpan, WeightSpan};
+use lads_image::place::Place;
+use lads_image::records::{DType, Event, Role, Scope, SourceKind};
+use lads_kernels::{attention_scratch_len, keys_len, pack, packed_len};
 
+use super::draft::{Draft, bound};
 use super::model::{ALPHA, Dense, EPS, Model, Norm};
-use super::writer::{self, Episode, Parts, empty_program};
-use super::{Memory, Random};
+use super::writer::{Call, Parts};
 
-const TIMESTEP: IntSlot = IntSlot(0);
-const INDEX: IntSlot = IntSlot(1);
+/// Entries of the image, by their number.
+pub const INSTRUCT: usize = 0;
+pub const START: usize = 1;
+pub const DECIDE: usize = 2;
+pub const RECORD: usize = 3;
+pub const LOOKUP: usize = 4;
+pub const ACT: usize = 5;
+pub const ENCODE: usize = 6;
+
+/// States of the image, by their number.
+pub const CONTEXT: u32 = 0;
+pub const LOGITS: u32 = 1;
+pub const PLAN: u32 = 2;
+
+/// Channels of the image, by their number.
+pub const OBSERVATION: u32 = 0;
+pub const WORDS: u32 = 1;
+pub const OBSERVATIONS: u32 = 2;
+pub const ACTIONS: u32 = 3;
+pub const ACTION: u32 = 4;
 
 /// A dense layer in the weights.
 #[derive(Clone, Copy)]
@@ -26,101 +39,23 @@ struct Packed {
     b: WeightSpan,
 }
 
-/// The weights of an image, each once.
-struct Pool(Vec<f32>);
-
-impl Pool {
-    fn dense(&mut self, dense: &Dense) -> Packed {
-        let mut panels = vec![0.0; packed_len(op::WeightFormat::F32, [dense.k, dense.n])];
-        pack(
-            op::WeightFormat::F32,
-            &dense.w,
-            [dense.k, dense.n],
-            &mut panels,
-        );
-        Packed {
+impl Packed {
+    fn new(parts: &mut Parts, dense: &Dense) -> Self {
+        let (format, shape) = (op::WeightFormat::F32, [dense.k, dense.n]);
+        let mut panels = vec![0.0; packed_len(format, shape)];
+        pack(format, &dense.w, shape, &mut panels);
+        Self {
             k: dense.k as u32,
             n: dense.n as u32,
-            w: self.add(&panels),
-            b: self.add(&dense.b),
+            w: parts.weights(&panels),
+            b: parts.weights(&dense.b),
         }
     }
 
-    fn norm(&mut self, norm: &Norm) -> [WeightSpan; 2] {
-        [self.add(&norm.gamma), self.add(&norm.beta)]
-    }
-
-    fn add(&mut self, values: &[f32]) -> WeightSpan {
-        writer::weights(&mut self.0, values)
-    }
-}
-
-/// One transformer layer in the weights, and its cache.
-struct PackedLayer {
-    norm1: [WeightSpan; 2],
-    qkv: Packed,
-    out: Packed,
-    norm2: [WeightSpan; 2],
-    up: Packed,
-    down: Packed,
-    cache_k: StateSpan,
-    cache_v: StateSpan,
-}
-
-/// A program under construction; arena is never used twice.
-struct Draft {
-    record: ProgramRecord,
-    ops: Vec<Op>,
-}
-
-impl Draft {
-    fn new(tokens: usize) -> Self {
-        let (record, ops) = empty_program();
-        Self {
-            record: ProgramRecord {
-                tokens: tokens as u32,
-                ..record
-            },
-            ops,
-        }
-    }
-
-    fn span(&mut self, len: u32) -> Span {
-        let offset = self.record.arena_len;
-        self.record.arena_len += len;
-        Span { offset, len }
-    }
-
-    fn input(&mut self, port: Port, place: Place) {
-        self.record.inputs[self.record.inputs_len as usize] = PortRecord { port, place };
-        self.record.inputs_len += 1;
-    }
-
-    fn input_span(&mut self, port: Port, len: usize) -> Span {
-        let span = self.span(len as u32);
-        self.input(port, Place::Span(span));
-        span
-    }
-
-    fn output(&mut self, port: Port, place: Place) {
-        self.record.outputs[self.record.outputs_len as usize] = PortRecord { port, place };
-        self.record.outputs_len += 1;
-    }
-
-    fn op(&mut self, op: impl Into<Op>) {
-        self.ops.push(op.into());
-    }
-
-    fn linear(
-        &mut self,
-        x: Span,
-        dense: Packed,
-        y: Span,
-        activation: Activation,
-        accumulate: bool,
-    ) {
-        let Packed { k, n, w, b } = dense;
-        self.op(op::Linear {
+    /// `y = activation(x W + b)`, or added to `y`.
+    fn run(self, draft: &mut Draft, x: Span, y: Span, activation: Activation, accumulate: bool) {
+        let Self { k, n, w, b } = self;
+        draft.op(op::Linear {
             x,
             format: op::WeightFormat::F32,
             w,
@@ -134,46 +69,51 @@ impl Draft {
             accumulate,
         });
     }
+}
 
-    fn norm(&mut self, x: Span, [gamma, beta]: [WeightSpan; 2]) -> Span {
-        let y = self.span(x.len);
-        self.op(op::LayerNorm {
-            x,
-            y,
-            gamma,
-            beta,
-            rows: x.len / gamma.len,
-            cols: gamma.len,
-            eps: EPS,
-        });
-        y
-    }
+fn norm(parts: &mut Parts, norm: &Norm) -> [WeightSpan; 2] {
+    [parts.weights(&norm.gamma), parts.weights(&norm.beta)]
+}
 
-    /// `x += table[timestep + shift]`
-    fn add_timestep(&mut self, x: Span, table: WeightSpan, shift: i32) {
-        let row = self.span(x.len);
-        self.op(op::GatherRow {
-            table,
-            row_len: x.len,
-            rows: table.len / x.len,
-            index: TIMESTEP,
-            shift,
-            y: row,
-        });
-        self.op(op::Binary {
-            kind: BinaryKind::Add,
-            a: x.into(),
-            b: row.into(),
-            y: x,
-            dims: [1, 1, 1, x.len],
-            a_strides: [0, 0, 0, 1],
-            b_strides: [0, 0, 0, 1],
-        });
-    }
+fn layer_norm(draft: &mut Draft, x: Span, [gamma, beta]: [WeightSpan; 2]) -> Span {
+    let y = draft.span(x.len);
+    draft.op(op::LayerNorm {
+        x,
+        y,
+        gamma,
+        beta,
+        rows: x.len / gamma.len,
+        cols: gamma.len,
+        eps: EPS,
+    });
+    y
+}
 
-    fn finish(self) -> (ProgramRecord, Vec<Op>) {
-        (self.record, self.ops)
-    }
+/// `x += table[timestep + shift]`
+fn add_timestep(draft: &mut Draft, x: Span, table: WeightSpan, shift: i32) {
+    let timestep = op::IntSlot(0);
+    let row = draft.gather(table, x.len, timestep, shift);
+    draft.op(op::Binary {
+        kind: BinaryKind::Add,
+        a: x.into(),
+        b: row.into(),
+        y: x,
+        dims: [1, 1, 1, x.len],
+        a_strides: [0, 0, 0, 1],
+        b_strides: [0, 0, 0, 1],
+    });
+}
+
+/// One transformer layer in the weights, and its part of the cache.
+struct PackedLayer {
+    norm1: [WeightSpan; 2],
+    qkv: Packed,
+    out: Packed,
+    norm2: [WeightSpan; 2],
+    up: Packed,
+    down: Packed,
+    cache_k: StateSpan,
+    cache_v: StateSpan,
 }
 
 /// The transformer's weights.
@@ -192,13 +132,13 @@ impl Transformer {
     /// The layers over `x`; with `decide` the logits of the last token, otherwise only keys and values.
     fn run(&self, draft: &mut Draft, x: Span, decide: bool) {
         let tokens = x.len / self.width;
-        let mut x = draft.norm(x, self.norm_embed);
+        let mut x = layer_norm(draft, x, self.norm_embed);
         for (i, layer) in self.layers.iter().enumerate() {
             let last = i + 1 == self.layers.len();
             let queries = if last { u32::from(decide) } else { tokens };
-            let normed = draft.norm(x, layer.norm1);
+            let normed = layer_norm(draft, x, layer.norm1);
             let qkv = draft.span(tokens * 3 * self.width);
-            draft.linear(normed, layer.qkv, qkv, Activation::None, false);
+            layer.qkv.run(draft, normed, qkv, Activation::None, false);
             let attended = self.attend(draft, layer, qkv, queries);
             if queries == 0 {
                 return;
@@ -208,36 +148,37 @@ impl Transformer {
                 offset: x.offset + dropped,
                 len: x.len - dropped,
             };
-            draft.linear(attended, layer.out, x, Activation::None, true);
-            let normed = draft.norm(x, layer.norm2);
+            layer.out.run(draft, attended, x, Activation::None, true);
+            let normed = layer_norm(draft, x, layer.norm2);
             let hidden = draft.span(queries * layer.up.n);
-            draft.linear(normed, layer.up, hidden, Activation::Relu, false);
-            draft.linear(hidden, layer.down, x, Activation::None, true);
+            layer.up.run(draft, normed, hidden, Activation::Relu, false);
+            layer.down.run(draft, hidden, x, Activation::None, true);
         }
-        let normed = draft.norm(x, self.norm_final);
+        let normed = layer_norm(draft, x, self.norm_final);
         let logits = draft.span(self.head.n);
-        draft.linear(normed, self.head, logits, Activation::None, false);
-        draft.output(Port::Logits, Place::Span(logits));
+        self.head
+            .run(draft, normed, logits, Activation::None, false);
+        draft.to_state(LOGITS, logits);
     }
 
     fn attend(&self, draft: &mut Draft, layer: &PackedLayer, qkv: Span, queries: u32) -> Span {
         let (width, stride) = (self.width, 3 * self.width);
         let tokens = qkv.len / stride;
-        let scratch = attention_scratch_len(
-            queries as usize,
-            self.heads as usize,
-            self.capacity as usize,
-        ) as u32;
-        let (y, scratch) = (draft.span(queries * width), draft.span(scratch));
         let part = |first: u32, rows: u32| Span {
             offset: qkv.offset + (tokens - rows) * stride + first * width,
             len: (rows - 1) * stride + width,
         };
-        let (q, y, scratch) = if queries == 0 {
-            Default::default()
-        } else {
-            (part(0, queries), y, scratch)
-        };
+        let (mut q, mut y, mut scratch) = Default::default();
+        if queries > 0 {
+            let lens = (
+                queries as usize,
+                self.heads as usize,
+                self.capacity as usize,
+            );
+            q = part(0, queries);
+            y = draft.span(queries * width);
+            scratch = draft.span(attention_scratch_len(lens.0, lens.1, lens.2) as u32);
+        }
         draft.op(op::Attention {
             q,
             q_stride: stride,
@@ -260,128 +201,161 @@ impl Transformer {
     }
 }
 
-/// The parts of an image of a model, with a recorded episode that its own controller made.
+/// The parts of an image of a model.
 pub fn parts(model: &Model) -> Parts {
     let spec = model.spec;
     let d = spec.width() as u32;
-    let mut pool = Pool(Vec::new());
+    let mut parts = Parts::new("lads");
+    let [o, a] = [spec.observation_len as u32, spec.action_len as u32];
+    let h = spec.horizon as u32;
+    let inside = [-3.0, 3.0];
+    parts.channel("observation", Role::Observation, DType::F32, &[o], inside);
+    let shape = [spec.words_len as u32, spec.word_dim as u32];
+    parts.channel("words", Role::Instruction, DType::F32, &shape, [-9.0, 9.0]);
+    parts.channel(
+        "observations",
+        Role::Demonstration,
+        DType::F32,
+        &[h, o],
+        inside,
+    );
+    parts.channel(
+        "actions",
+        Role::Demonstration,
+        DType::F32,
+        &[h, a],
+        [-1.0, 1.0],
+    );
+    parts.channel("action", Role::Action, DType::F32, &[a], [-1.0, 1.0]);
+    parts.contract.context_steps = spec.steps as u32;
+    for words in &model.instructions {
+        parts.instruction(spec.word_dim, words);
+    }
+
     let capacity = (spec.words_len + 1 + 2 * (spec.steps - 1)) as u32;
     let mut cache_len = 0;
-    let mut cache = |rows: u32| {
+    let mut cache = |len: u32| {
         let span = StateSpan {
             offset: cache_len,
-            len: rows * d,
+            len,
         };
-        cache_len += span.len;
+        cache_len += len;
         span
     };
-    let layers = model.layers.iter().map(|layer| PackedLayer {
-        norm1: pool.norm(&layer.norm1),
-        qkv: pool.dense(&layer.qkv),
-        out: pool.dense(&layer.out),
-        norm2: pool.norm(&layer.norm2),
-        up: pool.dense(&layer.up),
-        down: pool.dense(&layer.down),
-        cache_k: cache(capacity.next_multiple_of(16)),
-        cache_v: cache(capacity),
-    });
-    let layers = layers.collect();
+    let layers: Vec<_> = model
+        .layers
+        .iter()
+        .map(|layer| PackedLayer {
+            norm1: norm(&mut parts, &layer.norm1),
+            qkv: Packed::new(&mut parts, &layer.qkv),
+            out: Packed::new(&mut parts, &layer.out),
+            norm2: norm(&mut parts, &layer.norm2),
+            up: Packed::new(&mut parts, &layer.up),
+            down: Packed::new(&mut parts, &layer.down),
+            cache_k: cache(keys_len(capacity as usize, d as usize) as u32),
+            cache_v: cache(capacity * d),
+        })
+        .collect();
     let transformer = Transformer {
         width: d,
         heads: spec.heads as u32,
         head_dim: spec.head_dim as u32,
         capacity,
-        norm_embed: pool.norm(&model.norm_embed),
+        norm_embed: norm(&mut parts, &model.norm_embed),
         layers,
-        norm_final: pool.norm(&model.norm_final),
-        head: pool.dense(&model.head),
+        norm_final: norm(&mut parts, &model.norm_final),
+        head: Packed::new(&mut parts, &model.head),
     };
-    let embed_words = pool.dense(&model.embed_words);
-    let embed_observation = pool.dense(&model.embed_observation);
-    let embed_action = pool.dense(&model.embed_action);
-    let timesteps = pool.add(&model.timesteps);
+    parts.kv("context", cache_len, capacity);
+    parts.plain("logits", Scope::Episode, spec.codebook_len as u32);
+    parts.plain("plan", Scope::Episode, spec.plan_len as u32);
+    high_level(model, &mut parts, &transformer);
+    lookup(model, &mut parts);
+    act(model, &mut parts);
+    encode(model, &mut parts);
+    schedule(&mut parts, h);
+    parts.sealed()
+}
 
-    let mut instruct = Draft::new(spec.words_len);
-    let words = instruct.input_span(Port::Words, spec.words_len * spec.word_dim);
+fn schedule(parts: &mut Parts, h: u32) {
+    let entry = |entry: usize| entry as u32;
+    parts.calls = vec![
+        Call::on(Event::Instruct, entry(INSTRUCT)),
+        Call::step(entry(START)).first().select(LOGITS),
+        Call::step(entry(DECIDE))
+            .every(h)
+            .otherwise()
+            .select(LOGITS),
+        Call::step(entry(RECORD)).otherwise(),
+        Call::step(entry(LOOKUP)).every(h),
+        Call::step(entry(ACT)),
+        Call::on(Event::Follow, entry(LOOKUP)),
+        Call::on(Event::Follow, entry(ACT)),
+        Call::on(Event::Encode, entry(ENCODE)),
+    ];
+}
+
+fn high_level(model: &Model, parts: &mut Parts, transformer: &Transformer) {
+    let spec = model.spec;
+    let d = transformer.width;
+    let embed_words = Packed::new(parts, &model.embed_words);
+    let embed_observation = Packed::new(parts, &model.embed_observation);
+    let embed_action = Packed::new(parts, &model.embed_action);
+    let timesteps = parts.weights(&model.timesteps);
+
+    let mut instruct = Draft::appending("high_level/instruct", CONTEXT, spec.words_len as u32);
+    let words = instruct.channel(WORDS, (spec.words_len * spec.word_dim) as u32);
     let x = instruct.span(spec.words_len as u32 * d);
-    instruct.linear(words, embed_words, x, Activation::None, false);
+    embed_words.run(&mut instruct, words, x, Activation::None, false);
     transformer.run(&mut instruct, x, false);
+    parts.entry(instruct.finish());
 
-    let mut start = Draft::new(1);
-    start.input(Port::Timestep, Place::Int(TIMESTEP));
-    let observation = start.input_span(Port::Observation, spec.observation_len);
+    let mut start = Draft::appending("high_level/start", CONTEXT, 1);
+    start.int(SourceKind::Timestep, 0, 0);
+    let observation = start.channel(OBSERVATION, spec.observation_len as u32);
     let x = start.span(d);
-    start.linear(observation, embed_observation, x, Activation::None, false);
-    start.add_timestep(x, timesteps, 0);
+    embed_observation.run(&mut start, observation, x, Activation::None, false);
+    add_timestep(&mut start, x, timesteps, 0);
     transformer.run(&mut start, x, true);
+    parts.entry(start.finish());
 
-    let step = |decide| {
-        let mut step = Draft::new(2);
-        step.input(Port::Timestep, Place::Int(TIMESTEP));
-        let action = step.input_span(Port::Action, spec.action_len);
-        let observation = step.input_span(Port::Observation, spec.observation_len);
+    for (name, decide) in [("high_level/step", true), ("high_level/record", false)] {
+        let mut step = Draft::appending(name, CONTEXT, 2);
+        step.int(SourceKind::Timestep, 0, 0);
+        let action = step.channel(ACTION, spec.action_len as u32);
+        let observation = step.channel(OBSERVATION, spec.observation_len as u32);
         let x = step.span(2 * d);
-        let rows = [
+        let (first, second) = (
             Span { len: d, ..x },
             Span {
                 offset: x.offset + d,
                 len: d,
             },
-        ];
-        step.linear(action, embed_action, rows[0], Activation::None, false);
-        step.linear(
-            observation,
-            embed_observation,
-            rows[1],
-            Activation::None,
-            false,
         );
-        step.add_timestep(rows[0], timesteps, -1);
-        step.add_timestep(rows[1], timesteps, 0);
+        embed_action.run(&mut step, action, first, Activation::None, false);
+        embed_observation.run(&mut step, observation, second, Activation::None, false);
+        add_timestep(&mut step, first, timesteps, -1);
+        add_timestep(&mut step, second, timesteps, 0);
         transformer.run(&mut step, x, decide);
-        step.finish()
-    };
-
-    let (lookup, act, encode) = (
-        lookup(model, &mut pool),
-        act(model, &mut pool),
-        encode(model, &mut pool),
-    );
-    let programs = [
-        instruct.finish(),
-        start.finish(),
-        step(true),
-        step(false),
-        lookup,
-        act,
-        encode,
-    ];
-    contract(model, pool.0, programs, cache_len)
+        parts.entry(step.finish());
+    }
 }
 
-fn lookup(model: &Model, pool: &mut Pool) -> (ProgramRecord, Vec<Op>) {
-    let spec = model.spec;
-    let mut lookup = Draft::new(0);
-    lookup.input(Port::PlanIndex, Place::Int(INDEX));
-    let plan = lookup.span(spec.plan_len as u32);
-    lookup.op(op::GatherRow {
-        table: pool.add(&model.codebook),
-        row_len: plan.len,
-        rows: spec.codebook_len as u32,
-        index: INDEX,
-        shift: 0,
-        y: plan,
-    });
-    lookup.output(Port::Plan, Place::Span(plan));
-    lookup.finish()
+fn lookup(model: &Model, parts: &mut Parts) {
+    let codebook = parts.weights(&model.codebook);
+    let mut lookup = Draft::new("codebook/lookup");
+    let index = lookup.int(SourceKind::Selected, 0, 1);
+    let plan = lookup.gather(codebook, model.spec.plan_len as u32, index, 0);
+    lookup.to_state(PLAN, plan);
+    parts.entry(lookup.finish());
 }
 
-fn act(model: &Model, pool: &mut Pool) -> (ProgramRecord, Vec<Op>) {
+fn act(model: &Model, parts: &mut Parts) {
     let spec = model.spec;
-    let mut act = Draft::new(0);
+    let mut act = Draft::new("low_level/act");
     // The two inputs lie side by side, so no copy joins them.
-    let observation = act.input_span(Port::Observation, spec.observation_len);
-    let plan = act.input_span(Port::Plan, spec.plan_len);
+    let observation = act.channel(OBSERVATION, spec.observation_len as u32);
+    let plan = act.state(PLAN, spec.plan_len as u32);
     let mut x = Span {
         offset: observation.offset,
         len: observation.len + plan.len,
@@ -394,31 +368,25 @@ fn act(model: &Model, pool: &mut Pool) -> (ProgramRecord, Vec<Op>) {
         } else {
             Activation::LeakyRelu(ALPHA)
         };
-        act.linear(x, pool.dense(dense), y, activation, false);
+        Packed::new(parts, dense).run(&mut act, x, y, activation, false);
         x = y;
     }
-    act.output(Port::Action, Place::Span(x));
-    act.finish()
+    act.to_channel(ACTION, x);
+    parts.entry(act.finish());
 }
 
 /// Squared distance to code `c` is `|x|^2 - 2 x·c + |c|^2`; the first term is the same for all codes.
-fn encode(model: &Model, pool: &mut Pool) -> (ProgramRecord, Vec<Op>) {
+fn encode(model: &Model, parts: &mut Parts) {
     let spec = model.spec;
-    let mut encode = Draft::new(0);
-    let observations = encode.input_span(Port::Observations, spec.horizon * spec.observation_len);
-    let actions = encode.input_span(Port::Actions, spec.horizon * spec.action_len);
+    let mut encode = Draft::new("trajectory_encoder/encode");
+    let observations = encode.channel(OBSERVATIONS, (spec.horizon * spec.observation_len) as u32);
+    let actions = encode.channel(ACTIONS, (spec.horizon * spec.action_len) as u32);
     let x = Span {
         offset: observations.offset,
         len: observations.len + actions.len,
     };
     let latent = encode.span(spec.plan_len as u32);
-    encode.linear(
-        x,
-        pool.dense(&model.encoder),
-        latent,
-        Activation::None,
-        false,
-    );
+    Packed::new(parts, &model.encoder).run(&mut encode, x, latent, Activation::None, false);
     let codes = spec.codebook_len;
     let mut distance = Dense {
         k: spec.plan_len,
@@ -433,134 +401,9 @@ fn encode(model: &Model, pool: &mut Pool) -> (ProgramRecord, Vec<Op>) {
         }
     }
     let distances = encode.span(codes as u32);
-    encode.linear(
-        latent,
-        pool.dense(&distance),
-        distances,
-        Activation::None,
-        false,
-    );
-    encode.op(op::ArgMin {
-        x: distances,
-        out: INDEX,
-    });
-    encode.output(Port::PlanIndex, Place::Int(INDEX));
-    encode.output(Port::Latent, Place::Span(latent));
-    encode.finish()
-}
-
-fn contract(
-    model: &Model,
-    mut weights: Vec<f32>,
-    programs: [(ProgramRecord, Vec<Op>); 7],
-    cache_len: u32,
-) -> Parts {
-    let spec = model.spec;
-    let mut strings = String::new();
-    let mut text = |content: &str| writer::text(&mut strings, content);
-    let element = |text: &mut dyn FnMut(&str) -> Text, name: String, limit: f32| ElementRecord {
-        name: text(&name),
-        unit: text("rad"),
-        joint: text(""),
-        min: -limit,
-        max: limit,
-    };
-    let mut elements = Vec::new();
-    elements.extend(
-        (0..spec.observation_len).map(|i| element(&mut text, format!("observation{i}"), 3.0)),
-    );
-    elements.extend((0..spec.action_len).map(|i| element(&mut text, format!("action{i}"), 1.0)));
-    let instructions = model
-        .instructions
-        .iter()
-        .enumerate()
-        .map(|(i, words)| InstructionRecord {
-            id: text(&format!("id{i}")),
-            text: text(&format!("instruction {i}")),
-            sub_tasks: text("kettle,microwave"),
-            split: text(if i == 0 { "seen" } else { "unseen" }),
-            words_len: (words.len() / spec.word_dim) as u32,
-            words: writer::weights(&mut weights, words),
-        });
-    let instructions: Vec<_> = instructions.collect();
-    let record = ContractRecord {
-        kind: PolicyKind::Lads,
-        environment_id: text("test"),
-        environment_version: text("1"),
-        control_period_s: 0.08,
-        horizon: spec.horizon as u32,
-        codebook_len: spec.codebook_len as u32,
-        plan_len: spec.plan_len as u32,
-        rule: DecisionRule::Argmax,
-        temperature: 1.0,
-        seed: 0,
-        observation_len: spec.observation_len as u32,
-        action_len: spec.action_len as u32,
-        quaternion_order: QuaternionOrder::None,
-        words_len: spec.words_len as u32,
-        word_dim: spec.word_dim as u32,
-        context_steps: spec.steps as u32,
-        beyond: Beyond::Restart,
-        layers: spec.layers as u32,
-        heads: spec.heads as u32,
-        head_dim: spec.head_dim as u32,
-        instruction_count: instructions.len() as u32,
-        encoder: text("none"),
-        encoder_sha256: text(""),
-        bundle_sha256: text("cafe"),
-        cache_len,
-    };
-    Parts {
-        contract: record,
-        elements,
-        instructions,
-        strings,
-        programs,
-        weights,
-        golden: None,
-    }
-}
-
-/// The parts with a recorded episode of `steps` control steps of instruction 1.
-pub fn with_golden(mut parts: Parts, steps: usize) -> Parts {
-    parts.golden = None;
-    let image = parts.image();
-    let policy = image.policy();
-    let mut memory = Memory::for_policy(&policy);
-    let mut controller = memory.controller(&policy);
-    controller
-        .set_instruction(lads_core::Instruction::Id(1))
-        .expect("the instruction is known");
-    let mut random = Random(5);
-    let (o, a) = (
-        parts.contract.observation_len as usize,
-        parts.contract.action_len as usize,
-    );
-    let observations = random.vec(steps * o, 1.0);
-    let (mut plans, mut actions) = (Vec::new(), Vec::new());
-    for observation in observations.chunks(o) {
-        let mut action = vec![0.0; a];
-        let report = controller
-            .step(observation, &mut action)
-            .expect("the step is sound");
-        plans.push(report.plan.0);
-        actions.extend(action);
-    }
-    let record = GoldenRecord {
-        instruction: 1,
-        steps: steps as u32,
-        tolerance: 1e-4,
-    };
-    parts.golden = Some(Episode {
-        record,
-        observations,
-        plans,
-        actions,
-    });
-    parts
-}
-
-/// The ops of one program.
-pub fn ops_mut(parts: &mut Parts, kind: ProgramKind) -> &mut Vec<Op> {
-    &mut parts.programs[kind as usize].1
+    Packed::new(parts, &distance).run(&mut encode, latent, distances, Activation::None, false);
+    let out = op::IntSlot(1);
+    encode.op(op::ArgMin { x: distances, out });
+    encode.output(bound(SourceKind::Selected, 0), Place::Int(out));
+    parts.entry(encode.finish());
 }

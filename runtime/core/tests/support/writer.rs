@@ -1,20 +1,104 @@
-//! Writes images: programs and weights are collected, then laid out as `lads_core::image` describes.
+//! Writes images of version 5: a policy is described by its parts, and [`Parts::image`] lays them out as `lads_image` says.
 
-use lads_core::codec::{Field, Writer};
-use lads_core::image::{
-    self, CRC_WORD, ContractRecord, ElementRecord, GoldenRecord, InstructionRecord, Layout,
-    PROGRAMS, PortRecord, ProgramRecord, SECTIONS, Section, Text,
+use lads_core::{Policy, PolicyError, ScheduleError};
+use lads_image::codec::{Field, Reader, Writer};
+use lads_image::format::{self, CRC_WORD, Layout, SECTIONS, TABLE_WORD, Tag};
+use lads_image::op::Op;
+use lads_image::place::{Place, WeightSpan};
+use lads_image::records::{
+    self, Beyond, CallRecord, ChannelRecord, ContractRecord, DType, ElementRecord, EntryRecord,
+    Event, Fill, GoldenRecord, InstructionRecord, NoiseRule, PortRecord, QuaternionOrder, Repeat,
+    Role, Scope, SelectionRule, Source, StateKind, StateRecord, Text, When,
 };
-use lads_core::op::{Op, WeightSpan};
 
-use super::Image;
+use super::{Image, Memory, Random, Values, given, observe};
 
-/// A recorded episode.
+/// A program and what its ports are bound to.
+#[derive(Clone)]
+pub struct Entry {
+    pub name: String,
+    pub ops: Vec<Op>,
+    pub arena_len: u32,
+    pub cache: u32,
+    pub tokens: u32,
+    pub inputs: Vec<(Source, Place)>,
+    pub outputs: Vec<(Source, Place)>,
+}
+
+/// One line of the schedule.
+#[derive(Clone)]
+pub struct Call {
+    pub record: CallRecord,
+    pub clears: Vec<u32>,
+}
+
+impl Call {
+    pub fn on(event: Event, entry: u32) -> Self {
+        let record = CallRecord {
+            event,
+            when: When::Always,
+            every: 0,
+            otherwise: false,
+            entry,
+            repeat: Repeat::Times,
+            count: 1,
+            select: records::NONE,
+            first_clear: 0,
+            clears_len: 0,
+        };
+        Self {
+            record,
+            clears: Vec::new(),
+        }
+    }
+
+    pub fn step(entry: u32) -> Self {
+        Self::on(Event::Step, entry)
+    }
+
+    pub fn first(mut self) -> Self {
+        self.record.when = When::First;
+        self
+    }
+
+    pub fn every(mut self, period: u32) -> Self {
+        (self.record.when, self.record.every) = (When::Every, period);
+        self
+    }
+
+    pub fn otherwise(mut self) -> Self {
+        self.record.otherwise = true;
+        self
+    }
+
+    pub fn times(mut self, count: u32) -> Self {
+        (self.record.repeat, self.record.count) = (Repeat::Times, count);
+        self
+    }
+
+    pub fn rows(mut self, ring: u32) -> Self {
+        (self.record.repeat, self.record.count) = (Repeat::Rows, ring);
+        self
+    }
+
+    pub fn select(mut self, scores: u32) -> Self {
+        self.record.select = scores;
+        self
+    }
+
+    pub fn clears(mut self, state: u32) -> Self {
+        self.clears.push(state);
+        self
+    }
+}
+
+/// A recorded episode: what each observation channel was over all steps, in words.
 #[derive(Clone)]
 pub struct Episode {
     pub record: GoldenRecord,
-    pub observations: Vec<f32>,
-    pub plans: Vec<u32>,
+    pub observations: Vec<Vec<u32>>,
+    pub selected: Vec<u32>,
+    pub noise: Vec<f32>,
     pub actions: Vec<f32>,
 }
 
@@ -22,48 +106,384 @@ pub struct Episode {
 #[derive(Clone)]
 pub struct Parts {
     pub contract: ContractRecord,
+    pub channels: Vec<ChannelRecord>,
     pub elements: Vec<ElementRecord>,
     pub instructions: Vec<InstructionRecord>,
     pub strings: String,
-    pub programs: [(ProgramRecord, Vec<Op>); PROGRAMS],
+    pub states: Vec<StateRecord>,
+    pub entries: Vec<Entry>,
+    pub calls: Vec<Call>,
     pub weights: Vec<f32>,
     pub golden: Option<Episode>,
 }
 
-/// A record without ports and ops.
-pub fn empty_program() -> (ProgramRecord, Vec<Op>) {
-    let none = [PortRecord::default(); image::PORTS];
-    let record = ProgramRecord {
-        first_op: 0,
-        ops_len: 0,
-        arena_len: 0,
-        tokens: 0,
-        inputs_len: 0,
-        inputs: none,
-        outputs_len: 0,
-        outputs: none,
-    };
-    (record, Vec::new())
-}
+impl Parts {
+    /// Without channels, states and calls, of a policy whose context has no end.
+    pub fn new(family: &str) -> Self {
+        let none = Text::default();
+        let contract = ContractRecord {
+            family: none,
+            environment_id: none,
+            environment_version: none,
+            control_period_s: 0.08,
+            selection: SelectionRule::Argmax,
+            temperature: 1.0,
+            selection_seed: 0,
+            noise: NoiseRule::Zero,
+            noise_seed: 0,
+            context_steps: 0,
+            beyond: Beyond::Restart,
+            encoder: none,
+            encoder_sha256: none,
+            acceptance: 0.5,
+            bundle_sha256: none,
+            worst_work: 0,
+        };
+        let mut parts = Self {
+            contract,
+            channels: Vec::new(),
+            elements: Vec::new(),
+            instructions: Vec::new(),
+            strings: String::new(),
+            states: Vec::new(),
+            entries: Vec::new(),
+            calls: Vec::new(),
+            weights: Vec::new(),
+            golden: None,
+        };
+        parts.contract.family = parts.text(family);
+        parts.contract.environment_id = parts.text("test");
+        parts.contract.environment_version = parts.text("1");
+        parts.contract.bundle_sha256 = parts.text("cafe");
+        parts
+    }
 
-/// Appends a text.
-pub fn text(strings: &mut String, text: &str) -> Text {
-    let offset = strings.len() as u32;
-    strings.push_str(text);
-    Text {
-        offset,
-        len: text.len() as u32,
+    pub fn text(&mut self, text: &str) -> Text {
+        let offset = self.strings.len() as u32;
+        self.strings.push_str(text);
+        Text {
+            offset,
+            len: text.len() as u32,
+        }
+    }
+
+    pub fn weights(&mut self, values: &[f32]) -> WeightSpan {
+        let offset = self.weights.len() as u32;
+        self.weights.extend(values);
+        WeightSpan {
+            offset,
+            len: values.len() as u32,
+        }
+    }
+
+    /// Adds a channel whose values lie within `limits`. Those of floats with one axis get elements with names.
+    pub fn channel(
+        &mut self,
+        name: &str,
+        role: Role,
+        dtype: DType,
+        shape: &[u32],
+        [min, max]: [f32; 2],
+    ) -> u32 {
+        let mut dims = [1; 4];
+        dims[..shape.len()].copy_from_slice(shape);
+        let named = dtype == DType::F32
+            && shape.len() == 1
+            && matches!(role, Role::Observation | Role::Action);
+        let first_element = self.elements.len() as u32;
+        for i in 0..if named { shape[0] } else { 0 } {
+            let element = ElementRecord {
+                name: self.text(&format!("{name}{i}")),
+                unit: self.text("rad"),
+                scale: 1.0,
+                min,
+                max,
+                ..zeros()
+            };
+            self.elements.push(element);
+        }
+        let record = ChannelRecord {
+            name: self.text(name),
+            role,
+            dtype,
+            rank: shape.len() as u32,
+            dims,
+            quaternions: QuaternionOrder::None,
+            reference: Text::default(),
+            first_element,
+            elements_len: self.elements.len() as u32 - first_element,
+            min,
+            max,
+        };
+        self.channels.push(record);
+        self.channels.len() as u32 - 1
+    }
+
+    /// Adds a known instruction of whole words.
+    pub fn instruction(&mut self, word_dim: usize, words: &[f32]) {
+        let number = self.instructions.len();
+        let record = InstructionRecord {
+            id: self.text(&format!("id{number}")),
+            text: self.text(&format!("instruction {number}")),
+            words_len: (words.len() / word_dim) as u32,
+            words: self.weights(words),
+        };
+        self.instructions.push(record);
+    }
+
+    fn state(
+        &mut self,
+        name: &str,
+        kind: StateKind,
+        scope: Scope,
+        [width, rows]: [u32; 2],
+        fill: Fill,
+    ) -> u32 {
+        let name = self.text(name);
+        self.states.push(StateRecord {
+            name,
+            kind,
+            scope,
+            width,
+            rows,
+            fill,
+            offset: 0,
+        });
+        self.states.len() as u32 - 1
+    }
+
+    pub fn plain(&mut self, name: &str, scope: Scope, width: u32) -> u32 {
+        self.state(name, StateKind::Plain, scope, [width, 1], Fill::Zero)
+    }
+
+    pub fn ring(&mut self, name: &str, width: u32, rows: u32, fill: Fill) -> u32 {
+        self.state(name, StateKind::Ring, Scope::Episode, [width, rows], fill)
+    }
+
+    /// Keys and values of `words` words in all.
+    pub fn kv(&mut self, name: &str, words: u32, rows: u32) -> u32 {
+        self.state(
+            name,
+            StateKind::Kv,
+            Scope::Episode,
+            [words, rows],
+            Fill::Zero,
+        )
+    }
+
+    pub fn entry(&mut self, entry: Entry) -> u32 {
+        self.entries.push(entry);
+        self.entries.len() as u32 - 1
+    }
+
+    /// Puts the states one behind the other and states the work of the worst step.
+    pub fn sealed(mut self) -> Self {
+        let cleared: Vec<u32> = self
+            .calls
+            .iter()
+            .flat_map(|call| call.clears.clone())
+            .collect();
+        let (mut rows, mut bank, mut scratch) = (0, 0, 0);
+        for (i, state) in (0_u32..).zip(&mut self.states) {
+            let (end, times) = match (state.kind, state.scope) {
+                (StateKind::Plain, Scope::Step) => (&mut scratch, 1),
+                (StateKind::Plain, _) => (&mut bank, 1),
+                (StateKind::Ring, _) => (&mut rows, state.rows + 1),
+                (StateKind::Kv, _) => (&mut rows, if cleared.contains(&i) { 2 } else { 1 }),
+            };
+            state.offset = *end;
+            *end += state.width * times;
+        }
+        self.contract.worst_work = 0;
+        if let Some(PolicyError::Schedule(ScheduleError::Work { counted, .. })) =
+            self.image().refused()
+        {
+            self.contract.worst_work = counted;
+        }
+        self
+    }
+
+    /// With a recorded episode of `steps` control steps of the last known instruction, made by the policy itself.
+    pub fn with_golden(mut self, steps: usize) -> Self {
+        self.golden = None;
+        let image = self.image();
+        let policy = image.policy();
+        let mut memory = Memory::for_policy(&policy);
+        let mut controller = memory.controller(&policy);
+        let instruction = (self.instructions.len() as u32).checked_sub(1);
+        if let Some(id) = instruction {
+            controller
+                .set_instruction(lads_core::Instruction::Id(id))
+                .expect("the instruction is known");
+        }
+        let noise = policy
+            .contract()
+            .channels()
+            .find(|channel| channel.role() == lads_core::Role::Noise);
+        let mut random = Random(5);
+        let mut episode = Episode {
+            record: GoldenRecord {
+                instruction: instruction.unwrap_or(records::NONE),
+                steps: steps as u32,
+                selects: policy.index_count() > 0,
+                noise_len: policy.noise_len() as u32,
+                tolerance: 1e-4,
+            },
+            observations: vec![Vec::new(); policy.contract().observations_len()],
+            selected: Vec::new(),
+            noise: Vec::new(),
+            actions: Vec::new(),
+        };
+        for _ in 0..steps {
+            let mut inputs = observe(&policy, &mut random);
+            for ((_, values), all) in inputs.iter().zip(&mut episode.observations) {
+                assert!(
+                    !matches!(values, Values::U8(bytes) if bytes.len() % 4 != 0),
+                    "rows are whole words"
+                );
+                all.extend(values.words());
+            }
+            if let Some(channel) = noise {
+                let draws = random.vec(policy.noise_len(), 1.0);
+                episode.noise.extend(&draws);
+                inputs.push((channel.id(), Values::F32(draws)));
+            }
+            let mut action = vec![0.0; policy.contract().action_len()];
+            let report = controller
+                .step_with(&given(&inputs), &mut action)
+                .expect("the step is sound");
+            episode
+                .selected
+                .extend(report.selected.map(|selected| selected.index));
+            episode.actions.extend(action);
+        }
+        self.golden = Some(episode);
+        self
+    }
+
+    pub fn image(&self) -> Image {
+        let mut sections: [Vec<u32>; SECTIONS] = Default::default();
+        let [
+            contract,
+            channels,
+            elements,
+            instructions,
+            strings,
+            states,
+            entries,
+            ports,
+            calls,
+            clears,
+            ops,
+            weights,
+            golden,
+        ] = &mut sections;
+        put(contract, &self.contract);
+        self.channels
+            .iter()
+            .for_each(|record| put(channels, record));
+        self.elements
+            .iter()
+            .for_each(|record| put(elements, record));
+        self.instructions
+            .iter()
+            .for_each(|record| put(instructions, record));
+        strings.extend(Values::U8(self.strings.clone().into_bytes()).words());
+        self.states.iter().for_each(|record| put(states, record));
+        let name = Text::default();
+        for entry in &self.entries {
+            let mut add = |list: &[(Source, Place)]| {
+                let first = (ports.len() / PortRecord::WORDS) as u32;
+                for &(source, place) in list {
+                    put(
+                        ports,
+                        &PortRecord {
+                            name,
+                            source,
+                            place,
+                        },
+                    );
+                }
+                [first, list.len() as u32]
+            };
+            let ([first_input, inputs_len], [first_output, outputs_len]) =
+                (add(&entry.inputs), add(&entry.outputs));
+            let record = EntryRecord {
+                name,
+                first_op: (ops.len() / lads_image::OP_WORDS) as u32,
+                ops_len: entry.ops.len() as u32,
+                arena_len: entry.arena_len,
+                cache: entry.cache,
+                tokens: entry.tokens,
+                first_input,
+                inputs_len,
+                first_output,
+                outputs_len,
+            };
+            put(entries, &record);
+            ops.extend(entry.ops.iter().flat_map(Op::encode));
+        }
+        for call in &self.calls {
+            let (first_clear, clears_len) = (clears.len() as u32, call.clears.len() as u32);
+            put(
+                calls,
+                &CallRecord {
+                    first_clear,
+                    clears_len,
+                    ..call.record
+                },
+            );
+            clears.extend(&call.clears);
+        }
+        weights.extend(self.weights.iter().map(|w| w.to_bits()));
+        if let Some(episode) = &self.golden {
+            put(golden, &episode.record);
+            golden.extend(episode.observations.iter().flatten());
+            golden.extend(&episode.selected);
+            golden.extend(episode.noise.iter().map(|x| x.to_bits()));
+            golden.extend(episode.actions.iter().map(|x| x.to_bits()));
+        }
+        let layout = Layout::new(sections.each_ref().map(|section| section.len() * 4))
+            .expect("the image is small");
+        let mut words = vec![0; layout.total_bytes() / 4];
+        let header = layout.header();
+        words[..header.len()].copy_from_slice(&header);
+        for (tag, content) in Tag::ALL.iter().zip(&sections) {
+            let start = layout.section(*tag).offset / 4;
+            words[start..start + content.len()].copy_from_slice(content);
+        }
+        let mut image = Image(words);
+        image.0[CRC_WORD] = format::crc32(image.bytes());
+        image
+    }
+
+    /// Why the image is refused after `edit`, if it is.
+    pub fn refused(&self, edit: impl FnOnce(&mut Self)) -> Option<PolicyError> {
+        let mut parts = self.clone();
+        edit(&mut parts);
+        parts.image().refused()
+    }
+
+    /// The same of the schedule, which has to be what is at fault.
+    pub fn fault(&self, edit: impl FnOnce(&mut Self)) -> Option<ScheduleError> {
+        match self.refused(edit) {
+            None => None,
+            Some(PolicyError::Schedule(error)) => Some(error),
+            Some(other) => panic!("refused for another reason: {other:?}"),
+        }
+    }
+
+    /// The fault that is left when states and work are put right after `edit`.
+    pub fn sealed_fault(&self, edit: impl FnOnce(&mut Self)) -> Option<ScheduleError> {
+        let mut parts = self.clone();
+        edit(&mut parts);
+        parts.sealed().fault(|_| ())
     }
 }
 
-/// Appends weights.
-pub fn weights(pool: &mut Vec<f32>, values: &[f32]) -> WeightSpan {
-    let offset = pool.len() as u32;
-    pool.extend(values);
-    WeightSpan {
-        offset,
-        len: values.len() as u32,
-    }
+/// A record whose words are all zero.
+fn zeros<T: Field>() -> T {
+    T::take(&mut Reader::new(&vec![0; T::WORDS])).expect("zeros mean something")
 }
 
 fn put<T: Field>(out: &mut Vec<u32>, value: &T) {
@@ -72,59 +492,20 @@ fn put<T: Field>(out: &mut Vec<u32>, value: &T) {
     value.put(&mut Writer::new(&mut out[start..]));
 }
 
-impl Parts {
-    pub fn image(&self) -> Image {
-        let mut sections: [Vec<u32>; SECTIONS] = Default::default();
-        let [contract, strings, programs, ops, weights, golden] = &mut sections;
-        put(contract, &self.contract);
-        self.elements
-            .iter()
-            .for_each(|record| put(contract, record));
-        self.instructions
-            .iter()
-            .for_each(|record| put(contract, record));
-        let mut bytes = self.strings.clone().into_bytes();
-        bytes.resize(bytes.len().next_multiple_of(4), 0);
-        strings.extend(
-            bytes
-                .chunks(4)
-                .map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]])),
-        );
-        for (record, list) in &self.programs {
-            let first_op = (ops.len() / lads_core::op::OP_WORDS) as u32;
-            put(
-                programs,
-                &ProgramRecord {
-                    first_op,
-                    ops_len: list.len() as u32,
-                    ..*record
-                },
-            );
-            ops.extend(list.iter().flat_map(Op::encode));
-        }
-        weights.extend(self.weights.iter().map(|w| w.to_bits()));
-        if let Some(episode) = &self.golden {
-            put(golden, &episode.record);
-            golden.extend(episode.observations.iter().map(|x| x.to_bits()));
-            golden.extend(&episode.plans);
-            golden.extend(episode.actions.iter().map(|x| x.to_bits()));
-        }
-        let layout = Layout::new(sections.each_ref().map(|section| section.len() * 4))
-            .expect("the image is small");
-        let mut words = vec![0; layout.total_bytes() / 4];
-        let header = layout.header();
-        words[..header.len()].copy_from_slice(&header);
-        for (section, content) in Section::ALL.iter().zip(&sections) {
-            let start = layout.section(*section).offset / 4;
-            words[start..start + content.len()].copy_from_slice(content);
-        }
-        let mut image = Image(words);
-        image.0[CRC_WORD] = image::crc32(image.bytes());
-        image
-    }
+/// The words of the header that hold a section's offset and length.
+pub fn section_row(tag: Tag) -> [usize; 2] {
+    let row = Tag::ALL
+        .iter()
+        .position(|known| *known == tag)
+        .expect("every tag is listed");
+    [TABLE_WORD + 3 * row + 1, TABLE_WORD + 3 * row + 2]
 }
 
-/// The word of the header that holds a section's offset.
-pub fn section_start(section: Section) -> usize {
-    image::SECTION_TABLE_WORD + 2 * section as usize
+/// Opens with whatever work it takes.
+pub fn counted_work(parts: &Parts) -> u64 {
+    let image = parts.image();
+    Policy::new_within(image.bytes(), u64::MAX)
+        .expect("the image is sound")
+        .contract()
+        .worst_work()
 }

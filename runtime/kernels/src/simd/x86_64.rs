@@ -30,7 +30,7 @@ pub(crate) struct Halves<const NARROW: bool>(());
 
 /// AVX2 with F16C: sixteen registers of half a block.
 pub(crate) type Avx2 = Halves<false>;
-/// The same on AVX-512: thirty-two registers of half a block.
+/// AVX-512 in registers of half a block, of which it has thirty-two.
 pub(crate) type Avx512Narrow = Halves<true>;
 /// AVX-512: thirty-two registers of a block.
 #[derive(Clone, Copy)]

@@ -86,6 +86,9 @@ pub struct LanguageArguments {
     /// episodes of these sub-tasks. Left out, they last their full time and have no success rate
     #[arg(long, value_name = "SUB-TASKS")]
     pub sub_tasks: Option<String>,
+    /// Follow a sentence outside the bundle's table even where it is less like a known instruction than the bundle's contract asks for
+    #[arg(long, requires = "instruction")]
+    pub sentence_anyway: bool,
     /// Take no word embeddings from the bundle's table: the language encoder hears every instruction
     #[arg(long, conflicts_with_all = ["verify", "replay", "encode", "uniform"])]
     pub encode_language: bool,

@@ -1,10 +1,10 @@
 //! What the policy is told: instructions of the bundle's table, or, through the language encoder (cargo feature `language`), any sentence.
 
 use lads_compiler::Bundle;
-use lads_core::Policy;
+use lads_core::{KnownInstruction, Policy};
 use lads_sim::environment::Environment;
-use lads_sim::results::HeardBy;
-use lads_sim::spoken::{Sentence, WordBook, nearest};
+use lads_sim::results::{HeardBy, NearestKnown, Results};
+use lads_sim::spoken::{self, Sentence, Unaccepted, WordBook};
 
 use crate::arguments::Arguments;
 use crate::end::{End, refused};
@@ -100,39 +100,58 @@ fn nearest_texts(bundle: &Bundle, wanted: &str) -> String {
 }
 
 /// What was heard through the language encoder.
-pub struct Heard {
+pub struct Heard<'p> {
     /// The embeddings.
     pub words: WordBook,
     /// Who heard them, for results; `None` where all come from the table.
     pub by: Option<HeardBy>,
-    /// What a person wants to know of it.
+    /// The known instruction that a sentence outside the table is most like.
+    pub nearest: Option<KnownInstruction<'p>>,
+    /// What a person must know of it before it is followed.
+    pub first: String,
+    /// What a person wants to know of it afterwards.
     pub note: String,
 }
 
+impl Heard<'_> {
+    /// The note, with what a sentence that names no sub-tasks has completed.
+    pub fn last(&self, results: &Results) -> String {
+        let unjudged = self.words.sentence.as_ref();
+        let unjudged = unjudged.is_some_and(|sentence| sentence.known().sub_tasks.is_empty());
+        let result = results.instructions.first().filter(|_| unjudged);
+        let completed = self.nearest.as_ref().zip(result);
+        let completed = completed
+            .map(|(nearest, result)| format!("\n{}\n", spoken::completed(nearest, result)));
+        format!("{}{}", self.note, completed.unwrap_or_default())
+    }
+}
+
 /// Lets the language encoder hear what the table does not have, or, with `--encode-language`, everything.
-pub fn hear(
+pub fn hear<'p>(
     arguments: &Arguments,
     bundle: &Bundle,
-    policy: &Policy<'_>,
+    policy: &Policy<'p>,
     chosen: &Chosen,
-) -> Result<Heard, End> {
+) -> Result<Heard<'p>, End> {
     match chosen {
         Chosen::Sentence(text) => hear_sentence(arguments, bundle, policy, text),
         _ if arguments.language.encode_language => hear_again(arguments, bundle, policy, chosen),
         _ => Ok(Heard {
             words: WordBook::default(),
             by: None,
+            nearest: None,
+            first: String::new(),
             note: String::new(),
         }),
     }
 }
 
-fn hear_sentence(
+fn hear_sentence<'p>(
     arguments: &Arguments,
     bundle: &Bundle,
-    policy: &Policy<'_>,
+    policy: &Policy<'p>,
     text: &str,
-) -> Result<Heard, End> {
+) -> Result<Heard<'p>, End> {
     let not_known = || {
         format!(
             "--instruction '{text}': not in the bundle's table{}",
@@ -144,24 +163,58 @@ fn hear_sentence(
     let heard = encoder::words(&encoder, text)
         .map_err(|wrong| refused(format!("--instruction {wrong}")))?;
     let contract = policy.contract();
-    let note = nearest(&contract, &heard).map_or_else(String::new, |(known, cosine)| {
-        format!(
-            "\n'{text}' is heard most like '{}' ({}), cosine {cosine:.2}\n",
-            known.text, known.id
-        )
-    });
+    let (nearest, similarity) = spoken::nearest(&contract, &heard).ok_or_else(|| {
+        refused(format!(
+            "{}: no instruction to compare it with",
+            not_known()
+        ))
+    })?;
+    let acceptance = bundle.contract().language.acceptance.as_ref();
+    let accepted = spoken::accept(acceptance, similarity);
+    let shown = text.escape_debug();
+    let near = format!(
+        "the nearest known instruction is '{}' ({}), similarity {similarity:.3}",
+        nearest.text, nearest.id
+    );
+    let first = match accepted {
+        Ok(()) => format!("'{shown}': {near}\n\n"),
+        Err(why) if arguments.language.sentence_anyway => {
+            format!("'{shown}': {near}; {why}: followed because of --sentence-anyway\n\n")
+        }
+        Err(why) => {
+            let remedy = match why {
+                Unaccepted::Below { .. } => "say it in words that are more like a known one",
+                Unaccepted::Uncalibrated => "export it with a calibration",
+            };
+            return Err(refused(format!(
+                "--instruction '{shown}': {near}; {why}; {remedy}, or insist with --sentence-anyway"
+            )));
+        }
+    };
     let mut words = WordBook::default();
     words.set(contract.instruction_count() as u32, heard);
-    let by = Some(heard_by(bundle, None));
-    Ok(Heard { words, by, note })
+    let known = NearestKnown {
+        id: nearest.id.to_owned(),
+        text: nearest.text.to_owned(),
+        similarity,
+        threshold: acceptance.map(|acceptance| acceptance.threshold),
+        accepted: accepted.is_ok(),
+    };
+    Ok(Heard {
+        words,
+        by: Some(heard_by(bundle, None, Some(known))),
+        nearest: Some(nearest),
+        first,
+        note: String::new(),
+    })
 }
 
-fn hear_again(
+fn hear_again<'p>(
     arguments: &Arguments,
     bundle: &Bundle,
-    policy: &Policy<'_>,
+    policy: &Policy<'p>,
     chosen: &Chosen,
-) -> Result<Heard, End> {
+) -> Result<Heard<'p>, End> {
     let about = |wrong: String| refused(format!("--encode-language: {wrong}"));
     let encoder = encoder::open(arguments, bundle).map_err(about)?;
     let mut words = WordBook::default();
@@ -187,16 +240,26 @@ fn hear_again(
     let note = format!(
         "\n{count} instructions heard by the language encoder; largest difference from the bundle's table {largest:.1e}\n"
     );
-    let by = Some(heard_by(bundle, Some(largest)));
-    Ok(Heard { words, by, note })
+    Ok(Heard {
+        words,
+        by: Some(heard_by(bundle, Some(largest), None)),
+        nearest: None,
+        first: String::new(),
+        note,
+    })
 }
 
-fn heard_by(bundle: &Bundle, largest_difference: Option<f32>) -> HeardBy {
+fn heard_by(
+    bundle: &Bundle,
+    largest_difference: Option<f32>,
+    nearest: Option<NearestKnown>,
+) -> HeardBy {
     let language = &bundle.contract().language;
     HeardBy {
         encoder: language.encoder.clone(),
         sha256: language.sha256.clone(),
         largest_difference,
+        nearest,
     }
 }
 

@@ -18,15 +18,15 @@ mod verify;
 mod viewer;
 
 use std::fmt::Display;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use arguments::Arguments;
-use end::{End, check_writable, print, refused, unwritable};
-use indicatif::{ProgressBar, ProgressStyle};
+use end::{End, print, refused, unwritable};
+use indicatif::ProgressBar;
 use lads_compiler::{Bundle, Memory};
 use lads_core::{Contract, Decision, Policy};
 use lads_sim::environment::Environment;
@@ -150,6 +150,8 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
     }
     let recording = record::prepare(files, &evaluation, &open)?;
     let viewer = viewer::prepare(arguments, &evaluation, &open)?;
+    // Before the policy moves anything.
+    print(&heard.first)?;
     let bench = Bench {
         evaluation,
         open: &open,
@@ -199,7 +201,7 @@ struct Bench<'b> {
     open: &'b registry::Opener,
     environment: &'b dyn Environment,
     noise: &'b str,
-    heard: &'b Heard,
+    heard: &'b Heard<'b>,
     stop: &'b AtomicBool,
 }
 
@@ -337,7 +339,7 @@ impl Bench<'_> {
             report::write(&page, path)?;
         }
         print(&Table(&results))?;
-        print(&self.heard.note)?;
+        print(&self.heard.last(&results))?;
         if let Some(agreement) = &results.plan_agreement {
             print(&recordings::agreement(agreement))?;
         }
@@ -394,17 +396,43 @@ fn stop_on_interrupt() -> Result<Arc<AtomicBool>, End> {
     Ok(stop)
 }
 
-/// Whether all files could be written, before any work.
+/// Whether all files could be written and none is what is read or another one, before any work.
 fn check_outputs(arguments: &Arguments) -> Result<(), End> {
-    check_writable("--json", arguments.json.as_deref())?;
+    let files = &arguments.recordings;
     report::check(arguments.report.as_deref())?;
-    record::check(&arguments.recordings)?;
-    viewer::check(arguments)?;
-    check_writable("--log", arguments.recordings.log.as_deref())?;
-    for path in &arguments.certificate {
-        check_writable("--certificate", Some(path))?;
-    }
-    Ok(())
+    let reference = arguments.verify.as_ref();
+    let reference = reference.map(|named| verify::file(arguments, named.as_deref()));
+    let inputs = [
+        ("--model", Some(&arguments.model)),
+        ("--image", arguments.image.as_ref()),
+        ("--verify", reference.as_ref()),
+        ("--replay", files.replay.as_ref()),
+        ("--encode", files.encode.as_ref()),
+        ("--plans", files.plans.as_ref()),
+    ];
+    let outputs = [
+        ("--json", arguments.json.as_ref()),
+        ("--report", arguments.report.as_ref()),
+        ("--log", files.log.as_ref()),
+    ];
+    let certificates = arguments.certificate.iter();
+    let certificates = certificates.map(|path| ("--certificate", Some(path)));
+    let outputs = given(outputs.into_iter().chain(certificates));
+    let film = given([("--record", files.record.as_ref())]);
+    output::apart(&given(inputs), &[&outputs[..], &film].concat()).map_err(refused)?;
+    output::check(&[], &outputs).map_err(refused)?;
+    record::check(files)?;
+    viewer::check(arguments)
+}
+
+/// The files that were named.
+fn given<'p>(
+    files: impl IntoIterator<Item = (&'p str, Option<&'p PathBuf>)>,
+) -> Vec<output::Named<'p>> {
+    let files = files.into_iter();
+    files
+        .filter_map(|(option, path)| Some((option, path?.as_path())))
+        .collect()
 }
 
 /// Checks what needs no file; returns the number of threads.
@@ -458,13 +486,7 @@ fn progress(episodes: usize) -> ProgressBar {
 
 /// A progress bar over other things.
 fn progress_over(count: usize, things: &str) -> ProgressBar {
-    let bar = ProgressBar::new(count as u64);
-    let style = ProgressStyle::with_template(&format!(
-        "{{bar:40}} {{pos}}/{{len}} {things}, {{elapsed}} elapsed, {{eta}} left {{msg}}"
-    ));
-    bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
-    bar.enable_steady_tick(Duration::from_millis(200));
-    bar
+    command::progress(count, things)
 }
 
 /// Runs all episodes behind a progress bar, until `stop` is raised.

@@ -2,7 +2,7 @@
 
 use std::ffi::OsStr;
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use askama::Template as _;
@@ -24,10 +24,14 @@ pub fn reference(arguments: &Arguments) -> Result<Option<Reference>, End> {
     let Some(named) = &arguments.verify else {
         return Ok(None);
     };
-    let path = named
-        .clone()
-        .unwrap_or_else(|| arguments.model.with_extension("reference.json"));
+    let path = file(arguments, named.as_deref());
     Reference::open(&path).map(Some).map_err(refused)
+}
+
+/// The reference's file: the one that is named, else the one beside the model.
+pub fn file(arguments: &Arguments, named: Option<&Path>) -> PathBuf {
+    let beside = || arguments.model.with_extension("reference.json");
+    named.map_or_else(beside, Path::to_owned)
 }
 
 /// Makes `evaluation` the reference's: seed, decision rule, episodes and traces.
@@ -77,7 +81,7 @@ pub fn run(
     for path in certificates {
         let written = if path.extension() == Some(OsStr::new("html")) {
             let page = Page::new(&certificate).render().map_err(refused)?;
-            output::write(page.as_bytes(), path)
+            output::write(path, page.as_bytes())
         } else {
             output::write_json(&certificate, path)
         };

@@ -13,7 +13,7 @@ use mujoco_rs::prelude::MjtObjBase;
 use mujoco_rs::wrappers::{MjData, MjModel};
 use thiserror::Error;
 
-use crate::assets::{MissingAssets, asset};
+use crate::assets::{MissingAssets, OtherMujoco, asset, check_mujoco, remedy};
 use crate::environment::{
     ActionError, Completion, Environment, EpisodeSeed, Stage, View, check_action,
 };
@@ -49,8 +49,11 @@ pub enum SceneError {
     /// The assets were not set up.
     #[error(transparent)]
     Missing(#[from] MissingAssets),
+    /// Another MuJoCo is loaded.
+    #[error(transparent)]
+    Version(#[from] OtherMujoco),
     /// MuJoCo refuses the scene.
-    #[error("MuJoCo cannot load {path}: {reason} (run \"make setup\" to restore the assets)")]
+    #[error("MuJoCo cannot load {path}: {reason}; {remedy}", remedy = remedy(reason))]
     Refused {
         /// The scene's file.
         path: String,
@@ -68,6 +71,7 @@ pub struct Scene {
 impl Scene {
     /// Loads the scene from the folder that `make setup` fills, see [`crate::assets::vendor_dir`].
     pub fn load(vendor: &Path) -> Result<Self, SceneError> {
+        check_mujoco()?;
         let path = asset(vendor, SCENE)?;
         let refused = |reason: String| SceneError::Refused {
             path: path.display().to_string(),
@@ -81,9 +85,10 @@ impl Scene {
                 model.ffi().nu
             )));
         }
-        Ok(Self {
-            model: Arc::new(model),
-        })
+        let model = Arc::new(model);
+        // Every worker needs a state of its own; without memory for one there is nothing to begin.
+        MjData::try_new(Arc::clone(&model)).map_err(|error| refused(error.to_string()))?;
+        Ok(Self { model })
     }
 }
 

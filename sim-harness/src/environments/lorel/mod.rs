@@ -18,7 +18,7 @@ use mujoco_rs::prelude::{MjtObjBase, MjtState};
 use mujoco_rs::wrappers::{MjData, MjModel, MjSpec};
 use thiserror::Error;
 
-use crate::assets::{MissingAssets, asset};
+use crate::assets::{MissingAssets, OtherMujoco, asset, check_mujoco, remedy};
 use crate::environment::{
     ActionError, Completion, Environment, EpisodeSeed, Stage, View, check_action,
 };
@@ -61,8 +61,11 @@ pub enum SceneError {
     /// The assets were not set up.
     #[error(transparent)]
     Missing(#[from] MissingAssets),
+    /// Another MuJoCo is loaded.
+    #[error(transparent)]
+    Version(#[from] OtherMujoco),
     /// MuJoCo refuses the scene.
-    #[error("MuJoCo cannot load the LOReL table: {0} (run \"make setup\" to restore the assets)")]
+    #[error("MuJoCo cannot load the LOReL table: {0}; {remedy}", remedy = remedy(.0))]
     Refused(String),
 }
 
@@ -76,6 +79,7 @@ pub struct Scene {
 impl Scene {
     /// Loads the scene with the meshes in the folder that `make setup` fills, see [`crate::assets::vendor_dir`].
     pub fn load(vendor: &Path) -> Result<Self, SceneError> {
+        check_mujoco()?;
         asset(vendor, ONE_ASSET)?;
         let refused = |reason: String| SceneError::Refused(reason);
         let mut scene =
@@ -88,8 +92,11 @@ impl Scene {
         let model = scene
             .compile()
             .map_err(|error| refused(error.to_string()))?;
+        let model = Arc::new(model);
+        // Every worker needs a state of its own; without memory for one there is nothing to begin.
+        MjData::try_new(Arc::clone(&model)).map_err(|error| refused(error.to_string()))?;
         Ok(Self {
-            model: Arc::new(model),
+            model,
             postures: (0..=POSTURES).map(|_| OnceLock::new()).collect(),
         })
     }

@@ -21,7 +21,7 @@ use crate::trace::{Step, Trace};
 
 /// Reads a log as [`super::write`] writes it; messages of other topics are passed over.
 pub fn read(path: &Path) -> Result<Log, LogError> {
-    let bytes = std::fs::read(path)?;
+    let bytes = lads_host::input::read(path)?;
     whole(&bytes)?;
     let (origin, episodes) = origin(&bytes)?;
     let mut flights = Vec::new();

@@ -1,0 +1,136 @@
+"""What the small random policies of every family share: a made-up bench, its instructions, sizes, and parts of networks.
+
+They exist to prove that the runtime runs a family: networks of the family's shape in PyTorch, with random weights, as the entries that
+the contract names. Invariant: the same kind and seed give the same bundle.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from .. import bundle, config, contract as contracts, graphs, language, random_policy
+from ..model import HighLevelPolicy, Normalizer
+
+ENVIRONMENT = {
+    "id": "random-bench",
+    "version": "1",
+    "control_period_s": 0.02,
+    "quaternion_order": "none",
+    "reference": "velocity around the observed joint position",
+    "observation": [
+        *({"name": f"joint{n}", "unit": "rad", "min": -2.0 - n / 4, "max": 2.0, "joint": f"joint{n}", "interface": "position"} for n in range(1, 5)),
+        *({"name": f"joint{n}_velocity", "unit": "rad/s", "min": -8.0, "max": 8.0, "joint": f"joint{n}", "interface": "velocity"} for n in range(1, 4)),
+        {"name": "drawer", "unit": "m", "min": -0.1, "max": 0.6, "joint": "drawer", "interface": "position"},
+    ],
+    "action": [
+        {"name": f"joint{n}_velocity", "unit": "1", "min": -1.0, "max": 1.0 - n / 10, "joint": f"joint{n}", "interface": "velocity", "scale": 2.0, "physical_unit": "rad/s"}
+        for n in range(1, 4)
+    ],
+}
+INSTRUCTIONS = [
+    {"id": "open", "text": "open the drawer slowly", "sub_tasks": ["drawer"], "split": "seen"},
+    {"id": "close", "text": "close it", "sub_tasks": ["drawer"], "split": "seen"},
+    {"id": "turn", "text": "turn the lever left now", "sub_tasks": ["lever"], "split": "unseen"},
+]
+WORDS = language.encode(config.Language("random-12", -1, False), [row["text"] for row in INSTRUCTIONS])
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of the networks; the names are the configuration's."""
+
+    hidden: int = 32
+    layers: int = 2
+    heads: int = 4
+    steps: int = 40
+    horizon: int = 4
+    codes: int = 6
+    plan: int = 5
+    window: int = 3
+
+    @property
+    def observation(self):
+        return len(ENVIRONMENT["observation"])
+
+    @property
+    def action(self):
+        return len(ENVIRONMENT["action"])
+
+    @property
+    def transformer(self):
+        return config.HighLevel(self.hidden, self.layers, self.heads, 0.0, self.steps, 0.0)
+
+    @property
+    def network(self):
+        return {"layers": self.layers, "heads": self.heads, "head_dim": self.hidden // self.heads}
+
+    @property
+    def codebook(self):
+        return {"size": self.codes, "dim": self.plan}
+
+
+class Codes(nn.Module):
+    """The latent plans [M, D]."""
+
+    def __init__(self, sizes):
+        super().__init__()
+        self.table = nn.Parameter(torch.zeros(sizes.codes, sizes.plan))
+
+
+def normalizer():
+    """Statistics of the bench's observations."""
+    found = Normalizer(len(ENVIRONMENT["observation"]))
+    random_policy.place_normalizer(found, ENVIRONMENT["observation"])
+    return found
+
+
+def high_level(sizes, outputs, actions=True):
+    """The transformer that hears the words; its head has so many outputs. Without `actions` its history is of observations only."""
+    return HighLevelPolicy(sizes.transformer, WORDS.dim, sizes.observation, sizes.action if actions else None, outputs)
+
+
+def randomize(policy, seed):
+    """Random weights in all parts of a policy: plans differ from step to step, and few actions are at their limits."""
+    generator = torch.Generator().manual_seed(seed)
+    random_policy.draw_weights(policy, generator)
+    with torch.no_grad():
+        for module in policy.modules():
+            if isinstance(module, nn.Embedding):
+                module.weight.copy_(0.3 * torch.randn(module.weight.shape, generator=generator))
+            for head in (getattr(module, name) for name in ("head", "inverse_last") if hasattr(module, name)):
+                head.weight.mul_(0.3 if head.out_features == len(ENVIRONMENT["action"]) else 2)
+    return policy.eval()
+
+
+def graph_of(policy):
+    """A graph with the table of instructions and the entry that hears one."""
+    graph = graphs.Graph()
+    graphs.known_instructions(graph, policy.high_level, WORDS)
+    return graph
+
+
+def select_at_every_token(graph, policy):
+    """`high_level/step` of a policy whose history is of observations: logits at every step, the first too."""
+    entry, x, embedded = graphs.high_level_state(graph, policy.high_level, policy.normalizer)
+    graphs.head(entry, x, policy.high_level.head, "logits")
+    return entry, embedded
+
+
+def contract(family, sizes, seed, noise=None, segment=None):
+    """The contract of a policy on the bench with instructions."""
+    return bundle.describe(
+        family,
+        ENVIRONMENT,
+        INSTRUCTIONS,
+        WORDS,
+        {"setting": f"random {family['kind']}", "seed": seed},
+        channels=contracts.channels(ENVIRONMENT, words=[WORDS.max_words, WORDS.dim], noise=noise, segment=segment),
+        context={"words": WORDS.max_words, "steps": sizes.steps, "beyond": "restart"},
+        network=sizes.network,
+    )
+
+
+def argmax(rule="argmax"):
+    """A decision without chance."""
+    return {"rule": rule, "temperature": 1.0, "seed": 0}

@@ -1,0 +1,121 @@
+//! Warming changes nothing, whatever the state of the context, and runs what only later steps run.
+
+mod support;
+
+use lads_core::Instruction;
+use lads_image::records::Beyond;
+use support::assemble::parts;
+use support::{Image, Memory, Model, Random, Spec, given, observe, shapes};
+
+/// The bits of what an episode gives, with or without warming before every step.
+fn episode(image: &Image, warms: bool) -> Vec<u32> {
+    let policy = image.policy();
+    let mut memory = Memory::for_policy(&policy);
+    let mut controller = memory.controller(&policy);
+    if warms {
+        controller.warm();
+    }
+    let mut random = Random(1);
+    let mut bits = Vec::new();
+    for step in 0..30 {
+        if step % 17 == 0 && policy.contract().instruction_count() > 0 {
+            controller
+                .set_instruction(Instruction::Id(1))
+                .expect("the instruction is known");
+        }
+        if warms {
+            controller.warm();
+        }
+        let mut action = vec![0.0; policy.contract().action_len()];
+        let inputs = observe(&policy, &mut random);
+        if controller.step_with(&given(&inputs), &mut action).is_err() {
+            if warms {
+                controller.warm();
+            }
+            controller.reset();
+        }
+        bits.extend(
+            action
+                .iter()
+                .chain(controller.scores())
+                .map(|x| x.to_bits()),
+        );
+    }
+    bits
+}
+
+#[test]
+fn nothing_changes() {
+    let mut all = shapes::all();
+    all.push(("lads", parts(&Model::random(Spec::TINY, 11))));
+    for (name, mut parts) in all {
+        for beyond in [Beyond::Restart, Beyond::Refuse] {
+            parts.contract.beyond = beyond;
+            let image = parts.image();
+            assert_eq!(
+                episode(&image, true),
+                episode(&image, false),
+                "{name}, {beyond:?}"
+            );
+        }
+    }
+}
+
+/// A full context that refuses has no step to come; the instruction's rows of the cache stay what they are.
+#[test]
+fn a_full_context_keeps_its_instruction() {
+    let mut parts = parts(&Model::random(Spec::TINY, 11));
+    parts.contract.beyond = Beyond::Refuse;
+    let image = parts.image();
+    let second_episode = |warms: bool| {
+        support::with_controller(&image, |controller| {
+            let mut random = Random(3);
+            let mut seen = Vec::new();
+            for step in 0..16 {
+                if step == 8 {
+                    assert!(controller.step(&[0.0; 3], &mut [0.0; 2]).is_err());
+                    if warms {
+                        controller.warm();
+                    }
+                    controller.reset();
+                }
+                let mut action = [0.0; 2];
+                let report = controller
+                    .step(&random.vec(3, 1.0), &mut action)
+                    .expect("the context has room");
+                seen.push((report, action, controller.scores().to_vec()));
+            }
+            seen
+        })
+    };
+    assert_eq!(second_episode(true), second_episode(false));
+}
+
+/// Before the first step, the programs of later steps have run too: a step appends two rows, and the first step one.
+#[test]
+fn before_the_first_step_later_programs_run() {
+    let spec = Spec::TINY;
+    let image = parts(&Model::random(spec, 11)).image();
+    let policy = image.policy();
+    let rows = |warms: bool| {
+        let mut memory = Memory::for_policy(&policy);
+        let mut controller = memory.controller(&policy);
+        controller
+            .set_instruction(Instruction::Id(0))
+            .expect("the instruction is known");
+        if warms {
+            controller.warm();
+        }
+        // The values of the first layer lie behind its keys, which take two blocks of sixteen tokens.
+        let width = spec.width();
+        let values = &memory.state[32 * width..];
+        [0, 1, 2].map(|i| {
+            let row = spec.words_len + i;
+            values[row * width..(row + 1) * width]
+                .iter()
+                .any(|&x| x != 0.0)
+        })
+    };
+    assert_eq!(rows(false), [false, false, false]);
+    assert_eq!(rows(true), [true, true, false]);
+}

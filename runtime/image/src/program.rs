@@ -1,0 +1,144 @@
+//! One compiled entry graph: a list of ops over spans, checked once, then run without looking back.
+//!
+//! Invariants of a [`Program`]: every op decodes, every span lies inside its space, every length is what the shape says, what
+//! an op writes overlaps nothing that it reads (see [`op`](crate::op)), and every port lies inside the arena. Only
+//! [`Program::new_checked`] makes one, so running can fail on two accounts alone: an index that the caller or the data chose, and a
+//! KV cache without room.
+
+use core::error::Error;
+use core::fmt;
+
+use lads_kernels::flushed;
+
+use crate::check::{Checker, Fault, Spaces};
+use crate::codec::Reader;
+use crate::machine::{ExecError, Machine};
+use crate::op::{OP_WORDS, Op, Work};
+use crate::place::Place;
+
+/// A checked view on one program of an image.
+#[derive(Debug, Clone, Copy)]
+pub struct Program<'a> {
+    ops: &'a [[u32; OP_WORDS]],
+    arena_len: u32,
+    tokens: u32,
+    rows: usize,
+    cache_end: u64,
+}
+
+impl<'a> Program<'a> {
+    /// Checks the ops of a program and the places of its ports. A run appends `tokens` rows to the KV cache.
+    pub fn new_checked(
+        ops: &'a [[u32; OP_WORDS]],
+        arena_len: u32,
+        tokens: u32,
+        spaces: Spaces,
+        ports: impl Iterator<Item = Place>,
+    ) -> Result<Self, ProgramError> {
+        let error = |op, fault| ProgramError { op, fault };
+        let checker = Checker::new(spaces, arena_len, tokens);
+        for (i, words) in ops.iter().enumerate() {
+            let at = Some(i as u32);
+            let op = Op::decode(words).ok_or_else(|| {
+                let left_out = Op::is_left_out(words);
+                error(at, if left_out { Fault::LeftOut } else { Fault::Encoding })
+            })?;
+            op.check(&checker).map_err(|fault| error(at, fault))?;
+        }
+        for port in ports {
+            checker.place(port).map_err(|fault| error(None, fault))?;
+        }
+        let cache_end = checker.finish().map_err(|fault| error(None, fault))?;
+        Ok(Self {
+            ops,
+            arena_len,
+            tokens,
+            rows: spaces.rows,
+            cache_end,
+        })
+    }
+
+    /// A view without the checks, for ops that [`new_checked`](Self::new_checked) has already seen in these spaces.
+    #[inline]
+    pub fn trusted(ops: &'a [[u32; OP_WORDS]], arena_len: u32, tokens: u32, rows: usize) -> Self {
+        Self {
+            ops,
+            arena_len,
+            tokens,
+            rows,
+            cache_end: u64::from(tokens),
+        }
+    }
+
+    /// Runs the ops, subnormal numbers taken as zero. The ports' values lie in the machine: what is read is set before the run,
+    /// results are there afterwards.
+    pub fn run(&self, weights: &[f32], machine: &mut Machine) -> Result<(), ExecError> {
+        let needed = machine.past.saturating_add(self.tokens());
+        if self.cache_end > 0 && needed > self.rows {
+            return Err(ExecError::Full {
+                rows: self.rows,
+                needed,
+            });
+        }
+        flushed(|| self.ops().try_for_each(|op| op.run(weights, machine)))
+    }
+
+    /// Words of the KV cache up to the end of what the program reads or appends; 0 for a program that knows no cache.
+    #[inline]
+    pub fn cache_end(&self) -> u64 {
+        self.cache_end
+    }
+
+    /// Elements of arena that a run needs.
+    #[inline]
+    pub fn arena_len(&self) -> usize {
+        self.arena_len as usize
+    }
+
+    /// Tokens that a run appends to the KV cache.
+    #[inline]
+    pub fn tokens(&self) -> usize {
+        self.tokens as usize
+    }
+
+    /// True for a program without ops.
+    #[inline]
+    pub fn is_empty(&self) -> bool {
+        self.ops.is_empty()
+    }
+
+    /// The ops, in the order in which they run.
+    #[inline]
+    pub fn ops(&self) -> impl Iterator<Item = Op> + 'a {
+        // Decoded once already, with the zeros behind each.
+        self.ops
+            .iter()
+            .filter_map(|words| Op::take(&mut Reader::new(words)))
+    }
+
+    /// What a run costs at the largest context.
+    pub fn work(&self) -> Work {
+        self.ops()
+            .fold(Work::default(), |sum, op| sum.and(op.work()))
+    }
+}
+
+/// Why a program was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ProgramError {
+    /// The op, counted from the program's first; `None` for its ports and the length of its arena.
+    pub op: Option<u32>,
+    /// What is wrong.
+    pub fault: Fault,
+}
+
+impl fmt::Display for ProgramError {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self.op {
+            Some(op) => write!(f, "op {op}: {}", self.fault),
+            None => self.fault.fmt(f),
+        }
+    }
+}
+
+impl Error for ProgramError {}

@@ -1,0 +1,118 @@
+//! A small LADS policy for the tests of this crate: random weights, the network written naively in `f64` straight from its
+//! definition, and the same network assembled by hand from ops into programs.
+#![allow(dead_code, reason = "each test binary uses its own part")]
+
+pub mod assemble;
+pub mod model;
+
+use lads_image::op::{INT_SLOTS, Place};
+use lads_image::{ExecError, Isa, Machine};
+
+pub use assemble::{Assembled, Kind};
+pub use model::{Model, Spec};
+
+/// A policy that is smaller than tiny: every word of it is changed.
+pub fn sound() -> Assembled {
+    let spec = Spec {
+        layers: 1,
+        hidden: 6,
+        head_dim: 3,
+        codebook_len: 3,
+        plan_len: 2,
+        steps: 3,
+        horizon: 2,
+        ..Spec::TINY
+    };
+    assemble::assemble(&Model::random(spec, 2))
+}
+
+/// Runs the programs of a policy as a controller does, one KV cache under all of them.
+pub struct Runner<'p> {
+    policy: &'p Assembled,
+    arena: Vec<f32>,
+    cache: Vec<f32>,
+    ints: [u32; INT_SLOTS],
+    /// Valid rows of the cache.
+    pub past: usize,
+}
+
+impl<'p> Runner<'p> {
+    /// Memory full of what must not matter.
+    pub fn new(policy: &'p Assembled) -> Self {
+        Self {
+            policy,
+            arena: Vec::new(),
+            cache: vec![f32::NAN; policy.cache_len as usize],
+            ints: [0; INT_SLOTS],
+            past: 0,
+        }
+    }
+
+    /// Runs one program, a span that is set too short filled up with zeros. An integer is a float without fraction.
+    pub fn run(&mut self, kind: Kind, inputs: &[(&str, &[f32])]) -> Result<(), ExecError> {
+        let draft = self.policy.draft(kind);
+        let words = self.policy.encode(kind);
+        let program = self
+            .policy
+            .check(kind, &words)
+            .expect("the program is sound");
+        self.arena = vec![f32::NAN; program.arena_len()];
+        for (port, place) in &draft.inputs {
+            let (_, values) = inputs
+                .iter()
+                .find(|(name, _)| name == port)
+                .expect("every input is set");
+            match place {
+                Place::Span(span) => {
+                    let to = &mut self.arena[span.range()];
+                    to.fill(0.0);
+                    to[..values.len()].copy_from_slice(values);
+                }
+                Place::Int(slot) => self.ints[usize::from(slot.0)] = values[0] as u32,
+            }
+        }
+        let mut machine = Machine {
+            arena: &mut self.arena,
+            cache: &mut self.cache,
+            ints: self.ints,
+            past: self.past,
+            isa: Isa::detect(),
+        };
+        program.run(&self.policy.weights, &mut machine)?;
+        self.ints = machine.ints;
+        self.past += program.tokens();
+        Ok(())
+    }
+
+    /// An output of the program that ran last.
+    pub fn output(&self, kind: Kind, port: &str) -> Vec<f32> {
+        let outputs = &self.policy.draft(kind).outputs;
+        let (_, place) = outputs
+            .iter()
+            .find(|(name, _)| *name == port)
+            .expect("the program has the output");
+        match place {
+            Place::Span(span) => self.arena[span.range()].to_vec(),
+            Place::Int(slot) => vec![self.ints[usize::from(slot.0)] as f32],
+        }
+    }
+}
+
+/// A small linear congruential generator (Knuth's MMIX constants), the same on every platform.
+#[derive(Clone)]
+pub struct Random(pub u64);
+
+impl Random {
+    /// Uniform in -1..1.
+    pub fn next(&mut self) -> f32 {
+        self.0 = self
+            .0
+            .wrapping_mul(6364136223846793005)
+            .wrapping_add(1442695040888963407);
+        (self.0 >> 40) as f32 / (1_u64 << 23) as f32 - 1.0
+    }
+
+    pub fn vec(&mut self, len: usize, scale: f32) -> Vec<f32> {
+        (0..len).map(|_| self.next() * scale).collect()
+    }
+}
