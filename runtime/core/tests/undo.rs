@@ -24,8 +24,9 @@ fn all(fused: bool) -> Vec<(&'static str, Parts)> {
     let mut all = shapes::all();
     all.push(("lads", tiny()));
     if fused {
-        all.iter_mut()
-            .for_each(|(_, parts)| *parts = with_fuse(parts.clone()));
+        for (_, parts) in &mut all {
+            *parts = with_fuse(parts.clone());
+        }
     }
     all
 }
@@ -44,7 +45,7 @@ fn with_fuse(mut parts: Parts) -> Parts {
         x: x.into(),
         y,
     });
-    fuse.to_state(burnt, y);
+    fuse.gives_state(burnt, y);
     let fuse = parts.entry(fuse.finish());
     let last = parts
         .calls
@@ -101,7 +102,9 @@ fn episode(image: &Image, mut between: impl FnMut(&mut Controller, &Policy, usiz
 fn halve(inputs: &mut [(ChannelId, support::Values)]) {
     for (_, values) in inputs {
         if let support::Values::F32(values) = values {
-            values.iter_mut().for_each(|x| *x *= 0.5);
+            for value in values {
+                *value *= 0.5;
+            }
         }
     }
 }
@@ -237,7 +240,7 @@ fn a_ring_is_as_it_was_after_a_failed_step() {
         let rows = read.state(0, 2 * shapes::MEMORY);
         let index = read.int(lads_image::records::SourceKind::Selected, 0, 0);
         let row = read.gather(rows, 2, index, 0);
-        read.to_channel(shapes::ACTION, row);
+        read.gives_channel(shapes::ACTION, row);
         let read = parts.entry(read.finish());
         parts.calls.push(Call::on(Event::Follow, read));
         if name == "clear" {
