@@ -30,7 +30,10 @@ const MAX_STEPS: u32 = 1 << 14;
 
 /// The most entries and the most calls of an image, and the most ports on a side of an entry: going through a context takes time
 /// in proportion.
-const MAX_RECORDS: usize = 128;
+const MAX_RECORDS: usize = 64;
+
+/// What a run of each entry costs, in multiply-adds; one more for every op.
+type Work = [u64; MAX_RECORDS];
 
 /// The most runs of one call.
 const MAX_REPEAT: u32 = 1 << 16;
@@ -70,9 +73,9 @@ pub(crate) fn check(tables: &Tables, contract: &Contract) -> Checked<Sizes> {
     };
     few(tables)?;
     states(tables, &mut sizes)?;
-    entries(tables, contract, &mut sizes)?;
+    let work = entries(tables, contract, &mut sizes)?;
     calls(tables, contract, &mut sizes)?;
-    go_through(tables, contract, &mut sizes)?;
+    go_through(tables, contract, &work, &mut sizes)?;
     used(tables)?;
     if contract.worst_work() != sizes.work {
         return Err(ScheduleError::Work {
@@ -180,8 +183,8 @@ fn is_instructed(tables: &Tables, state: usize) -> bool {
 }
 
 /// Every entry is a sound program with sound ports, and every KV cache is as large as what the programs use of it.
-fn entries(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked {
-    let mut used = [0; MAX_ROW_STATES];
+fn entries(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked<Work> {
+    let (mut work, mut used) = ([0; MAX_RECORDS], [0; MAX_ROW_STATES]);
     for i in 0..tables.entries_len() {
         let at = i as u32;
         let entry = tables.entry(i).ok_or(ScheduleError::Entry { entry: at })?;
@@ -232,6 +235,10 @@ fn entries(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked {
             }
         }
         sizes.arena_len = sizes.arena_len.max(program.arena_len());
+        if let Some(work) = work.get_mut(i) {
+            let products = program.work().multiply_adds;
+            *work = products.saturating_add(u64::from(entry.ops_len));
+        }
     }
     for (i, end) in (0_u32..).zip(used) {
         let kv = tables
@@ -241,7 +248,7 @@ fn entries(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked {
             return Err(ScheduleError::State { state: i });
         }
     }
-    Ok(())
+    Ok(work)
 }
 
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -420,6 +427,7 @@ fn event_reads(event: Event, role: Role) -> bool {
 struct Walk<'t, 'a> {
     tables: &'t Tables<'a>,
     contract: &'t Contract<'a>,
+    costs: &'t Work,
     bounded: bool,
     /// Valid rows of rings and KV caches.
     rows: [u32; MAX_ROW_STATES],
@@ -470,11 +478,7 @@ impl Walk<'_, '_> {
         if entry.cache != records::NONE {
             self.append(&entry, call.event, times, refused)?;
         }
-        let program = Program::trusted(self.tables.ops(&entry), entry.arena_len, entry.tokens, 0);
-        let run = program
-            .work()
-            .multiply_adds
-            .saturating_add(u64::from(entry.ops_len));
+        let run = self.costs.get(call.entry as usize).copied().unwrap_or(0);
         self.work = self
             .work
             .saturating_add(run.saturating_mul(u64::from(most)));
@@ -619,7 +623,7 @@ impl Chain {
 }
 
 /// Goes through every kind of event, and through every step of a context.
-fn go_through(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked {
+fn go_through(tables: &Tables, contract: &Contract, costs: &Work, sizes: &mut Sizes) -> Checked {
     let bounded = contract.context_steps().is_some();
     let steps = match contract.context_steps() {
         Some(steps) => steps as u64,
@@ -631,6 +635,7 @@ fn go_through(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checke
     let mut walk = Walk {
         tables,
         contract,
+        costs,
         bounded,
         rows: [0; MAX_ROW_STATES],
         most: [0; MAX_ROW_STATES],

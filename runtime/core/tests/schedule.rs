@@ -338,6 +338,20 @@ fn a_context_is_no_longer_than_can_be_gone_through() {
     );
 }
 
+/// The ops of an entry are counted once, not at each of the steps that run it: this takes no minutes.
+#[test]
+fn long_programs_are_gone_through_once() {
+    let many = shapes::memoryless().sealed_fault(|parts| {
+        parts.contract.context_steps = 1 << 14;
+        let long = parts.entries[0].ops[1];
+        parts.entries[0]
+            .ops
+            .extend(std::iter::repeat_n(long, 20_000));
+        parts.calls.extend(std::iter::repeat_n(Call::step(0), 60));
+    });
+    assert_eq!(many, None);
+}
+
 /// An image of some megabytes must not take hours to open.
 #[test]
 fn a_schedule_is_no_longer_than_can_be_gone_through() {

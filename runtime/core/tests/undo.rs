@@ -293,3 +293,49 @@ fn resize(parts: &mut Parts, rows: u32) {
         }
     }
 }
+
+/// The one call whose failure is not undone leaves the controller without an instruction, and nothing for the next one.
+#[test]
+fn an_instruction_that_fails_leaves_none() {
+    let image = shapes::recurrent().image();
+    let fresh = episode(&image, |_, _, _| ());
+    let disturbed = episode(&image, |controller, _, step| {
+        if step != 0 && step != 13 {
+            return;
+        }
+        let refused = controller.set_instruction(Instruction::Words(&[3e38; 4]));
+        assert_eq!(refused, Err(InstructionError::Run(RunError::NotFinite)));
+        assert!(!controller.is_instructed());
+        let refused = controller.step(&[0.0; 2], &mut [0.0; 2]);
+        assert_eq!(refused, Err(StepError::NoInstruction));
+        let id = u32::from(step == 13);
+        controller
+            .set_instruction(Instruction::Id(id))
+            .expect("it is known");
+    });
+    assert_eq!(fresh, disturbed);
+}
+
+/// Words so large that nothing can be computed fill the cache with what is not finite; the next instruction does not see it.
+#[test]
+fn what_a_hopeless_instruction_left_in_the_cache_is_not_read() {
+    let image = tiny().image();
+    let fresh = episode(&image, |_, _, _| ());
+    let disturbed = episode(&image, |controller, _, step| {
+        if step != 0 && step != 13 {
+            return;
+        }
+        controller
+            .set_instruction(Instruction::Words(&[3e38; 16]))
+            .expect("words have no limits");
+        for _ in 0..2 {
+            let refused = controller.step(&[0.1; 3], &mut [0.0; 2]);
+            assert_eq!(refused, Err(StepError::Run(RunError::NotFinite)));
+        }
+        let id = u32::from(step == 13);
+        controller
+            .set_instruction(Instruction::Id(id))
+            .expect("it is known");
+    });
+    assert_eq!(fresh, disturbed);
+}
