@@ -9,6 +9,12 @@ def policies():
     return {"PyTorch": Torch, "OpenVINO": OpenVino}
 
 
+def limits(contract):
+    """The action's lowest and highest values."""
+    action = next(row for row in contract["channels"] if row["role"] == "action")
+    return tuple([element[key] for element in action["elements"]] for key in ("min", "max"))
+
+
 class Torch:
     def __init__(self, model, contract, instruction):
         import torch
@@ -19,7 +25,7 @@ class Torch:
         self.inference = torch.inference_mode()
         self.inference.__enter__()
         self.net = Eager(model, contract)
-        self.low, self.high = (torch.tensor([row[k] for row in contract["action"]]) for k in ("min", "max"))
+        self.low, self.high = (torch.tensor(side) for side in limits(contract))
         self.detail = f"{torch.__version__}, eager, inference mode, 1 thread, keys and values written in place"
 
     def tensor(self, row):
@@ -80,7 +86,7 @@ class OpenVino:
         arrays = {t.name: onnx.numpy_helper.to_array(t) for t in model.graph.initializer}
         self.length = int(arrays["constants/instruction.lengths"][instruction])
         self.known = arrays["weights/instruction.words"][instruction][None].copy()
-        self.low, self.high = (np.array([row[k] for row in contract["action"]], np.float32) for k in ("min", "max"))
+        self.low, self.high = (np.array(side, np.float32) for side in limits(contract))
         self.cache, self.saved = {}, {}
         self.detail = f"{openvino.__version__.split('-')[0]}, Python, f32, 1 thread, latency hint"
 

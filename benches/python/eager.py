@@ -18,7 +18,7 @@ class Eager:
         arrays = {t.name.removeprefix("weights/"): numpy_helper.to_array(t).copy() for t in model.graph.initializer}
         self.weights = {name: torch.from_numpy(a) for name, a in arrays.items() if a.dtype == np.float32}
         self.lengths = arrays["constants/instruction.lengths"]
-        self.network, self.horizon = contract["network"], contract["horizon"]
+        self.network, self.horizon = contract["network"], contract["family"]["horizon"]
         self.layers, self.heads, self.head_dim = (self.network[k] for k in ("layers", "heads", "head_dim"))
         # The other matrices are stored as [k, n], those of Gemm as [n, k], which is what F.linear wants.
         self.turned = {n: w.T.contiguous() for n, w in self.weights.items() if n.startswith("high_level.") and w.dim() == 2}

@@ -22,7 +22,7 @@ class Worker:
         from contenders import policies
 
         model, contract = load(bundle)
-        self.horizon = contract["horizon"]
+        self.horizon = contract["family"]["horizon"]
         self.policy = policies()[name](model, contract, episode["instruction"])
         self.observations = [self.policy.tensor(row) for row in episode["observations"]]
         self.rows = episode["observations"]

@@ -64,6 +64,9 @@ class Entry:
     def integers(self, name, values):
         return self.graph.constant(f"constants/{name}", np.array(values, np.int64))
 
+    def scalar(self, name, value):
+        return self.graph.constant(f"constants/{name}", np.float32(value))
+
     def gemm(self, x, weight, bias, out):
         """x [m, k] times weight [n, k] (as PyTorch stores it) transposed, plus bias."""
         return self.op("Gemm", [x, weight, bias], out, transB=1)

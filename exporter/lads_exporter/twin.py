@@ -3,7 +3,8 @@
 Golden episodes and tests are made with it; the product's control loop is the Rust core, which shares nothing with this file
 but the contract. Values are bound by their names: a channel's name is that channel, `timestep`, `phase`, `pass` and `index` are the
 controller's integers, `action` or `previous_action` as an input is the last executed action, `past_key_values.*` and `present.*`
-are the keys and values of the entry's level, and every other name is a state. Nothing is taken back after an error.
+are the keys and values of the entry's level, and every other name is a state. Nothing is taken back after an error, and a plan is always
+the one with the largest logit: what a contract's rule `sample` would draw is the runtime's own affair.
 """
 
 from contextlib import suppress
@@ -15,6 +16,7 @@ from onnx.utils import Extractor
 from . import contract as contracts
 from .config import UserError
 from .contract import ACTION, NOISE
+from .normals import Normals
 
 PAST, PRESENT = "past_key_values.", "present."
 PREVIOUS = ("action", "previous_action")
@@ -59,7 +61,7 @@ class Recorded:
     def __init__(self, draws):
         self.draws = np.asarray(draws, np.float32).ravel()
 
-    def fill(self, count):
+    def draw(self, count):
         if count > len(self.draws):
             raise UserError(f"{count} more numbers of noise are asked for, {len(self.draws)} are recorded")
         taken, self.draws = self.draws[:count], self.draws[count:]
@@ -69,7 +71,7 @@ class Recorded:
 class Zero:
     """No noise: the mean plan, or denoising without chance."""
 
-    def fill(self, count):
+    def draw(self, count):
         return np.zeros(count, np.float32)
 
 
@@ -81,8 +83,6 @@ def noise_source(contract):
     given = family["noise"] if "noise" in family else family["decision"]
     if given["rule"] in ("zero", "mean"):
         return Zero()
-    from .normals import Normals
-
     return Normals(given["seed"])
 
 
@@ -111,7 +111,7 @@ class Twin:
     """A policy as its controller runs it: `set_instruction`, `reset`, `step`, and `executed` where another action was taken."""
 
     def __init__(self, model, noise=None):
-        """model: a bundle as ONNX; noise: an object whose `fill(n)` gives n float32 numbers, else the contract's own source."""
+        """model: a bundle as ONNX; noise: an object whose `draw(n)` gives n float32 numbers, else the contract's own source."""
         self.contract = contracts.of(model)
         self.family = self.contract["family"]
         self.entries = {name: Entry(model, name) for name in entries(model)}
@@ -240,7 +240,7 @@ class Twin:
         if port in integers:
             return np.array([integers[port]], np.int64)
         if port == NOISE and NOISE in self.channels:
-            drawn = self.noise.fill(int(np.prod(self.channels[NOISE]["shape"])))
+            drawn = self.noise.draw(int(np.prod(self.channels[NOISE]["shape"])))
             self.draws.append(drawn)
             return drawn.reshape(shape)
         if port in self.observed:

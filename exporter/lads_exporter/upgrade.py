@@ -18,6 +18,7 @@ from safetensors.numpy import load as load_safetensors, save as save_safetensors
 
 from . import bundle, config, contract as contracts, reference
 from .config import UserError
+from .output import write_atomically
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 
@@ -50,7 +51,7 @@ def contract(old, environment=None):
     }
     words = [old["context"]["words"], old["language"]["dim"]]
     instructions = old["instructions"]
-    found = {
+    return {
         "version": contracts.VERSION,
         "family": {"kind": old["kind"], **{key: old[key] for key in ("horizon", "codebook", "decision")}},
         "environment": old["environment"],
@@ -58,13 +59,11 @@ def contract(old, environment=None):
         "channels": contracts.channels(own, words=words, segment=old["horizon"]),
         "context": old["context"],
         "instructions": [{key: row[key] for key in ("id", "text")} for row in instructions],
-        "language": old["language"],
+        "language": {"pooling": "none"} | old["language"],
         "network": old["network"],
         "evaluation": {"instructions": [{key: row[key] for key in ("sub_tasks", "split")} for row in instructions]},
         "provenance": old["provenance"],
     }
-    contracts.check(found)
-    return found
 
 
 def golden(blob):
@@ -100,15 +99,19 @@ def read(path):
     return model, found
 
 
-def model(old, environment=None):
-    """An ONNX model with a contract of version 1 -> its metadata of version 2, in place."""
+def model(old, stated=None, where="the model"):
+    """Rewrites the metadata of an ONNX model with a contract of version 1, in place -> the contract of version 2.
+
+    stated: the contract's `environment` -> the environment file's table, or None.
+    """
     properties = contracts.properties(old)
     try:
         before = json.loads(properties[contracts.KEY])
-        found = contract(before, environment)
+        found = contract(before, stated(before["environment"]) if stated else None)
         blob = golden(properties[contracts.GOLDEN_KEY])
     except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"the contract or the golden episode is not that of version 1 ({type(error).__name__}: {error})") from error
+        raise UserError(f"{where}: the contract or the golden episode is not that of version 1 ({type(error).__name__}: {error})") from error
+    contracts.check(found, where)
     new = properties | {contracts.KEY: json.dumps(found), contracts.GOLDEN_KEY: blob} | bundle.flat_keys(found)
     helper.set_model_props(old, new)
     return found
@@ -125,7 +128,7 @@ def rebind(path, before, after, purpose):
         text = text.replace(before, after)
         if suffix == ".reference.json":
             text = _line(text, "purpose_sha256", purpose)
-        bundle.write_atomically(beside, text.encode())
+        write_atomically(beside, text.encode())
         changed.append(beside.name)
     return changed
 
@@ -142,10 +145,7 @@ def write(path, output=None, environment=None):
     if found["version"] == contracts.VERSION:
         contracts.check(found, path)
         return f"{path}: contract version {contracts.VERSION} already; nothing to do"
-    try:
-        after = model(old, environment_file(found["environment"], environment))
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from error
+    after = model(old, lambda known: environment_file(known, environment), path)
     before = hashlib.sha256(Path(path).read_bytes()).hexdigest()
     sha256 = bundle.save(old, output or path)
     changed = [] if output and Path(output).resolve() != Path(path).resolve() else rebind(path, before, sha256, reference.purpose_sha256(after))

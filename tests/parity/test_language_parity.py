@@ -190,7 +190,7 @@ def test_refusals(cache, tmp_path):
     wrong = refusal(tmp_path / "no", "lorel", "--instruction", "open teh drawer")
     assert "make language" in wrong and "open drawer" in wrong and str(tmp_path / "no") in wrong
     assert "make language" in refusal(tmp_path / "no", "lorel", "--encode-language")
-    assert "open drawer, close drawer" in refusal(cache, "lorel", "--instruction", "shut it", "--sub-tasks", "shut it")
+    assert "open drawer, close drawer" in refusal(cache, "lorel", "--instruction", "pull the drawer out", "--sub-tasks", "shut it")
     other = tmp_path / "other"
     other.mkdir()
     for file in ("encoder.onnx", "tokenizer.json"):

@@ -13,7 +13,8 @@ import pytest
 
 np = pytest.importorskip("numpy")
 onnx = pytest.importorskip("onnx")
-replay = pytest.importorskip("lads_exporter.replay")
+twin = pytest.importorskip("lads_exporter.twin")
+from lads_exporter import contract as contracts  # noqa: E402
 from safetensors.numpy import load  # noqa: E402
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -43,18 +44,23 @@ def act(bundle, instruction, observations):
 @pytest.fixture(params=BUNDLES, ids=lambda path: path.stem)
 def bundle(request):
     model = onnx.load(request.param)
-    metadata = {entry.key: entry.value for entry in model.metadata_props}
-    golden = load(base64.b64decode(metadata["lads.golden"]))
-    return request.param, replay.Bundle(model), json.loads(metadata["lads.contract"]), golden
+    golden = load(base64.b64decode(contracts.properties(model)["lads.golden"]))
+    return request.param, twin.Twin(model), contracts.of(model), golden
+
+
+def open_loop(reference, instruction, golden):
+    """-> what ONNX Runtime does on the golden observations under an instruction, and these."""
+    observations = golden["channel.observation"]
+    return twin.open_loop(reference, instruction, {"observation": observations}), observations
 
 
 def test_golden_episode(bundle):
     path, reference, contract, golden = bundle
     index = int(golden["instruction"][0])
-    plans, actions, _ = reference.open_loop(contract, index, golden["observations"])
-    ours, our_actions = act(path, contract["instructions"][index]["id"], golden["observations"])
-    assert (ours == plans).all() and (ours == golden["plans"]).all()
-    assert np.abs(our_actions - actions).max() <= TOLERANCE
+    rollout, observations = open_loop(reference, index, golden)
+    ours, our_actions = act(path, contract["instructions"][index]["id"], observations)
+    assert (ours == rollout.selected).all() and (ours == golden["selected"]).all()
+    assert np.abs(our_actions - np.stack(rollout.actions)).max() <= TOLERANCE
     assert np.abs(our_actions - golden["actions"]).max() <= TOLERANCE
 
 
@@ -67,11 +73,11 @@ def test_other_instructions_on_the_same_observations(bundle, offset):
     """
     path, reference, contract, golden = bundle
     index = (int(golden["instruction"][0]) + offset) % len(contract["instructions"])
-    plans, actions, logits = reference.open_loop(contract, index, golden["observations"])
-    ordered = np.sort(logits[:: contract["horizon"]], axis=1)
-    close = np.flatnonzero(ordered[:, -1] - ordered[:, -2] < TOLERANCE)
-    stop = close[0] * contract["horizon"] if len(close) else len(plans)
-    assert stop > contract["horizon"], "a comparison of nothing"
-    ours, our_actions = act(path, contract["instructions"][index]["id"], golden["observations"])
-    assert (ours[:stop] == plans[:stop]).all()
-    assert np.abs(our_actions[:stop] - actions[:stop]).max() <= TOLERANCE
+    rollout, observations = open_loop(reference, index, golden)
+    close = np.flatnonzero(np.array(rollout.margins) < TOLERANCE)
+    period = contracts.period(contract)
+    stop = close[0] * period if len(close) else len(observations)
+    assert stop > period, "a comparison of nothing"
+    ours, our_actions = act(path, contract["instructions"][index]["id"], observations)
+    assert (ours[:stop] == rollout.selected[:stop]).all()
+    assert np.abs(our_actions[:stop] - np.stack(rollout.actions)[:stop]).max() <= TOLERANCE

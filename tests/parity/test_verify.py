@@ -16,7 +16,7 @@ import pytest
 
 np = pytest.importorskip("numpy")
 onnx = pytest.importorskip("onnx")
-replay = pytest.importorskip("lads_exporter.replay")
+exporter = pytest.importorskip("lads_exporter.bundle")
 from onnx import helper, numpy_helper  # noqa: E402
 from safetensors.numpy import load, save  # noqa: E402
 
@@ -84,8 +84,13 @@ def joints_swapped(model):
 def horizon_off(model):
     """Plans are decided every H + 1 steps; the trajectory encoder drops the last step of its longer window."""
     contract = json.loads(properties(model)["lads.contract"])
-    horizon, graph = contract["horizon"], model.graph
-    contract["horizon"] += 1
+    horizon, graph = contract["family"]["horizon"], model.graph
+    contract["family"]["horizon"] += 1
+    # A context ends with a plan.
+    contract["context"]["steps"] -= contract["context"]["steps"] % (horizon + 1)
+    for channel in contract["channels"]:
+        if channel["role"] == "demonstration":
+            channel["shape"][0] += 1
     set_property(model, "lads.contract", json.dumps(contract))
     bounds = {"damage/from": [0], "damage/to": [horizon], "damage/axis": [1]}
     graph.initializer.extend(numpy_helper.from_array(np.array(value, np.int64), name) for name, value in bounds.items())
@@ -130,13 +135,12 @@ def set_property(model, key, value):
 
 def record_golden(model):
     """The golden episode as an exporter with this fault would have recorded it."""
-    contract = json.loads(properties(model)["lads.contract"])
     golden = load(base64.b64decode(properties(model)["lads.golden"]))
-    bundle = replay.Bundle(model)
-    index = int(golden["instruction"][0])
-    plans, actions, _ = bundle.open_loop(contract, index, golden["observations"])
-    golden |= {"plans": plans.astype(np.int64), "actions": actions.astype(np.float32)}
-    set_property(model, "lads.golden", base64.b64encode(save(golden, metadata={"tolerance": "0.0001"})).decode())
+    runner = exporter.twin.Twin(model)
+    index, channels = int(golden["instruction"][0]), {"observation": golden["channel.observation"][: runner.steps]}
+    rollout = exporter.twin.open_loop(runner, index, channels)
+    tensors = exporter.golden_tensors(rollout, index, channels)
+    set_property(model, "lads.golden", base64.b64encode(save(tensors, metadata={"tolerance": "0.0001"})).decode())
 
 
 @pytest.mark.parametrize("damage", [scale_off, joints_swapped, horizon_off, second_best], ids=lambda damage: damage.__name__)
@@ -150,8 +154,22 @@ def test_a_damaged_policy_is_different(damage, tmp_path):
     assert code == DIFFERENT and certificate["verdict"] == "DIFFERENT"
     assert certificate["policy"]["differing_episodes"] == 1
     assert certificate["environment"]["first_difference"] is None
-    assert "the policy answers otherwise" in certificate["reasons"][0]
+    assert any("the policy answers otherwise" in reason for reason in certificate["reasons"])
     assert not certificate["reference"]["same_bundle"]
+
+
+def test_another_rule_is_different_though_the_networks_are_the_same(tmp_path):
+    """What runs samples at temperature 5, and hardly ever succeeds: the contract is compared, and its own rule is what is run."""
+    model = onnx.load(BUNDLE)
+    contract = json.loads(properties(model)["lads.contract"])
+    contract["decision"] |= {"rule": "sample", "temperature": 5.0}
+    set_property(model, "lads.contract", json.dumps(contract))
+    path = tmp_path / "sampled.onnx"
+    path.write_bytes(model.SerializeToString())
+    code, certificate = verify(path, tmp_path)
+    assert code == DIFFERENT and certificate["setting"]["decision"] == "sampling at temperature 5"
+    assert "decision.rule" in certificate["reasons"][0]
+    assert [row["field"] for row in certificate["contract"]["differing"]] == ["decision.rule", "decision.temperature"]
 
 
 def test_the_shipped_policy_is_not(tmp_path):

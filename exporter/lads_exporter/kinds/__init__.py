@@ -6,9 +6,11 @@ A kind is a module's three functions: the networks in PyTorch with random weight
 from dataclasses import dataclass
 from typing import Callable
 
+import torch
+
 from .. import bundle, random_policy
 from ..config import UserError
-from . import common, lads, plain
+from . import common, diffusion, history, lads, lang_dt, lisa, plain, vae
 from .common import Sizes
 
 
@@ -26,9 +28,16 @@ def _of(network, build, contract, sizes=Sizes()):
 
 KINDS = {
     "lads": Kind(lads.policy, lads.build, lads.contract),
+    "lang_dt": _of(lang_dt.LangDt, lang_dt.build, lang_dt.contract),
+    "lisa": _of(lisa.Lisa, lisa.build, lisa.contract),
+    "vae": _of(vae.Vae, vae.build, vae.contract),
+    "lcsd": _of(diffusion.Lcsd, diffusion.build_lcsd, diffusion.contract_lcsd),
+    "skilldiffuser": _of(diffusion.SkillDiffuser, diffusion.build_skilldiffuser, diffusion.contract_skilldiffuser, Sizes(horizon=7, steps=42)),
+    "history": _of(history.History, history.build, history.contract),
     "plain": _of(plain.Plain, plain.build_plain, plain.contract),
     "recurrent": _of(plain.Recurrent, plain.build_recurrent, plain.contract_recurrent),
     "stacked": _of(plain.Stacked, plain.build_stacked, plain.contract_stacked),
+    "camera": _of(plain.Camera, plain.build_camera, plain.contract_camera),
 }
 
 
@@ -37,6 +46,7 @@ def export(name, seed=0):
     if name not in KINDS:
         raise UserError(f"--kind {name}: unknown; known: {', '.join(KINDS)}")
     kind = KINDS[name]
+    torch.manual_seed(seed)  # of what PyTorch starts weights with that are not drawn anew
     policy = kind.policy(kind.sizes, seed)
     found = kind.contract(kind.sizes, seed)
     known = len(found.get("instructions", []))

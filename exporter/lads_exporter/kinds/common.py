@@ -91,15 +91,15 @@ def high_level(sizes, outputs, actions=True):
 
 
 def randomize(policy, seed):
-    """Random weights in all parts of a policy; embeddings of time and heads of a size that makes every step differ."""
+    """Random weights in all parts of a policy: plans differ from step to step, and few actions are at their limits."""
     generator = torch.Generator().manual_seed(seed)
     random_policy.draw_weights(policy, generator)
     with torch.no_grad():
         for module in policy.modules():
             if isinstance(module, nn.Embedding):
                 module.weight.copy_(0.3 * torch.randn(module.weight.shape, generator=generator))
-            if isinstance(module, HighLevelPolicy):
-                module.head.weight.mul_(2)
+            for head in (getattr(module, name) for name in ("head", "inverse_last") if hasattr(module, name)):
+                head.weight.mul_(0.3 if head.out_features == len(ENVIRONMENT["action"]) else 2)
     return policy.eval()
 
 

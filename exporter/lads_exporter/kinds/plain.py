@@ -1,7 +1,9 @@
-"""`plain`: observation to action, without instructions, plans or a context; `recurrent` and `stacked` are plain with states."""
+"""`plain`: observation to action, without instructions, plans or a context; `recurrent` and `stacked` are plain with states,
+`camera` with channels of other types."""
 
 import numpy as np
 import torch
+from onnx import TensorProto
 from torch import nn
 
 from .. import bundle, contract as contracts, graphs
@@ -61,6 +63,24 @@ class Stacked(nn.Module):
         padded = torch.cat([normed[:1].expand(self.ROWS - 1, -1), normed])
         stacks = torch.stack([padded[t : t + self.ROWS].flatten() for t in range(len(normed))])
         return self.last(torch.tanh(self.first(torch.cat([stacks, commands], 1))))
+
+
+class Camera(nn.Module):
+    """An MLP over the observation, a small image and whole numbers."""
+
+    IMAGE, MODES = [6, 8, 3], 2
+
+    def __init__(self, sizes):
+        super().__init__()
+        self.normalizer = common.normalizer()
+        self.pixels = nn.Linear(6 * 8 * 3, 12)
+        self.first = nn.Linear(sizes.observation + 12 + self.MODES, sizes.hidden)
+        self.last = nn.Linear(sizes.hidden, sizes.action)
+
+    def forward(self, observations, images, modes):
+        """observations [T, O], images [T, 6, 8, 3] of bytes, modes [T, 2] of whole numbers -> actions [T, A]."""
+        seen = torch.tanh(self.pixels(images.flatten(1).float() / 255))
+        return self.last(torch.tanh(self.first(torch.cat([self.normalizer(observations), seen, modes.float()], 1))))
 
 
 def _dense(entry, x, module, out, weight=None):
@@ -132,9 +152,27 @@ def build_stacked(policy, sizes):
     return _finish(graph, entry, x, policy)
 
 
+def build_camera(policy, sizes):
+    graph = graphs.Graph()
+    entry = graphs.Entry(graph, ENTRY)
+    observation = entry.input("observation", [1, sizes.observation])
+    image = entry.input("camera", [1, *policy.IMAGE], TensorProto.UINT8)
+    modes = entry.input("mode", [1, policy.MODES], TensorProto.INT32)
+    bytes_ = entry.op("Cast", [image], "camera_cast", to=TensorProto.FLOAT)
+    shares = entry.op("Div", [bytes_, entry.scalar("largest_byte", 255.0)], "camera_scaled")
+    flat = entry.op("Reshape", [shares, entry.integers("policy.pixels", [1, policy.pixels.in_features])], "camera_flat")
+    seen = entry.op("Tanh", [_dense(entry, flat, policy.pixels, "pixels")], "pixels.tanh")
+    centred = entry.centred(observation, policy.normalizer, "observation_centred")
+    numbers = entry.op("Cast", [modes], "mode_cast", to=TensorProto.FLOAT)
+    x = entry.op("Concat", [centred, seen, numbers], "joined", axis=1)
+    weight = graphs.fold_std(policy.first.weight, policy.normalizer)
+    x = entry.op("Tanh", [_dense(entry, x, policy.first, "first", weight)], "first.tanh")
+    return _finish(graph, entry, x, policy)
+
+
 def contract(sizes, seed, kind="plain", states=None, more=()):
     channels = contracts.channels(common.ENVIRONMENT)
-    channels[1:1] = [contracts.vector(name, "observation", elements) for name, elements in more]
+    channels[1:1] = more
     provenance = {"setting": f"random {kind}", "seed": seed}
     return bundle.describe({"kind": "plain"}, common.ENVIRONMENT, [], None, provenance, channels=channels, states=states)
 
@@ -150,4 +188,10 @@ def contract_recurrent(sizes, seed):
 
 def contract_stacked(sizes, seed):
     stack = {"name": "stack", "kind": "ring", "rows": Stacked.ROWS, "source": "observation", "fill": "first", "cleared_by": "episode"}
-    return contract(sizes, seed, "stacked", [stack], [("command", COMMAND)])
+    return contract(sizes, seed, "stacked", [stack], [contracts.vector("command", "observation", COMMAND)])
+
+
+def contract_camera(sizes, seed):
+    image = contracts.array("camera", "observation", Camera.IMAGE, "u8", layout="hwc", min=0, max=255)
+    modes = contracts.array("mode", "observation", [Camera.MODES], "i32", min=-1, max=2)
+    return contract(sizes, seed, "camera", more=[image, modes])

@@ -3,103 +3,29 @@
 use std::collections::HashMap;
 use std::fmt;
 
-use lads_core::Policy;
-use lads_image::op::{CacheFormat, Port, WeightFormat, WeightSpan};
+use lads_core::{Controller, Policy, PolicyError, ScheduleError, Workspace};
+use lads_image::op::{CacheFormat, WeightFormat, WeightSpan};
 
 use crate::bundle::Bundle;
-use crate::entries::{
-    self, ACT, ENCODE, INSTRUCT, LOOKUP_INSTRUCTION, LOOKUP_PLAN, START, STEP, Signature,
-};
+use crate::entries::{self, LOOKUP_INSTRUCTION, Signature};
 use crate::error::CompileError;
-use crate::fuse::fuse;
+use crate::family::{Blueprint, Entry, Keep, Origin};
+use crate::fuse::{Fused, fuse};
+use crate::graph::Dim;
 use crate::image::{self, Image, Parts};
 use crate::import::Model;
 use crate::lower::{Cache, Weights, lower};
-use crate::memory::Memory;
 use crate::plan::{Placed, plan};
 use crate::report::{CompileReport, ProgramReport};
 use crate::tensor::Tensor;
 use crate::verify::verify;
 
-/// One program of the image: what it is compiled from and which outputs it keeps.
-pub(crate) struct Recipe {
-    pub name: &'static str,
-    pub entry: &'static str,
-    pub outputs: &'static [&'static str],
-    pub ports: &'static [(&'static str, Port)],
-}
-
-/// In the order of `lads_core::image::ProgramKind`.
-pub(crate) const RECIPES: [Recipe; 7] = [
-    Recipe {
-        name: "instruct",
-        entry: INSTRUCT,
-        outputs: &[],
-        ports: &[("words", Port::Words)],
-    },
-    Recipe {
-        name: "start",
-        entry: START,
-        outputs: &["logits"],
-        ports: &[
-            ("observation", Port::Observation),
-            ("timestep", Port::Timestep),
-            ("logits", Port::Logits),
-        ],
-    },
-    Recipe {
-        name: "step_decide",
-        entry: STEP,
-        outputs: &["logits"],
-        ports: STEP_PORTS,
-    },
-    Recipe {
-        name: "step_record",
-        entry: STEP,
-        outputs: &[],
-        ports: STEP_PORTS,
-    },
-    Recipe {
-        name: "lookup",
-        entry: LOOKUP_PLAN,
-        outputs: &["plan"],
-        ports: &[("index", Port::PlanIndex), ("plan", Port::Plan)],
-    },
-    Recipe {
-        name: "act",
-        entry: ACT,
-        outputs: &["action"],
-        ports: &[
-            ("observation", Port::Observation),
-            ("plan", Port::Plan),
-            ("action", Port::Action),
-        ],
-    },
-    Recipe {
-        name: "encode",
-        entry: ENCODE,
-        outputs: &["index", "latent"],
-        ports: &[
-            ("observations", Port::Observations),
-            ("actions", Port::Actions),
-            ("index", Port::PlanIndex),
-            ("latent", Port::Latent),
-        ],
-    },
-];
-
-const STEP_PORTS: &[(&str, Port)] = &[
-    ("action", Port::Action),
-    ("observation", Port::Observation),
-    ("timestep", Port::Timestep),
-    ("logits", Port::Logits),
-];
-
 /// One program that was made.
-struct Made {
-    placed: Placed,
-    tokens: usize,
-    report: ProgramReport,
+pub(crate) struct Made {
+    /// Index into the blueprint's entries.
+    pub entry: usize,
+    pub placed: Placed,
+    pub tokens: usize,
 }
 
 /// What a compilation may choose.
@@ -149,97 +75,177 @@ pub fn compile(bundle: &Bundle) -> Result<Image, CompileError> {
 }
 
 /// Compiles a bundle. Weights or a cache of fewer bits have to pass a gate, unless forced: the image that was made replays the bundle's golden
-/// episode with the same plans, and with actions inside the episode's tolerance.
+/// episode with the same indices, and with actions inside the episode's tolerance.
 pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileError> {
     let contract = bundle.contract();
-    let signatures = entries::signatures(contract);
+    let blueprint = contract.family.kind().blueprint(contract);
+    let signatures =
+        entries::signatures(bundle.graph(), contract, &blueprint).map_err(CompileError::Bundle)?;
     let model = Model::new(&bundle.model, bundle.graph())?;
-    let cache = Cache::new(contract, options.cache);
-    let cache_len = cache.len().ok_or_else(|| CompileError::TooLarge {
-        what: "the KV cache".into(),
-    })?;
-    // Before the compiler itself takes memory that grows with the context.
-    Memory::bytes_of(cache_len as usize)?;
+    let caches = caches(bundle, &blueprint, &signatures, options.cache)?;
     let mut weights = Weights::default();
-    let mut made: Vec<Made> = vec![];
-    // Whole matrices come before the parts of them that other programs need, and what runs in every control step comes first.
-    let (before, rest) = RECIPES.split_at(1);
-    for recipe in rest.iter().chain(before) {
-        let signature = signature(&signatures, recipe.entry)?;
-        let entry = model.import(signature, &HashMap::new())?;
-        let fused = fuse(entry, signature, recipe.outputs)?;
-        weights.format = if recipe.entry == ACT {
+    let (mut made, mut programs) = (vec![], vec![]);
+    // In the order of the blueprint: whole matrices come before the parts of them that other programs need, and what runs in every
+    // control step comes first.
+    for (index, entry) in blueprint.entries.iter().enumerate() {
+        let Some(fused) = fused(&model, &signatures, &blueprint, entry)? else {
+            continue;
+        };
+        weights.format = if entry.acts {
             options.low_level()
         } else {
             options.weights
         };
-        let lowered = lower(recipe.entry, &fused, recipe.ports, cache, &mut weights)?;
+        let cache = entry.cache.as_ref().and_then(|name| caches.get(name));
+        let lowered = lower(
+            &entry.name,
+            &fused,
+            *cache.unwrap_or(&Cache::NONE),
+            &mut weights,
+        )?;
         let placed = plan(&lowered);
         verify(&lowered, &placed).map_err(|fault| CompileError::Plan {
-            program: recipe.name,
+            program: entry.name.as_str().into(),
             fault,
         })?;
-        let report = ProgramReport {
-            name: recipe.name,
-            entry: recipe.entry,
+        programs.push(ProgramReport {
+            name: entry.name.clone(),
+            entry: entry.graph().unwrap_or("").into(),
             ops: placed.ops.len(),
             arena_len: placed.arena_len as usize,
             arena_lower_bound: placed.lower_bound as usize,
-        };
+        });
         made.push(Made {
+            entry: index,
             placed,
             tokens: lowered.tokens,
-            report,
         });
     }
-    made.rotate_right(before.len());
-    let words = instruction_words(
-        bundle,
-        &model,
-        signature(&signatures, LOOKUP_INSTRUCTION)?,
-        &mut weights,
-    )?;
-    let report = CompileReport {
-        programs: made.iter().map(|made| made.report.clone()).collect(),
-        weight_bytes: weights.data.len() * 4,
-        cache_len: cache_len as usize,
-    };
-    let programs: Vec<(&Placed, usize)> = made
+    let words = match signatures
         .iter()
-        .map(|made| (&made.placed, made.tokens))
-        .collect();
-    let parts = Parts {
-        programs: &programs,
+        .find(|known| known.entry == LOOKUP_INSTRUCTION)
+    {
+        Some(signature) => instruction_words(bundle, &model, signature, &mut weights)?,
+        None => vec![],
+    };
+    let mut parts = Parts {
+        blueprint: &blueprint,
+        caches: &caches,
+        made: &made,
         words: &words,
         weights: &weights.data,
-        cache_len,
         tolerance: options.tolerance.unwrap_or(bundle.golden().tolerance),
+        work: 0,
     };
-    let image = image::write(bundle, &parts, report)?;
+    let weight_bytes = weights.data.len() * 4;
+    let report = |cache_len| CompileReport {
+        programs: programs.clone(),
+        weight_bytes,
+        cache_len,
+    };
+    // What the worst step costs is for the core to count: it is asked with an image that says nothing, and told what it counted.
+    let draft = image::write(bundle, &parts, report(0))?;
+    parts.work = match Policy::new_within(draft.as_bytes(), u64::MAX) {
+        Err(PolicyError::Schedule(ScheduleError::Work { counted, .. })) => counted,
+        Err(error) => return Err(CompileError::Image(error)),
+        Ok(_) => 0,
+    };
+    drop(draft);
+    let cache_len = image::rows_len(&parts);
+    let image = image::write(bundle, &parts, report(cache_len))?;
     let policy = Policy::new_checked(image.as_bytes()).map_err(CompileError::Image)?;
     if !options.is_exact() && !options.force {
-        let mut memory = Memory::of(&policy)?;
-        memory
-            .controller(&policy)?
-            .self_test()
-            .map_err(|error| CompileError::Gate {
-                stored: options.to_string().into(),
-                error,
-                tolerance: parts.tolerance,
-            })?;
+        gate(&policy, options, parts.tolerance)?;
     }
     Ok(image)
 }
 
-fn signature<'s>(signatures: &'s [Signature], entry: &str) -> Result<&'s Signature, CompileError> {
-    let missing = || CompileError::Entry {
-        entry: entry.into(),
-        problem: "it belongs to no policy of this kind".into(),
+/// Refuses memory of more f32 elements than a policy gets.
+fn bounded(elements: usize) -> Result<(), CompileError> {
+    let bytes = elements.saturating_mul(size_of::<f32>());
+    if bytes > Policy::MEMORY_LIMIT {
+        return Err(CompileError::Excessive { bytes });
+    }
+    Ok(())
+}
+
+/// The golden episode, in memory of its own.
+fn gate(policy: &Policy, options: Options, tolerance: f32) -> Result<(), CompileError> {
+    bounded(policy.arena_len().saturating_add(policy.state_len()))?;
+    let mut arena = vec![0.0; policy.arena_len()];
+    let mut state = vec![0.0; policy.state_len()];
+    let workspace = Workspace::new(policy, &mut arena, &mut state).map_err(|small| CompileError::Excessive {
+        bytes: small.needed.saturating_mul(size_of::<f32>()),
+    })?;
+    let replayed = Controller::new(*policy, workspace).self_test();
+    replayed.map(|_| ()).map_err(|error| CompileError::Gate {
+        stored: options.to_string().into(),
+        error,
+        tolerance,
+    })
+}
+
+/// The KV caches, with the rows that the longest context takes.
+fn caches(
+    bundle: &Bundle,
+    blueprint: &Blueprint,
+    signatures: &[Signature],
+    format: CacheFormat,
+) -> Result<HashMap<String, Cache>, CompileError> {
+    let tokens = |entry: &Entry| {
+        let signature = signatures
+            .iter()
+            .find(|signature| Some(signature.entry.as_str()) == entry.graph());
+        signature.map_or(0, Signature::tokens)
     };
-    signatures
-        .iter()
-        .find(|signature| signature.entry == entry)
-        .ok_or_else(missing)
+    let rows = blueprint.rows(bundle.contract(), tokens);
+    let mut caches = HashMap::new();
+    let mut elements = 0_usize;
+    for (state, rows) in blueprint.states.iter().zip(rows) {
+        let Keep::Kv(network) = state.keep else {
+            continue;
+        };
+        let cache = Cache::new(network, rows, format);
+        let len = cache.len().ok_or_else(|| CompileError::TooLarge {
+            what: "the KV cache".into(),
+        })?;
+        // Before the compiler itself takes memory that grows with the context.
+        elements = elements.saturating_add(len as usize);
+        bounded(elements)?;
+        caches.insert(state.name.clone(), cache);
+    }
+    Ok(caches)
+}
+
+/// The graph of an entry, ready to be lowered; `None` for one that the bundle leaves out.
+fn fused(
+    model: &Model,
+    signatures: &[Signature],
+    blueprint: &Blueprint,
+    entry: &Entry,
+) -> Result<Option<Fused>, CompileError> {
+    match &entry.origin {
+        Origin::Graph(graph) => {
+            let Some(signature) = signatures.iter().find(|known| known.entry == *graph) else {
+                return Ok(None);
+            };
+            let imported = model.import(signature, &HashMap::new())?;
+            fuse(imported, signature, &entry.outputs).map(Some)
+        }
+        Origin::Copy { channel } => {
+            let output = entry.outputs.first().map_or("", String::as_str);
+            let name = output.strip_prefix("next_").unwrap_or(output);
+            let state = blueprint.states.iter().find(|state| state.name == name);
+            let width = state
+                .and_then(|state| state.width.as_ref())
+                .map_or(0, |wide| wide.0);
+            Ok(Some(Fused::copy(
+                channel,
+                output,
+                &[Dim::of(1), Dim::of(width)],
+            )))
+        }
+    }
 }
 
 /// The words of every known instruction: the entry is evaluated for each id.
@@ -250,6 +256,7 @@ fn instruction_words(
     weights: &mut Weights,
 ) -> Result<Vec<(u32, WeightSpan)>, CompileError> {
     let contract = bundle.contract();
+    let [most, dim] = contract.words().unwrap_or_default();
     let refused = |problem: String| CompileError::Entry {
         entry: LOOKUP_INSTRUCTION.into(),
         problem: problem.into(),
@@ -275,11 +282,11 @@ fn instruction_words(
         };
         let length = usize::try_from(length)
             .ok()
-            .filter(|length| (1..=contract.context.words).contains(length));
+            .filter(|length| (1..=most).contains(length));
         let length = length.ok_or_else(|| {
             refused(format!(
-                "instruction {} has no length from 1 to the contract's `context.words` {}",
-                known.id, contract.context.words
+                "instruction {} has no length from 1 to the {most} words of its channel",
+                known.id
             ))
         })?;
         if words.iter().any(|x| !x.is_finite()) {
@@ -288,9 +295,7 @@ fn instruction_words(
                 known.id
             )));
         }
-        let span = weights
-            .store(&words[..length * contract.language.dim])
-            .map_err(refused)?;
+        let span = weights.store(&words[..length * dim]).map_err(refused)?;
         all.push((length as u32, span));
     }
     Ok(all)

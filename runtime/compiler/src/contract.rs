@@ -8,17 +8,10 @@ use std::collections::HashSet;
 use serde::Deserialize;
 
 use crate::error::BundleError;
+use crate::family::Family;
 
 /// Version of the contract that this crate reads.
-pub const CONTRACT_VERSION: u32 = 1;
-
-/// What kind of policy a bundle holds.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Kind {
-    /// Learned alignment of discrete skills.
-    Lads,
-}
+pub const CONTRACT_VERSION: u32 = 2;
 
 /// The environment that the policy was made for.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
@@ -29,37 +22,119 @@ pub struct Environment {
     pub version: String,
 }
 
-/// The codebook of latent plans.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-pub struct Codebook {
-    /// Entries, `M`.
-    pub size: usize,
-    /// Elements of an entry, `D`.
-    pub dim: usize,
-}
-
-/// How a plan is picked from the logits.
+/// What a channel is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Rule {
-    /// The largest logit.
-    Argmax,
-    /// At random with the softmax of the logits over the temperature.
-    Sample,
+pub enum Role {
+    /// Given by the caller in every control step.
+    Observation,
+    /// Written by every control step.
+    Action,
+    /// Word embeddings, `[words, elements]`.
+    Instruction,
+    /// Random numbers; the shape is that of one draw.
+    Noise,
+    /// A piece of a demonstration, to be encoded.
+    Demonstration,
 }
 
-/// The decision rule and its parameters.
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
-pub struct Decision {
-    /// How a plan is picked.
-    pub rule: Rule,
-    /// Divides the logits when sampling.
-    pub temperature: f32,
-    /// Seed of the sampling.
-    pub seed: u64,
+/// Type of a channel's elements.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum DType {
+    /// 32-bit floats.
+    F32,
+    /// Bytes.
+    U8,
+    /// Signed 32-bit integers.
+    I32,
 }
 
-/// One element of the observation or the action.
+/// A value at the policy's edge.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct Channel {
+    /// Name.
+    pub name: String,
+    /// What it is for.
+    pub role: Role,
+    /// Type of its elements.
+    pub dtype: DType,
+    /// Lengths of its axes, one to four.
+    pub shape: Vec<usize>,
+    /// Order of quaternions in it.
+    #[serde(default)]
+    pub quaternion_order: QuaternionOrder,
+    /// What the values are relative to, in words.
+    #[serde(default)]
+    pub reference: String,
+    /// Its elements; none for images, instructions and the like.
+    #[serde(default)]
+    pub elements: Vec<Element>,
+    /// Smallest value of any element, for a channel without elements of its own.
+    #[serde(default)]
+    pub min: Option<f32>,
+    /// Largest value of any element.
+    #[serde(default)]
+    pub max: Option<f32>,
+}
+
+impl Channel {
+    /// How many elements it has.
+    #[expect(
+        clippy::len_without_is_empty,
+        reason = "a checked channel has an element at least"
+    )]
+    pub fn len(&self) -> usize {
+        self.shape.iter().product()
+    }
+
+    /// The limits of a channel without elements of its own: what was said, or all that the type holds.
+    pub(crate) fn limits(&self) -> (f32, f32) {
+        let (min, max) = match self.dtype {
+            DType::F32 => (f32::MIN, f32::MAX),
+            DType::U8 => (0.0, 255.0),
+            DType::I32 => (i32::MIN as f32, i32::MAX as f32),
+        };
+        (self.min.unwrap_or(min), self.max.unwrap_or(max))
+    }
+
+    fn check(&self, at: &str) -> Result<(), String> {
+        let len = self.shape.iter().try_fold(1_usize, |len, &dim| {
+            len.checked_mul(dim)
+                .filter(|&len| (1..=MAX_CHANNEL_LEN).contains(&len))
+        });
+        if !(1..=4).contains(&self.shape.len()) || len.is_none() {
+            return Err(format!(
+                "field `{at}.shape` is {:?}, it must have one to four axes and 1 to {MAX_CHANNEL_LEN} elements",
+                self.shape
+            ));
+        }
+        let described = matches!(self.role, Role::Observation | Role::Action);
+        let vector = self.dtype == DType::F32 && self.shape.len() == 1;
+        if described && vector && self.elements.len() != self.len() {
+            return Err(format!(
+                "field `{at}.elements` has {} elements, its shape {:?} says {}",
+                self.elements.len(),
+                self.shape,
+                self.len()
+            ));
+        }
+        if !self.elements.is_empty() && (!vector || self.elements.len() != self.len()) {
+            return Err(format!(
+                "field `{at}.elements`: only vectors of f32 have elements, one for each of their length"
+            ));
+        }
+        let (min, max) = self.limits();
+        if !(min.is_finite() && max.is_finite() && min < max) {
+            return Err(format!(
+                "field `{at}` has limits {min} to {max}, which is no range"
+            ));
+        }
+        elements(&format!("{at}.elements"), &self.elements)
+    }
+}
+
+/// One element of a channel.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Element {
     /// Name.
@@ -73,13 +148,86 @@ pub struct Element {
     /// The joint that it belongs to.
     #[serde(default)]
     pub joint: Option<String>,
+    /// What of the joint: position, velocity, effort.
+    #[serde(default)]
+    pub interface: Option<String>,
+    /// Physical value of one unit: physical = reference + offset + scale * value.
+    #[serde(default = "one")]
+    pub scale: f32,
+    /// Physical value of zero, on top of the channel's reference.
+    #[serde(default)]
+    pub offset: f32,
+    /// Unit of the physical value.
+    #[serde(default)]
+    pub physical_unit: Option<String>,
 }
 
-/// Order of the components of quaternions in the observation.
+fn one() -> f32 {
+    1.0
+}
+
+/// How a state of a plain policy is kept.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum StateKind {
+    /// As a whole.
+    Plain,
+    /// The last rows.
+    Ring,
+}
+
+/// What clears a state.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ClearedBy {
+    /// The end of an episode.
+    #[default]
+    Episode,
+    /// Another instruction.
+    Instruction,
+}
+
+/// What stands for rows that a ring does not have yet.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Fill {
+    /// Zeros.
+    #[default]
+    Zero,
+    /// The oldest row.
+    First,
+}
+
+/// A state of a plain policy: what of one control step the next one reads.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+pub struct State {
+    /// Name; the graph reads it by this name and gives `next_NAME`.
+    pub name: String,
+    /// How it is kept.
+    pub kind: StateKind,
+    /// Shape of a plain state.
+    #[serde(default)]
+    pub shape: Vec<usize>,
+    /// Rows of a ring.
+    #[serde(default)]
+    pub rows: usize,
+    /// The channel that is appended to a ring in every step, before the graph runs.
+    #[serde(default)]
+    pub source: Option<String>,
+    /// What stands for missing rows of a ring.
+    #[serde(default)]
+    pub fill: Fill,
+    /// What clears it.
+    #[serde(default)]
+    pub cleared_by: ClearedBy,
+}
+
+/// Order of the components of quaternions in a channel.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum QuaternionOrder {
     /// There are none.
+    #[default]
     None,
     /// Scalar first.
     Wxyz,
@@ -115,10 +263,23 @@ pub struct Instruction {
     pub id: String,
     /// What the person says.
     pub text: String,
+}
+
+/// How an instruction is evaluated.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+pub struct Evaluated {
     /// The sub-tasks that it asks for.
     pub sub_tasks: Vec<String>,
-    /// Name of the set that it belongs to in evaluations: `seen` and `unseen`, or the benchmark's own names.
+    /// Name of the set that it belongs to: `seen` and `unseen`, or the benchmark's own names.
     pub split: String,
+}
+
+/// How the policy is evaluated; never part of an image.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
+pub struct Evaluation {
+    /// One for each instruction, in their order; or none at all.
+    #[serde(default)]
+    pub instructions: Vec<Evaluated>,
 }
 
 /// What becomes of the words of an instruction.
@@ -188,38 +349,41 @@ pub struct Network {
 pub struct Contract {
     /// Version of the contract's form.
     pub version: u32,
-    /// Kind of policy.
-    pub kind: Kind,
+    /// The family of policies that it belongs to, with that family's own fields.
+    pub family: Family,
     /// The environment.
     pub environment: Environment,
     /// Time from one control step to the next, in seconds.
     pub control_period_s: f32,
-    /// Control steps from one decision to the next, `H`.
-    pub horizon: usize,
-    /// The codebook of latent plans.
-    pub codebook: Codebook,
-    /// How plans are picked.
-    pub decision: Decision,
-    /// The observation's elements.
-    pub observation: Vec<Element>,
-    /// The action's elements.
-    pub action: Vec<Element>,
-    /// Order of quaternions in the observation.
-    pub quaternion_order: QuaternionOrder,
-    /// The transformer's context.
-    pub context: Context,
+    /// The values at its edge.
+    pub channels: Vec<Channel>,
+    /// What a plain policy remembers.
+    #[serde(default)]
+    pub states: Vec<State>,
+    /// The context; without one, time goes on without end.
+    #[serde(default)]
+    pub context: Option<Context>,
     /// The known instructions.
+    #[serde(default)]
     pub instructions: Vec<Instruction>,
-    /// The language encoder.
-    pub language: Language,
-    /// The transformer.
-    pub network: Network,
+    /// The language encoder, where there are instructions.
+    #[serde(default)]
+    pub language: Option<Language>,
+    /// The transformer that reads the instruction.
+    #[serde(default)]
+    pub network: Option<Network>,
+    /// How the policy is evaluated.
+    #[serde(default)]
+    pub evaluation: Evaluation,
     /// How the policy was trained: anything that the exporter wrote.
     pub provenance: serde_json::Value,
 }
 
 /// The largest length that a contract may claim. Generous, and small enough that products of a few fit 64 bits.
-const MAX_LEN: usize = 1 << 20;
+pub(crate) const MAX_LEN: usize = 1 << 20;
+
+/// The most elements of a channel.
+const MAX_CHANNEL_LEN: usize = 1 << 26;
 
 impl Contract {
     /// Reads and checks a contract.
@@ -232,11 +396,15 @@ impl Contract {
         let version = value
             .get("version")
             .ok_or_else(|| refused("missing field `version`".into()))?;
-        if version.as_u64() != Some(u64::from(CONTRACT_VERSION)) {
-            return Err(BundleError::ContractVersion {
-                found: version.to_string().into(),
-                supported: CONTRACT_VERSION,
-            });
+        match version.as_u64() {
+            Some(1) => return Err(BundleError::ContractV1),
+            Some(found) if found == u64::from(CONTRACT_VERSION) => {}
+            _ => {
+                return Err(BundleError::ContractVersion {
+                    found: version.to_string().into(),
+                    supported: CONTRACT_VERSION,
+                });
+            }
         }
         // From the text, so that the error tells where.
         let contract: Self =
@@ -245,46 +413,228 @@ impl Contract {
         Ok(contract)
     }
 
+    /// The channel of a name.
+    pub fn channel(&self, name: &str) -> Option<&Channel> {
+        self.channels.iter().find(|channel| channel.name == name)
+    }
+
+    /// The channels that the caller gives in every control step, in their order.
+    pub fn observations(&self) -> impl Iterator<Item = &Channel> {
+        self.with(Role::Observation)
+    }
+
+    /// The first channel that the caller gives in every control step, the only one of most policies.
+    pub fn observation(&self) -> &Channel {
+        self.known(Role::Observation)
+    }
+
+    /// The action channel.
+    pub fn action(&self) -> &Channel {
+        self.known(Role::Action)
+    }
+
+    /// Words of the longest instruction, and elements of a word; `None` for a policy that takes none.
+    pub fn words(&self) -> Option<[usize; 2]> {
+        let channel = self.with(Role::Instruction).next()?;
+        Some([channel.shape[0], channel.shape[1]])
+    }
+
+    /// Control steps from one selection to the next; `None` for a policy that selects nothing.
+    pub fn period(&self) -> Option<usize> {
+        self.family.period()
+    }
+
+    /// The sub-tasks and the split of an instruction; empty where the bundle does not say.
+    pub fn evaluated(&self, instruction: usize) -> (&[String], &str) {
+        self.evaluation
+            .instructions
+            .get(instruction)
+            .map_or((&[], ""), |found| (&found.sub_tasks, &found.split))
+    }
+
+    fn with(&self, role: Role) -> impl Iterator<Item = &Channel> {
+        self.channels
+            .iter()
+            .filter(move |channel| channel.role == role)
+    }
+
+    fn known(&self, role: Role) -> &Channel {
+        static NONE: Channel = Channel {
+            name: String::new(),
+            role: Role::Observation,
+            dtype: DType::F32,
+            shape: vec![],
+            quaternion_order: QuaternionOrder::None,
+            reference: String::new(),
+            elements: vec![],
+            min: None,
+            max: None,
+        };
+        // Always there: a contract is checked when it is parsed.
+        self.with(role).next().unwrap_or(&NONE)
+    }
+
     fn check(&self) -> Result<(), String> {
-        let lengths = [
-            ("horizon", self.horizon),
-            ("codebook.size", self.codebook.size),
-            ("codebook.dim", self.codebook.dim),
-            ("observation", self.observation.len()),
-            ("action", self.action.len()),
-            ("context.words", self.context.words),
-            ("context.steps", self.context.steps),
-            ("instructions", self.instructions.len()),
-            ("language.dim", self.language.dim),
-            ("network.layers", self.network.layers),
-            ("network.heads", self.network.heads),
-            ("network.head_dim", self.network.head_dim),
-        ];
-        for (field, len) in lengths {
+        let period = self.control_period_s;
+        if !(period.is_finite() && period > 0.0) {
+            return Err(format!(
+                "field `control_period_s` is {period}, it must be positive"
+            ));
+        }
+        self.check_channels()?;
+        for (i, state) in self.states.iter().enumerate() {
+            self.check_state(state, &format!("states[{i}]"))?;
+        }
+        let names = self.states.iter().map(|state| state.name.as_str());
+        let channels = self.channels.iter().map(|channel| channel.name.as_str());
+        distinct("states", "name", names.clone())?;
+        distinct("channels and states", "name", channels.chain(names))?;
+        self.check_context()?;
+        self.check_instructions()?;
+        self.family.check(self)
+    }
+
+    fn check_channels(&self) -> Result<(), String> {
+        for (i, channel) in self.channels.iter().enumerate() {
+            channel.check(&format!("channels[{i}]"))?;
+        }
+        distinct(
+            "channels",
+            "name",
+            self.channels.iter().map(|c| c.name.as_str()),
+        )?;
+        let count = |role| self.with(role).count();
+        let observations = count(Role::Observation);
+        if !(1..=lads_core::MAX_OBSERVATIONS).contains(&observations) {
+            return Err(format!(
+                "field `channels` has {observations} observations, it must have 1 to {}",
+                lads_core::MAX_OBSERVATIONS
+            ));
+        }
+        if count(Role::Action) != 1 {
+            return Err(format!(
+                "field `channels` has {} actions, it must have one",
+                count(Role::Action)
+            ));
+        }
+        if count(Role::Instruction) > 1 {
+            return Err("field `channels` has more than one instruction".into());
+        }
+        for channel in &self.channels {
+            let floats = channel.role == Role::Observation || channel.dtype == DType::F32;
+            let words = channel.role != Role::Instruction || channel.shape.len() == 2;
+            if !floats || !words {
+                return Err(format!(
+                    "channel {}: only observations may have elements other than f32, and an instruction has two axes",
+                    channel.name
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    fn check_state(&self, state: &State, at: &str) -> Result<(), String> {
+        match state.kind {
+            StateKind::Plain => {
+                let len = state.shape.iter().product::<usize>();
+                if state.shape.is_empty() || !(1..=MAX_LEN).contains(&len) {
+                    return Err(format!(
+                        "field `{at}.shape` is {:?}, it must have 1 to {MAX_LEN} elements",
+                        state.shape
+                    ));
+                }
+                if state.source.is_some() {
+                    return Err(format!("field `{at}.source`: only a ring has a source"));
+                }
+            }
+            StateKind::Ring => {
+                if !(1..=MAX_LEN).contains(&state.rows) {
+                    return Err(format!(
+                        "field `{at}.rows` is {}, it must be 1 to {MAX_LEN}",
+                        state.rows
+                    ));
+                }
+                let source = state.source.as_deref().unwrap_or("");
+                if !self.observations().any(|channel| channel.name == source) {
+                    return Err(format!(
+                        "field `{at}.source` is \"{source}\", it must name an observation channel"
+                    ));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn check_context(&self) -> Result<(), String> {
+        let Some(context) = &self.context else {
+            return Ok(());
+        };
+        for (field, len) in [
+            ("context.words", context.words),
+            ("context.steps", context.steps),
+        ] {
             if !(1..=MAX_LEN).contains(&len) {
                 return Err(format!(
                     "field `{field}` is {len}, it must be 1 to {MAX_LEN}"
                 ));
             }
         }
-        for (field, value) in [
-            ("control_period_s", self.control_period_s),
-            ("decision.temperature", self.decision.temperature),
-        ] {
-            if !(value.is_finite() && value > 0.0) {
-                return Err(format!("field `{field}` is {value}, it must be positive"));
-            }
+        if let Some(period) = self.period()
+            && !context.steps.is_multiple_of(period)
+        {
+            return Err(format!(
+                "field `context.steps` is {}, it must be a multiple of the period of {period} control steps: a context that starts again would decide between",
+                context.steps
+            ));
         }
-        if let Some(acceptance) = &self.language.acceptance {
+        Ok(())
+    }
+
+    fn check_instructions(&self) -> Result<(), String> {
+        let Some([words, dim]) = self.words() else {
+            if !self.instructions.is_empty() {
+                return Err("field `instructions`: no channel takes an instruction".into());
+            }
+            return Ok(());
+        };
+        if !(1..=MAX_LEN).contains(&self.instructions.len()) {
+            return Err(format!(
+                "field `instructions` has {}, it must have 1 to {MAX_LEN}",
+                self.instructions.len()
+            ));
+        }
+        let language = self.language.as_ref().ok_or("missing field `language`")?;
+        if language.dim != dim {
+            return Err(format!(
+                "field `language.dim` is {}, the instruction channel's words have {dim} elements",
+                language.dim
+            ));
+        }
+        if self.context.is_some_and(|context| context.words != words) {
+            return Err(format!(
+                "field `context.words` is not the instruction channel's {words} words"
+            ));
+        }
+        if let Some(acceptance) = &language.acceptance {
             acceptance.check()?;
         }
-        elements("observation", &self.observation)?;
-        elements("action", &self.action)?;
         for (i, known) in self.instructions.iter().enumerate() {
-            for (part, value) in [("text", &known.text), ("split", &known.split)] {
-                if value.trim().is_empty() {
-                    return Err(format!("field `instructions[{i}].{part}` is empty"));
-                }
+            if known.text.trim().is_empty() {
+                return Err(format!("field `instructions[{i}].text` is empty"));
+            }
+        }
+        let evaluated = self.evaluation.instructions.len();
+        if evaluated != 0 && evaluated != self.instructions.len() {
+            return Err(format!(
+                "field `evaluation.instructions` has {evaluated}, there are {} instructions",
+                self.instructions.len()
+            ));
+        }
+        for (i, known) in self.evaluation.instructions.iter().enumerate() {
+            if known.split.trim().is_empty() {
+                return Err(format!(
+                    "field `evaluation.instructions[{i}].split` is empty"
+                ));
             }
         }
         // Texts may repeat: benchmarks ask for the same in other words, and for the same words by other measures.
@@ -312,7 +662,19 @@ impl Acceptance {
 
 fn elements(field: &str, elements: &[Element]) -> Result<(), String> {
     for (i, element) in elements.iter().enumerate() {
-        let Element { name, min, max, .. } = element;
+        let Element {
+            name,
+            min,
+            max,
+            scale,
+            offset,
+            ..
+        } = element;
+        if !(scale.is_finite() && offset.is_finite()) {
+            return Err(format!(
+                "field `{field}[{i}]` ({name}) has scale {scale} and offset {offset}, which are not numbers"
+            ));
+        }
         if !(min.is_finite() && max.is_finite() && min < max) {
             return Err(format!(
                 "field `{field}[{i}]` ({name}) has limits {min} to {max}, which is no range"

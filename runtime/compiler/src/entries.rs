@@ -1,144 +1,374 @@
-//! The entries of a policy of kind `lads`: which values each reads and gives, with which shapes, as the contract says them.
+//! The graphs of a bundle: which values each reads and gives, and whether they are what the contract says.
 //!
-//! The entries live in one graph; a value's name starts with its entry's. What can fail: a value is missing or is declared
-//! with another type or shape, which [`check`] reports together with the field of the contract.
+//! The graphs lie in one ONNX graph; a value's name starts with its graph's. The contract's family says which graphs there are, and the
+//! names of their values what they are bound to. What can fail: a graph or a value is missing, means nothing, or is declared with
+//! another type or shape; [`signatures`] reports it together with the field of the contract.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 
-use crate::contract::Contract;
+use crate::contract::{Contract, DType};
 use crate::error::BundleError;
+use crate::family::{Blueprint, Bound, Entry, Keep};
 use crate::graph::{Dim, Type, show};
 use crate::onnx::{GraphProto, NodeProto, TensorTypeProto, ValueInfoProto, data_type};
 
+/// The table of known instructions: evaluated when a bundle is compiled.
 pub(crate) const LOOKUP_INSTRUCTION: &str = "instruction/lookup";
-pub(crate) const INSTRUCT: &str = "high_level/instruct";
-pub(crate) const START: &str = "high_level/start";
-pub(crate) const STEP: &str = "high_level/step";
-pub(crate) const LOOKUP_PLAN: &str = "codebook/lookup";
-pub(crate) const ACT: &str = "low_level/act";
-pub(crate) const ENCODE: &str = "trajectory_encoder/encode";
 
-/// A value at the edge of an entry.
+/// A value at the edge of a graph.
 #[derive(Debug, Clone)]
 pub(crate) struct Value {
-    /// Without the entry's name.
+    /// Without the graph's name.
     pub name: String,
     pub ty: Type,
     pub shape: Vec<Dim>,
     /// The fields of the contract that the shape comes from.
-    pub fields: &'static str,
+    pub fields: String,
 }
 
-/// What an entry reads and gives.
+/// What a graph reads and gives.
 #[derive(Debug, Clone)]
 pub(crate) struct Signature {
-    pub entry: &'static str,
+    pub entry: String,
     pub inputs: Vec<Value>,
     pub outputs: Vec<Value>,
 }
 
-fn value(name: &str, ty: Type, shape: &[usize], fields: &'static str) -> Value {
-    let shape = shape.iter().map(|&dim| Dim::of(dim)).collect();
-    Value {
-        name: name.into(),
-        ty,
-        shape,
-        fields,
+impl Signature {
+    /// Rows that a run appends to the KV cache.
+    pub fn tokens(&self) -> usize {
+        let present = self
+            .outputs
+            .iter()
+            .find(|value| value.name.starts_with("present."));
+        present.map_or(0, |value| value.shape.get(2).map_or(0, |dim| dim.fixed))
     }
 }
 
-/// `past_key_values.N.key|value` or `present.N.key|value` of every layer.
-fn cache(contract: &Contract, name: &str, len: Dim) -> Vec<Value> {
-    let network = contract.network;
-    (0..network.layers)
-        .flat_map(|layer| ["key", "value"].map(|part| format!("{name}.{layer}.{part}")))
-        .map(|name| Value {
-            name,
-            ty: Type::F32,
-            shape: vec![
-                Dim::of(1),
-                Dim::of(network.heads),
-                len,
-                Dim::of(network.head_dim),
-            ],
-            fields: "`network`, `context.words`",
-        })
-        .collect()
+/// The signatures of all graphs that the contract's family has, checked against the contract.
+pub(crate) fn signatures(
+    graph: &GraphProto,
+    contract: &Contract,
+    blueprint: &Blueprint,
+) -> Result<Vec<Signature>, BundleError> {
+    let refused = |problem: String| BundleError::Entry {
+        problem: problem.into(),
+    };
+    if !graph.sparse_initializer.is_empty() {
+        return Err(refused("the graph has sparse initializers".into()));
+    }
+    let mut checker = Checker {
+        contract,
+        blueprint,
+        widths: HashMap::new(),
+    };
+    let mut all: Vec<Signature> = vec![];
+    if let Some(words) = contract.words() {
+        all.push(checker.lookup(graph, words).map_err(refused)?);
+    }
+    for entry in &blueprint.entries {
+        let Some(name) = entry.graph() else { continue };
+        let prefix = format!("{name}/");
+        let mut values = |declared: &[ValueInfoProto], input: bool| -> Result<Vec<Value>, String> {
+            declared
+                .iter()
+                .filter(|value| value.name.starts_with(&prefix))
+                // An output that this project does not use may be anything.
+                .filter(|value| input || is_used(entry, &value.name[prefix.len()..]))
+                .map(|value| checker.value(name, &entry.name, value, input))
+                .collect()
+        };
+        let outputs = values(&graph.output, false).map_err(refused)?;
+        if outputs.is_empty() && entry.optional {
+            continue;
+        }
+        let inputs = values(&graph.input, true).map_err(refused)?;
+        for wanted in &entry.outputs {
+            if !outputs.iter().any(|value| value.name == *wanted) {
+                return Err(refused(format!("output {name}/{wanted} is missing")));
+            }
+        }
+        checker
+            .cache(entry.cache.as_deref(), name, &inputs, &outputs)
+            .map_err(refused)?;
+        if !all.iter().any(|known| known.entry == name) {
+            all.push(Signature {
+                entry: name.into(),
+                inputs,
+                outputs,
+            });
+        }
+    }
+    unknown(graph, contract, &all).map_err(refused)?;
+    Ok(all)
 }
 
-/// The signatures of all entries.
-pub(crate) fn signatures(contract: &Contract) -> Vec<Signature> {
-    use Type::{F32, I64};
-    let c = contract;
-    let (o, a, h) = (c.observation.len(), c.action.len(), c.horizon);
-    let words = || {
-        value(
-            "words",
-            F32,
-            &[1, c.context.words, c.language.dim],
-            "`context.words`, `language.dim`",
-        )
-    };
-    let observation = || value("observation", F32, &[1, o], "`observation`");
-    let logits = || value("logits", F32, &[1, c.codebook.size], "`codebook.size`");
-    let plan = || value("plan", F32, &[1, c.codebook.dim], "`codebook.dim`");
-    let int = |name| value(name, I64, &[1], "version");
-    let with_cache = |mut values: Vec<Value>, name, len| {
-        values.extend(cache(c, name, len));
-        values
-    };
-    let past = || (Dim::past(0), "past_key_values");
-    vec![
-        Signature {
-            entry: LOOKUP_INSTRUCTION,
-            inputs: vec![int("id")],
-            outputs: vec![words(), int("length")],
-        },
-        Signature {
-            entry: INSTRUCT,
-            inputs: vec![words()],
-            outputs: with_cache(vec![], "present", Dim::of(c.context.words)),
-        },
-        Signature {
-            entry: START,
-            inputs: with_cache(vec![observation(), int("timestep")], past().1, past().0),
-            outputs: with_cache(vec![logits()], "present", Dim::past(1)),
-        },
-        Signature {
-            entry: STEP,
-            inputs: with_cache(
-                vec![
-                    value("action", F32, &[1, a], "`action`"),
-                    observation(),
-                    int("timestep"),
-                ],
-                past().1,
-                past().0,
-            ),
-            outputs: with_cache(vec![logits()], "present", Dim::past(2)),
-        },
-        Signature {
-            entry: LOOKUP_PLAN,
-            inputs: vec![int("index")],
-            outputs: vec![plan()],
-        },
-        Signature {
-            entry: ACT,
-            inputs: vec![observation(), plan()],
-            outputs: vec![value("action", F32, &[1, a], "`action`")],
-        },
-        Signature {
-            entry: ENCODE,
-            inputs: vec![
-                value("observations", F32, &[1, h, o], "`horizon`, `observation`"),
-                value("actions", F32, &[1, h, a], "`horizon`, `action`"),
-            ],
+/// Whether an output is kept, or part of the KV cache.
+fn is_used(entry: &Entry, output: &str) -> bool {
+    output.starts_with("present.") || entry.outputs.iter().any(|kept| kept == output)
+}
+
+/// Every value belongs to a graph of the family. (A trajectory encoder may come with any of them, to be used elsewhere.)
+fn unknown(graph: &GraphProto, contract: &Contract, known: &[Signature]) -> Result<(), String> {
+    for declared in graph.input.iter().chain(&graph.output) {
+        let initialized = graph
+            .initializer
+            .iter()
+            .any(|tensor| tensor.name == declared.name);
+        let entry = entry_of(&declared.name).unwrap_or("");
+        let found = known.iter().any(|signature| signature.entry == entry)
+            || entry == "trajectory_encoder/encode";
+        if !initialized && !found {
+            return Err(format!(
+                "value {} belongs to no entry of a policy of kind `{}`",
+                declared.name,
+                contract.family.name()
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// What has been seen of the values.
+struct Checker<'c> {
+    contract: &'c Contract,
+    blueprint: &'c Blueprint,
+    /// Elements of the states whose width no field says, by the first value that was bound to each.
+    widths: HashMap<usize, (usize, String)>,
+}
+
+impl Checker<'_> {
+    /// The table of instructions.
+    fn lookup(&self, graph: &GraphProto, [words, dim]: [usize; 2]) -> Result<Signature, String> {
+        let wanted = |name: &str, ty, shape: &[usize]| Value {
+            name: name.into(),
+            ty,
+            shape: shape.iter().map(|&dim| Dim::of(dim)).collect(),
+            fields: "the instruction channel".into(),
+        };
+        let signature = Signature {
+            entry: LOOKUP_INSTRUCTION.into(),
+            inputs: vec![wanted("id", Type::I64, &[1])],
             outputs: vec![
-                value("latent", F32, &[1, c.codebook.dim], "`codebook.dim`"),
-                int("index"),
+                wanted("words", Type::F32, &[1, words, dim]),
+                wanted("length", Type::I64, &[1]),
             ],
-        },
-    ]
+        };
+        for (values, declared, what) in [
+            (&signature.inputs, &graph.input, "input"),
+            (&signature.outputs, &graph.output, "output"),
+        ] {
+            for value in values {
+                let name = format!("{LOOKUP_INSTRUCTION}/{}", value.name);
+                let found = declared.iter().find(|other| other.name == name);
+                let found = found.ok_or_else(|| format!("{what} {name} is missing"))?;
+                let (ty, shape) = declaration(found)?;
+                if ty != value.ty || shape != value.shape {
+                    return Err(differs(&name, &shape, &show(&value.shape), &value.fields));
+                }
+            }
+        }
+        Ok(signature)
+    }
+
+    /// A declared value, if it is what the contract says.
+    fn value(
+        &mut self,
+        graph: &str,
+        entry: &str,
+        declared: &ValueInfoProto,
+        input: bool,
+    ) -> Result<Value, String> {
+        let name = declared.name[graph.len() + 1..].to_owned();
+        let bound = self
+            .blueprint
+            .bind(self.contract, entry, &name, input)
+            .ok_or_else(|| {
+                format!(
+                    "value {} is bound to nothing: it names no channel and no state of a policy of kind `{}`",
+                    declared.name,
+                    self.contract.family.name()
+                )
+            })?;
+        let (mut ty, shape) = declaration(declared)?;
+        let len = shape
+            .iter()
+            .try_fold(1_usize, |len, dim| dim.known()?.checked_mul(len));
+        let fields = match bound {
+            Bound::Channel(index) => {
+                let channel = &self.contract.channels[index];
+                let squeezed = |dims: &mut dyn Iterator<Item = usize>| -> Vec<usize> {
+                    dims.filter(|&dim| dim != 1).collect()
+                };
+                let found = squeezed(&mut shape.iter().map(|dim| dim.fixed));
+                let wanted = squeezed(&mut channel.shape.iter().copied());
+                let fields = format!("channel `{}`", channel.name);
+                if len.is_none() || found != wanted {
+                    let wanted = format!("{:?}", channel.shape);
+                    return Err(differs(&declared.name, &shape, &wanted, &fields));
+                }
+                // An integer of one element is an index, others are numbers that the graph casts itself.
+                ty = match (channel.dtype, ty) {
+                    (DType::I32, Type::I64) if channel.len() == 1 && input => Type::I64,
+                    (DType::I32 | DType::U8, _) | (DType::F32, Type::F32) => Type::F32,
+                    (DType::F32, Type::I64) => {
+                        return Err(format!(
+                            "{} has elements of I64, by the contract's {fields} they are F32",
+                            declared.name
+                        ));
+                    }
+                };
+                fields
+            }
+            Bound::State(index) | Bound::Row(index) => {
+                let state = &self.blueprint.states[index];
+                let rows = match (state.keep, bound, input) {
+                    (Keep::Ring { rows, .. }, Bound::State(_), true) => rows,
+                    _ => 1,
+                };
+                let len = len.filter(|len| len.is_multiple_of(rows) && ty == Type::F32);
+                let width = len.map(|len| len / rows).ok_or_else(|| {
+                    format!(
+                        "{} is {ty:?} {}, state `{}` has {rows} rows of F32",
+                        declared.name,
+                        show(&shape),
+                        state.name
+                    )
+                })?;
+                let known = state.width.clone().unwrap_or_else(|| {
+                    self.widths
+                        .entry(index)
+                        .or_insert_with(|| (width, declared.name.clone()))
+                        .clone()
+                });
+                let fields = format!("`{}`", known.1);
+                if known.0 != width {
+                    let wanted = format!("[{rows}, {}]", known.0);
+                    return Err(differs(&declared.name, &shape, &wanted, &fields));
+                }
+                fields
+            }
+            Bound::Timestep | Bound::Phase | Bound::Pass | Bound::Selected => {
+                if ty != Type::I64 || len != Some(1) {
+                    return Err(format!(
+                        "{} is {ty:?} {}, it must be one I64",
+                        declared.name,
+                        show(&shape)
+                    ));
+                }
+                "the family".into()
+            }
+            Bound::Cache => "`network`".into(),
+        };
+        Ok(Value {
+            name,
+            ty,
+            shape,
+            fields,
+        })
+    }
+
+    /// Keys and values of every layer of the entry's transformer, and no others.
+    fn cache(
+        &self,
+        cache: Option<&str>,
+        entry: &str,
+        inputs: &[Value],
+        outputs: &[Value],
+    ) -> Result<(), String> {
+        let state = cache.and_then(|name| {
+            self.blueprint
+                .states
+                .iter()
+                .find(|state| state.name == name)
+        });
+        let network = match state.map(|state| state.keep) {
+            Some(Keep::Kv(network)) => Some(network),
+            _ => None,
+        };
+        let words = self.contract.words().map(|[words, _]| words);
+        for (values, what) in [(inputs, "past_key_values"), (outputs, "present")] {
+            let found: Vec<&Value> = values
+                .iter()
+                .filter(|value| value.name.starts_with(what))
+                .collect();
+            // What reads the instruction begins the cache, and so has no past.
+            let begins = what == "past_key_values"
+                && found.is_empty()
+                && inputs
+                    .iter()
+                    .any(|value| Some(value.shape.len()) == words.map(|_| 3));
+            let layers = match network {
+                Some(_) if begins => 0,
+                Some(network) => network.layers,
+                None => 0,
+            };
+            if found.len() != 2 * layers {
+                return Err(format!(
+                    "entry {entry} has {} values {what}, by the contract's `network` there are {}",
+                    found.len(),
+                    2 * layers
+                ));
+            }
+            for layer in 0..layers {
+                for part in ["key", "value"] {
+                    let name = format!("{what}.{layer}.{part}");
+                    let value = found.iter().find(|value| value.name == name);
+                    let value = value.ok_or_else(|| format!("value {entry}/{name} is missing"))?;
+                    let (heads, head_dim) =
+                        network.map_or((0, 0), |network| (network.heads, network.head_dim));
+                    let fits = value.ty == Type::F32
+                        && matches!(value.shape[..], [one, h, _, d]
+                            if one.is_one() && h == Dim::of(heads) && d == Dim::of(head_dim));
+                    if !fits {
+                        let wanted = format!("[1, {heads}, P, {head_dim}]");
+                        let full = format!("{entry}/{name}");
+                        return Err(differs(&full, &value.shape, &wanted, "`network`"));
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+fn differs(name: &str, found: &[Dim], wanted: &str, fields: &str) -> String {
+    format!(
+        "{name} has shape {}, by the contract's {fields} it is {wanted}",
+        show(found)
+    )
+}
+
+/// The type and shape that a value declares: symbolic axes must be called `P` or `P+n`.
+fn declaration(value: &ValueInfoProto) -> Result<(Type, Vec<Dim>), String> {
+    let name = &value.name;
+    let tensor = value.r#type.as_ref().and_then(|ty| ty.tensor_type.as_ref());
+    let tensor = tensor.ok_or_else(|| format!("{name} declares no tensor type"))?;
+    let ty = match tensor.elem_type {
+        // Bytes and small integers come as numbers: the graph casts them.
+        data_type::FLOAT | data_type::UINT8 => Type::F32,
+        data_type::INT64 | data_type::INT32 => Type::I64,
+        other => {
+            return Err(format!(
+                "{name} has elements of {}, which no channel and no state has",
+                data_type::name(other)
+            ));
+        }
+    };
+    let shape = shape_of(tensor).ok_or_else(|| {
+        format!("{name} declares no shape that can be read (the only symbolic axis is `P`)")
+    })?;
+    Ok((ty, shape))
+}
+
+fn shape_of(tensor: &TensorTypeProto) -> Option<Vec<Dim>> {
+    let dims = tensor.shape.as_ref()?.dim.iter();
+    dims.map(|dim| match (&dim.dim_value, &dim.dim_param) {
+        (Some(len), _) => usize::try_from(*len).ok().map(Dim::of),
+        (None, Some(text)) => past(text),
+        (None, None) => None,
+    })
+    .collect()
 }
 
 /// The entry that a value's name starts with: its first two parts.
@@ -146,99 +376,6 @@ pub(crate) fn entry_of(name: &str) -> Option<&str> {
     let first = name.find('/')?;
     let second = name[first + 1..].find('/')?;
     Some(&name[..=first + second])
-}
-
-/// Compares what the graph declares with what the contract says.
-pub(crate) fn check(graph: &GraphProto, contract: &Contract) -> Result<(), BundleError> {
-    let refused = |problem: String| BundleError::Entry {
-        problem: problem.into(),
-    };
-    if !graph.sparse_initializer.is_empty() {
-        return Err(refused("the graph has sparse initializers".into()));
-    }
-    let mut known = HashSet::new();
-    for Signature {
-        entry,
-        inputs,
-        outputs,
-    } in signatures(contract)
-    {
-        for (values, declared, what) in [
-            (inputs, &graph.input, "input"),
-            (outputs, &graph.output, "output"),
-        ] {
-            for value in values {
-                let name = format!("{entry}/{}", value.name);
-                let found = declared.iter().find(|other| other.name == name);
-                let found = found.ok_or_else(|| refused(format!("{what} {name} is missing")))?;
-                compare(&name, &value, found).map_err(refused)?;
-                known.insert(name);
-            }
-        }
-    }
-    for declared in graph.input.iter().chain(&graph.output) {
-        let initialized = graph
-            .initializer
-            .iter()
-            .any(|tensor| tensor.name == declared.name);
-        if !initialized && !known.contains(&declared.name) {
-            return Err(refused(format!(
-                "value {} belongs to no entry of a policy of kind `lads`",
-                declared.name
-            )));
-        }
-    }
-    Ok(())
-}
-
-/// The type and shape that a value declares: symbolic axes must be called `P` or `P+n`.
-fn declared(tensor: &TensorTypeProto) -> Option<(Option<Type>, Vec<Dim>)> {
-    let ty = match tensor.elem_type {
-        data_type::FLOAT => Some(Type::F32),
-        data_type::INT64 => Some(Type::I64),
-        _ => None,
-    };
-    let shape =
-        tensor
-            .shape
-            .as_ref()?
-            .dim
-            .iter()
-            .map(|dim| match (&dim.dim_value, &dim.dim_param) {
-                (Some(len), _) => usize::try_from(*len).ok().map(Dim::of),
-                (None, Some(text)) => {
-                    let rest = text.strip_prefix('P')?;
-                    let added = rest
-                        .trim()
-                        .strip_prefix('+')
-                        .map_or_else(|| rest.is_empty().then_some(0), |n| n.trim().parse().ok());
-                    added.map(Dim::past)
-                }
-                (None, None) => None,
-            });
-    Some((ty, shape.collect::<Option<_>>()?))
-}
-
-fn compare(name: &str, wanted: &Value, found: &ValueInfoProto) -> Result<(), String> {
-    let tensor = found.r#type.as_ref().and_then(|ty| ty.tensor_type.as_ref());
-    let tensor = tensor.ok_or_else(|| format!("{name} declares no tensor type"))?;
-    let (ty, shape) = declared(tensor).ok_or_else(|| {
-        format!("{name} declares no shape that can be read (the only symbolic axis is `P`)")
-    })?;
-    if ty != Some(wanted.ty) {
-        return Err(format!(
-            "{name} has elements of {}, it must be {:?}",
-            data_type::name(tensor.elem_type),
-            wanted.ty
-        ));
-    }
-    if shape != wanted.shape {
-        let (found, wanted_shape, fields) = (show(&shape), show(&wanted.shape), wanted.fields);
-        return Err(format!(
-            "{name} has shape {found}, by the contract's {fields} it is {wanted_shape}"
-        ));
-    }
-    Ok(())
 }
 
 /// The nodes that some values need, in the graph's order.
@@ -268,4 +405,14 @@ pub(crate) fn needed<'g>(
         .zip(wanted)
         .filter_map(|(node, wanted)| wanted.then_some(node))
         .collect()
+}
+
+/// The length that a symbolic axis stands for: `P`, the rows of the cache, or `P+n`.
+pub(crate) fn past(name: &str) -> Option<Dim> {
+    let rest = name.strip_prefix('P')?;
+    let added = rest
+        .trim()
+        .strip_prefix('+')
+        .map_or_else(|| rest.is_empty().then_some(0), |n| n.trim().parse().ok());
+    added.map(Dim::past)
 }

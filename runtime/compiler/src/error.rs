@@ -3,9 +3,7 @@
 use std::fmt;
 use std::path::PathBuf;
 
-use lads_core::{PolicyError, SelfTestError};
-
-use crate::memory::MemoryError;
+use lads_core::{Policy, PolicyError, SelfTestError};
 
 /// Text of one line: control characters, which names in a hostile file may hold, are escaped.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -71,6 +69,11 @@ pub enum BundleError {
         /// Version that is read.
         supported: u32,
     },
+    /// A contract of the first version.
+    #[error(
+        "the contract has version 1, this program reads version 2; upgrade it: `python -m lads_exporter upgrade FILE`"
+    )]
+    ContractV1,
     /// A contract that misses something or contradicts itself.
     #[error("contract: {problem}; export the bundle again")]
     Contract {
@@ -102,6 +105,9 @@ pub enum BundleError {
 /// Why a bundle does not compile.
 #[derive(Debug, thiserror::Error)]
 pub enum CompileError {
+    /// The graphs contradict the contract.
+    #[error(transparent)]
+    Bundle(BundleError),
     /// An operator that the compiler does not know, or uses of a known one that it does not.
     #[error("entry {entry}, node `{node}`: operator {operator} {problem}")]
     Operator {
@@ -128,7 +134,7 @@ pub enum CompileError {
     )]
     Plan {
         /// The program.
-        program: &'static str,
+        program: Line,
         /// What the verifier found.
         fault: crate::verify::PlanFault,
     },
@@ -152,9 +158,15 @@ pub enum CompileError {
         /// What is too large.
         what: Line,
     },
-    /// There is no memory for the image's controller.
-    #[error(transparent)]
-    Memory(#[from] MemoryError),
+    /// A controller of the policy would ask for more memory than any policy gets.
+    #[error(
+        "the policy asks for a workspace of {bytes} bytes, and gets at most {most}; do not trust it, or export a bundle with a shorter context",
+        most = Policy::MEMORY_LIMIT
+    )]
+    Excessive {
+        /// What it would ask for.
+        bytes: usize,
+    },
     /// The image that was made does not load: a defect of this compiler.
     #[error(
         "the compiled image does not load ({0}); this is a defect of the compiler, please report it with the bundle"

@@ -8,7 +8,7 @@ mod rows;
 
 use crate::entries::Signature;
 use crate::error::CompileError;
-use crate::graph::{Graph, Id, Op, topological};
+use crate::graph::{Dim, Graph, Id, Op, Type, topological};
 use crate::import::Entry;
 
 /// One entry, ready to be lowered.
@@ -29,9 +29,9 @@ pub(crate) struct Fused {
 pub(crate) fn fuse(
     entry: Entry,
     signature: &Signature,
-    wanted: &[&str],
+    wanted: &[String],
 ) -> Result<Fused, CompileError> {
-    let name = signature.entry;
+    let name = signature.entry.as_str();
     let refused = |problem: String| CompileError::Entry {
         entry: name.into(),
         problem: problem.into(),
@@ -44,7 +44,7 @@ pub(crate) fn fuse(
     let cached = attention::fuse(graph, &inputs, &outputs).map_err(|fault| fault.named(name))?;
     let kept: Vec<(String, Id)> = outputs
         .into_iter()
-        .filter(|(output, _)| wanted.contains(&output.as_str()))
+        .filter(|(output, _)| wanted.contains(output))
         .collect();
     // The constants that a value needs are part of it; inputs are kept so that their ports stay known.
     let mut fused = Fused {
@@ -75,6 +75,21 @@ pub(crate) fn fuse(
     let fused = linear::fuse(fused).map_err(refused)?;
     attention::no_past_left(&fused, name)?;
     Ok(fused)
+}
+
+impl Fused {
+    /// A program that only hands a value on: `output` is a copy of `input`.
+    pub fn copy(input: &str, output: &str, shape: &[Dim]) -> Self {
+        let mut graph = Graph::default();
+        let id = graph.input(input, shape, Type::F32);
+        Self {
+            graph,
+            inputs: vec![(input.into(), id)],
+            outputs: vec![(output.into(), id)],
+            records: vec![],
+            tokens: 0,
+        }
+    }
 }
 
 /// Which layers' attention the roots and the recording of the other layers need.

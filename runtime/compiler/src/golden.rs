@@ -1,27 +1,41 @@
-//! The golden episode of a bundle: recorded observations, the plans and actions that the reference gave for them.
+//! The golden episode of a bundle: what was observed, and the indices and actions that the reference gave for it.
 //!
 //! Stored as base64 of a safetensors blob in the model's metadata. Invariant of a [`Golden`]: all parts have the length that the
-//! contract says, plans are indices into the codebook, and every number is finite.
+//! contract says, indices are inside the codebook, and every number is finite.
 
 use base64::Engine as _;
 use safetensors::{Dtype, SafeTensors};
 
-use crate::contract::Contract;
+use crate::contract::{Channel, Contract, DType};
 use crate::error::BundleError;
 
 /// One recorded episode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Golden {
-    /// Index of the instruction.
-    pub instruction: usize,
-    /// `[T, O]`, raw units.
-    pub observations: Vec<f32>,
-    /// `[T]`: the plan in force at each control step.
-    pub plans: Vec<u32>,
+    /// Index of the instruction; `None` for a policy that takes none.
+    pub instruction: Option<usize>,
+    /// The values of each observation channel over all steps, in the contract's order.
+    pub observations: Vec<Recorded>,
+    /// `[T]`: the index in force at each control step; empty for a policy that selects none.
+    pub selected: Vec<u32>,
+    /// `[T, N]`: all draws of noise of each step in the order in which they are used; empty for a policy without noise.
+    pub noise: Vec<f32>,
     /// `[T, A]`, after clipping to the contract's limits.
     pub actions: Vec<f32>,
     /// Largest absolute difference of an action that counts as equal.
     pub tolerance: f32,
+    steps: usize,
+}
+
+/// The values of a channel over all steps, `[T, elements]`.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Recorded {
+    /// Of a channel of floats.
+    F32(Vec<f32>),
+    /// Of a channel of bytes.
+    U8(Vec<u8>),
+    /// Of a channel of integers.
+    I32(Vec<i32>),
 }
 
 impl Golden {
@@ -34,7 +48,12 @@ impl Golden {
 
     /// Control steps, `T`.
     pub fn steps(&self) -> usize {
-        self.plans.len()
+        self.steps
+    }
+
+    /// Elements of noise of a step; 0 without noise.
+    pub fn noise_len(&self) -> usize {
+        self.noise.len() / self.steps.max(1)
     }
 
     fn read(base64: &str, contract: &Contract) -> Result<Self, String> {
@@ -56,48 +75,108 @@ impl Golden {
         if !(tolerance.is_finite() && tolerance > 0.0) {
             return Err(format!("its `tolerance` {tolerance} is not positive"));
         }
-        let plans = integers(&tensors, "plans")?;
-        let steps = plans.len();
-        let codebook = contract.codebook.size;
-        let plans: Option<Vec<u32>> = plans
-            .iter()
-            .map(|&plan| {
-                u32::try_from(plan)
-                    .ok()
-                    .filter(|&plan| (plan as usize) < codebook)
-            })
-            .collect();
-        let plans = plans
-            .ok_or_else(|| format!("`plans` reach beyond the codebook's {codebook} entries"))?;
-        let instruction = match integers(&tensors, "instruction")?[..] {
-            [index] => usize::try_from(index)
-                .ok()
-                .filter(|&index| index < contract.instructions.len()),
-            _ => None,
-        };
-        let instruction = instruction.ok_or_else(|| {
-            format!(
-                "`instruction` is no index of the {} instructions",
-                contract.instructions.len()
-            )
-        })?;
+        let has = |name: &str| tensors.tensor(name).is_ok();
+        let steps = tensors
+            .tensor("actions")
+            .map_err(|_| "it has no tensor `actions`".to_owned())?
+            .shape()
+            .first()
+            .copied()
+            .unwrap_or(0);
         if steps == 0 {
             return Err("it has no steps".into());
         }
-        let observations = floats(
-            &tensors,
-            "observations",
-            [steps, contract.observation.len()],
-        )?;
-        let actions = floats(&tensors, "actions", [steps, contract.action.len()])?;
+        let instruction = if contract.words().is_some() {
+            Some(instruction(&tensors, contract)?)
+        } else {
+            None
+        };
+        let observations = contract
+            .observations()
+            .map(|channel| recorded(&tensors, channel, steps))
+            .collect::<Result<Vec<_>, _>>()?;
+        let selected = if has("selected") {
+            let selected = integers(&tensors, "selected")?;
+            if selected.len() != steps {
+                return Err(format!(
+                    "`selected` has {} steps, not {steps}",
+                    selected.len()
+                ));
+            }
+            selected
+                .iter()
+                .map(|&index| u32::try_from(index))
+                .collect::<Result<_, _>>()
+                .map_err(|_| "`selected` has an index below zero".to_owned())?
+        } else {
+            vec![]
+        };
+        let noise = if has("noise") {
+            let shape = tensors
+                .tensor("noise")
+                .map(|tensor| tensor.shape().to_vec());
+            let width = shape
+                .ok()
+                .and_then(|shape| shape.get(1).copied())
+                .unwrap_or(0);
+            floats(&tensors, "noise", &[steps, width])?
+        } else {
+            vec![]
+        };
+        let action = [&[steps][..], &contract.action().shape].concat();
+        let actions = floats(&tensors, "actions", &action)?;
         Ok(Self {
             instruction,
             observations,
-            plans,
+            selected,
+            noise,
             actions,
             tolerance,
+            steps,
         })
     }
+}
+
+fn instruction(tensors: &SafeTensors, contract: &Contract) -> Result<usize, String> {
+    let index = match integers(tensors, "instruction")?[..] {
+        [index] => usize::try_from(index)
+            .ok()
+            .filter(|&index| index < contract.instructions.len()),
+        _ => None,
+    };
+    index.ok_or_else(|| {
+        format!(
+            "`instruction` is no index of the {} instructions",
+            contract.instructions.len()
+        )
+    })
+}
+
+fn recorded(tensors: &SafeTensors, channel: &Channel, steps: usize) -> Result<Recorded, String> {
+    let name = format!("channel.{}", channel.name);
+    let shape = [&[steps][..], &channel.shape].concat();
+    let bytes = |dtype: Dtype| -> Result<Vec<u8>, String> {
+        let tensor = tensors
+            .tensor(&name)
+            .map_err(|_| format!("it has no tensor `{name}`"))?;
+        if tensor.dtype() != dtype || tensor.shape() != shape {
+            return Err(format!(
+                "`{name}` is {:?} {:?}, not {dtype:?} {shape:?}",
+                tensor.dtype(),
+                tensor.shape()
+            ));
+        }
+        Ok(tensor.data().to_vec())
+    };
+    Ok(match channel.dtype {
+        DType::F32 => Recorded::F32(floats(tensors, &name, &shape)?),
+        DType::U8 => Recorded::U8(bytes(Dtype::U8)?),
+        DType::I32 => {
+            let bytes = bytes(Dtype::I32)?;
+            let words = bytes.as_chunks().0.iter();
+            Recorded::I32(words.map(|&word| i32::from_le_bytes(word)).collect())
+        }
+    })
 }
 
 fn integers(tensors: &SafeTensors, name: &str) -> Result<Vec<i64>, String> {
@@ -120,7 +199,7 @@ fn integers(tensors: &SafeTensors, name: &str) -> Result<Vec<i64>, String> {
         .collect())
 }
 
-fn floats(tensors: &SafeTensors, name: &str, shape: [usize; 2]) -> Result<Vec<f32>, String> {
+fn floats(tensors: &SafeTensors, name: &str, shape: &[usize]) -> Result<Vec<f32>, String> {
     let tensor = tensors
         .tensor(name)
         .map_err(|_| format!("it has no tensor `{name}`"))?;

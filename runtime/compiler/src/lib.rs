@@ -1,7 +1,7 @@
 //! Compiles an ONNX bundle to a program image.
 //!
 //! ```text
-//! bundle ─► import ─► graph ─► fuse ─► lower ─► plan ─► verify ─► image
+//! bundle ─► family ─► import ─► graph ─► fuse ─► lower ─► plan ─► verify ─► image
 //! ```
 //!
 //! A [`Bundle`] is one ONNX file that holds a whole policy: the entry graphs, a contract and a golden episode. [`compile`] makes it
@@ -13,7 +13,7 @@
 //!
 //! ```text
 //! Abs Add ArgMax ArgMin BatchNormalization Cast Clip Concat Constant ConstantOfShape Div Dropout Erf Exp Expand Flatten Gather
-//! Gelu Gemm Identity LSTM LayerNormalization LeakyRelu Log LogSoftmax MatMul Max Min Mul Neg Pow Reciprocal ReduceL1 ReduceL2
+//! GRU Gelu Gemm Identity LSTM LayerNormalization LeakyRelu Log LogSoftmax MatMul Max Min Mul Neg Pow Reciprocal ReduceL1 ReduceL2
 //! ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare Relu Reshape Shape Sigmoid Slice Softmax Split Sqrt
 //! Squeeze Sub Sum Tanh Transpose Unsqueeze
 //! ```
@@ -26,24 +26,23 @@ pub mod contract;
 mod digest;
 mod entries;
 mod error;
+pub mod family;
 mod fuse;
 mod golden;
 mod graph;
 mod image;
 mod import;
 mod lower;
-mod memory;
 mod onnx;
-mod pages;
 mod plan;
 mod report;
+mod survey;
 mod tensor;
 mod verify;
 
 #[cfg(test)]
 mod tests;
 
-pub use aligned::Aligned;
 pub use bundle::Bundle;
 pub use compile::{Options, compile, compile_with};
 pub use contract::Contract;
@@ -52,6 +51,6 @@ pub use error::{BundleError, CompileError, Line};
 pub use golden::Golden;
 pub use image::Image;
 pub use lads_image::op::{CacheFormat, WeightFormat};
-pub use memory::{Memory, MemoryError};
 pub use report::{CompileReport, ProgramReport};
+pub use survey::{Field, Missing, Operand, Operator, Survey, Value, survey};
 pub use verify::PlanFault;

@@ -13,10 +13,10 @@ mod weights;
 
 use std::collections::{HashMap, HashSet};
 
-use lads_image::op::{self, CacheFormat, IntSlot, Operand, Place, Port, Space, Span, StateSpan};
+use lads_image::op::{self, CacheFormat, IntSlot, Operand, Place, Space, Span, StateSpan};
 use lads_kernels::keys_len;
 
-use crate::contract::Contract;
+use crate::contract::Network;
 use crate::error::CompileError;
 use crate::fuse::Fused;
 use crate::graph::{Graph, Id, Op, Type, topological};
@@ -33,27 +33,24 @@ pub(crate) struct Lowered {
     pub ops: Vec<op::Op>,
     /// Spans of the virtual arena that move as a whole; together they cover every span of every op.
     pub buffers: Vec<Span>,
-    pub inputs: Vec<(Port, Place)>,
-    pub outputs: Vec<(Port, Place)>,
+    pub inputs: Vec<(String, Place)>,
+    pub outputs: Vec<(String, Place)>,
     pub tokens: usize,
 }
 
-/// Where the KV cache lies in the state: for each layer keys, in whole blocks of sixteen tokens, then values,
-/// `[capacity, heads * head_dim]`.
+/// A KV cache: for each layer keys, in whole blocks of sixteen tokens, then values, `[capacity, heads * head_dim]`.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Cache {
     pub format: CacheFormat,
-    capacity: usize,
+    pub capacity: usize,
     layers: usize,
     heads: usize,
     head_dim: usize,
 }
 
 impl Cache {
-    /// Room for the longest instruction, the first observation and a pair of tokens for every later control step.
-    pub fn new(contract: &Contract, format: CacheFormat) -> Self {
-        let network = contract.network;
-        let capacity = contract.context.words + 2 * contract.context.steps - 1;
+    /// Room for so many rows.
+    pub fn new(network: Network, capacity: usize, format: CacheFormat) -> Self {
         Self {
             format,
             capacity,
@@ -62,6 +59,15 @@ impl Cache {
             head_dim: network.head_dim,
         }
     }
+
+    /// The cache of an entry that has none.
+    pub const NONE: Self = Self {
+        format: CacheFormat::F32,
+        capacity: 0,
+        layers: 0,
+        heads: 0,
+        head_dim: 0,
+    };
 
     fn width(&self) -> usize {
         self.heads * self.head_dim
@@ -95,11 +101,10 @@ impl Cache {
     }
 }
 
-/// Lowers an entry. `ports` names the ports of its inputs and outputs.
+/// Lowers an entry.
 pub(crate) fn lower(
     entry: &str,
     fused: &Fused,
-    ports: &[(&str, Port)],
     cache: Cache,
     weights: &mut Weights,
 ) -> Result<Lowered, CompileError> {
@@ -107,7 +112,7 @@ pub(crate) fn lower(
     let mut lowering = Lowering::new(fused, &order, cache, weights);
     lowering.place_concatenations(&order);
     lowering.place_residuals(&order);
-    lowering.inputs(&order, fused, ports);
+    lowering.inputs(&order, fused);
     for &id in &order {
         lowering.node(id).map_err(|problem| {
             let (operator, node) = fused.graph.origin(id);
@@ -125,7 +130,7 @@ pub(crate) fn lower(
         }
     }
     lowering
-        .outputs(fused, ports)
+        .outputs(fused)
         .map_err(|problem| CompileError::Entry {
             entry: entry.into(),
             problem: problem.into(),
@@ -151,12 +156,9 @@ pub(crate) fn lower(
     })
 }
 
-/// The port of a value at the edge.
-fn port_of(ports: &[(&str, Port)], name: &str) -> Option<Port> {
-    ports
-        .iter()
-        .find(|(known, _)| *known == name)
-        .map(|&(_, port)| port)
+/// Whether a value at the edge belongs to the KV cache, which attention reads and appends to by itself.
+fn is_cache(name: &str) -> bool {
+    name.starts_with("past_key_values.") || name.starts_with("present.")
 }
 
 /// An entry on its way to ops.
@@ -178,8 +180,8 @@ struct Lowering<'a> {
     residents: Vec<Vec<Id>>,
     /// Values that are computed inside a concatenation: buffer and offset.
     placed: HashMap<Id, (usize, usize)>,
-    input_ports: Vec<(Port, Place)>,
-    output_ports: Vec<(Port, Place)>,
+    input_ports: Vec<(String, Place)>,
+    output_ports: Vec<(String, Place)>,
 }
 
 impl<'a> Lowering<'a> {
@@ -326,13 +328,13 @@ impl<'a> Lowering<'a> {
             .all(|&id| self.pending.get(&id).copied().unwrap_or(0) <= reads(id))
     }
 
-    fn inputs(&mut self, order: &[Id], fused: &Fused, ports: &[(&str, Port)]) {
+    fn inputs(&mut self, order: &[Id], fused: &Fused) {
         let needed: HashSet<Id> = order.iter().copied().collect();
         for (name, id) in &fused.inputs {
-            let Some(port) = port_of(ports, name).filter(|_| needed.contains(id)) else {
+            if is_cache(name) || !needed.contains(id) {
                 continue;
-            };
-            let place = if port.is_int() {
+            }
+            let place = if self.g.ty(*id) == Type::I64 {
                 let slot = self.slot();
                 self.ints.insert(*id, (slot, 0));
                 Place::Int(slot)
@@ -343,7 +345,7 @@ impl<'a> Lowering<'a> {
                 self.set(*id, view);
                 place
             };
-            self.input_ports.push((port, place));
+            self.input_ports.push((name.clone(), place));
         }
     }
 
@@ -352,12 +354,12 @@ impl<'a> Lowering<'a> {
         IntSlot(self.slots - 1)
     }
 
-    fn outputs(&mut self, fused: &Fused, ports: &[(&str, Port)]) -> Result<(), String> {
+    fn outputs(&mut self, fused: &Fused) -> Result<(), String> {
         for (name, id) in &fused.outputs {
-            let Some(port) = port_of(ports, name) else {
+            if is_cache(name) {
                 continue;
-            };
-            let place = if port.is_int() {
+            }
+            let place = if self.g.ty(*id) == Type::I64 {
                 match self.ints.get(id) {
                     Some(&(slot, 0)) => Place::Int(slot),
                     _ => return Err(format!("output {name} is no index that an operation gives")),
@@ -376,7 +378,7 @@ impl<'a> Lowering<'a> {
                 };
                 Place::Span(span)
             };
-            self.output_ports.push((port, place));
+            self.output_ports.push((name.clone(), place));
         }
         if usize::from(self.slots) > op::INT_SLOTS {
             return Err(format!("more than {} indices are computed", op::INT_SLOTS));

@@ -179,6 +179,7 @@ pub(crate) struct Opaque {}
 /// Element types, as `TensorProto.DataType` numbers them.
 pub(crate) mod data_type {
     pub const FLOAT: i32 = 1;
+    pub const UINT8: i32 = 2;
     pub const INT32: i32 = 6;
     pub const INT64: i32 = 7;
 

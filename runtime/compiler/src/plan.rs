@@ -4,7 +4,7 @@
 //! from the largest to the smallest, each in the smallest gap that fits among those that live at the same time (greedy best
 //! fit). The result is not trusted: [`verify`](crate::verify) proves it.
 
-use lads_image::op::{Op, Place, Port, Span};
+use lads_image::op::{Op, Place, Span};
 
 use crate::lower::Lowered;
 
@@ -15,8 +15,8 @@ const ALIGN: u32 = 16;
 #[derive(Debug, Clone)]
 pub(crate) struct Placed {
     pub ops: Vec<Op>,
-    pub inputs: Vec<(Port, Place)>,
-    pub outputs: Vec<(Port, Place)>,
+    pub inputs: Vec<(String, Place)>,
+    pub outputs: Vec<(String, Place)>,
     pub arena_len: u32,
     /// Largest sum of the lengths of buffers that live at the same time: no plan needs less.
     pub lower_bound: u32,
@@ -48,7 +48,7 @@ pub(crate) fn plan(lowered: &Lowered) -> Placed {
     for op in &mut ops {
         op.each_span(&mut |span| moved(span));
     }
-    let ports = |ports: &[(Port, Place)]| {
+    let ports = |ports: &[(String, Place)]| {
         let place = |place: Place| match place {
             Place::Span(mut span) => {
                 moved(&mut span);
@@ -56,7 +56,10 @@ pub(crate) fn plan(lowered: &Lowered) -> Placed {
             }
             Place::Int(slot) => Place::Int(slot),
         };
-        ports.iter().map(|&(port, at)| (port, place(at))).collect()
+        ports
+            .iter()
+            .map(|(name, at)| (name.clone(), place(*at)))
+            .collect()
     };
     let ends = buffers
         .iter()
@@ -86,8 +89,8 @@ fn lives(lowered: &Lowered) -> Vec<Life> {
         let life = &mut lives[buffer_of(&lowered.buffers, span)];
         *life = Some(life.map_or((time, time), |(from, to)| (from.min(time), to.max(time))));
     };
-    let spans = |ports: &[(Port, Place)]| -> Vec<Span> {
-        let span = |&(_, place): &(Port, Place)| match place {
+    let spans = |ports: &[(String, Place)]| -> Vec<Span> {
+        let span = |(_, place): &(String, Place)| match *place {
             Place::Span(span) => Some(span),
             Place::Int(_) => None,
         };

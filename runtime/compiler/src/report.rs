@@ -5,10 +5,10 @@ use std::fmt;
 /// One program of an image.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ProgramReport {
-    /// For example `step_decide`.
-    pub name: &'static str,
-    /// The entry it was compiled from.
-    pub entry: &'static str,
+    /// For example `high_level/record`.
+    pub name: String,
+    /// The graph it was compiled from; empty for one that only copies.
+    pub entry: String,
     /// Number of ops.
     pub ops: usize,
     /// Elements of arena that the memory plan needs.
@@ -24,7 +24,7 @@ pub struct CompileReport {
     pub programs: Vec<ProgramReport>,
     /// Bytes of weights, tables and word embeddings, each content once.
     pub weight_bytes: usize,
-    /// 4-byte words of state that the KV cache takes.
+    /// 4-byte words of state that rings and KV caches take.
     pub cache_len: usize,
 }
 
@@ -44,19 +44,19 @@ impl fmt::Display for CompileReport {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         writeln!(
             f,
-            "{:<12} {:>5} {:>8} {:>8}",
+            "{:<26} {:>5} {:>8} {:>8}",
             "program", "ops", "arena", "at least"
         )?;
         for program in &self.programs {
             writeln!(
                 f,
-                "{:<12} {:>5} {:>8} {:>8}",
+                "{:<26} {:>5} {:>8} {:>8}",
                 program.name, program.ops, program.arena_len, program.arena_lower_bound
             )?;
         }
         write!(
             f,
-            "weights {} bytes, KV cache {} bytes",
+            "weights {} bytes, rings and KV caches {} bytes",
             self.weight_bytes,
             self.cache_len * 4
         )

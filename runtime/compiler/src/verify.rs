@@ -5,7 +5,7 @@
 //! still is the one meant. So if two values that are both still read overlapped, or something was read that nobody had written,
 //! some read would find something else. The ops themselves must be the same but for their offsets.
 
-use lads_image::op::{INT_SLOTS, Op, Place, Port, Span};
+use lads_image::op::{INT_SLOTS, Op, Place, Span};
 use lads_image::{Access, AccessKind};
 
 use crate::lower::Lowered;
@@ -99,8 +99,8 @@ pub(crate) fn verify(planned: &Lowered, placed: &Placed) -> Result<(), PlanFault
 
 /// The places of the same ports.
 fn ports(
-    planned: &[(Port, Place)],
-    placed: &[(Port, Place)],
+    planned: &[(String, Place)],
+    placed: &[(String, Place)],
     op: usize,
 ) -> Result<Vec<(Place, Place)>, PlanFault> {
     let same = planned.len() == placed.len()

@@ -31,6 +31,7 @@ pub struct Contract<'a> {
     action: u32,
     action_len: u32,
     instruction: Option<u32>,
+    noise: Option<u32>,
 }
 
 /// Which channel of a policy: its position among [`Contract::channels`].
@@ -102,6 +103,8 @@ pub struct Element<'a> {
     pub joint: &'a str,
     /// What of the joint: `position`, `velocity`, `effort`; empty where the bundle does not say.
     pub interface: &'a str,
+    /// Unit of the physical value that the element stands for; empty where the bundle does not say.
+    pub physical_unit: &'a str,
     /// Physical value of one unit of the element: physical = reference + offset + scale * value.
     pub scale: f32,
     /// Physical value of zero, on top of the channel's reference.
@@ -186,6 +189,7 @@ impl<'a> Contract<'a> {
             action: records::NONE,
             action_len: 0,
             instruction: None,
+            noise: None,
         };
         if tables.channels_len() > MAX_CHANNELS {
             return Err(ContractError::Channels);
@@ -216,7 +220,13 @@ impl<'a> Contract<'a> {
                     }
                     contract.instruction = Some(i);
                 }
-                Role::Noise | Role::Demonstration => {
+                Role::Noise => {
+                    if contract.noise.is_some() || channel.dtype() != DType::F32 {
+                        return Err(ContractError::Channels);
+                    }
+                    contract.noise = Some(i);
+                }
+                Role::Demonstration => {
                     if channel.dtype() != DType::F32 {
                         return Err(ContractError::Channels);
                     }
@@ -340,6 +350,11 @@ impl<'a> Contract<'a> {
     /// The channel of word embeddings; `None` for a policy that takes no instruction.
     pub fn instruction_channel(&self) -> Option<Channel<'a>> {
         self.channel(ChannelId(self.instruction?))
+    }
+
+    /// The channel of random numbers; `None` for a policy that takes none.
+    pub fn noise_channel(&self) -> Option<Channel<'a>> {
+        self.channel(ChannelId(self.noise?))
     }
 
     /// Words of the longest instruction; 0 for a policy that takes none.
@@ -569,6 +584,7 @@ impl<'a> Channel<'a> {
                 unit: tables.text(record.unit),
                 joint: tables.text(record.joint),
                 interface: tables.text(record.interface),
+                physical_unit: tables.text(record.physical_unit),
                 scale: record.scale,
                 offset: record.offset,
                 limits: Interval {
@@ -611,7 +627,8 @@ impl<'a> Channel<'a> {
 pub enum ContractError {
     /// The control period, the temperature or the acceptance threshold is not a number that makes sense.
     Number,
-    /// No observation or more than a step has room for, no action or more than one, too many channels in all, a name twice, or a role whose elements have the wrong type.
+    /// No observation or more than a step has room for, no action, more than one action, instruction or noise, too many channels
+    /// in all, a name twice, or a role whose elements have the wrong type.
     Channels,
     /// The shape of a channel makes no sense, or its elements are not as many.
     Shape {

@@ -7,8 +7,8 @@
 
 use lads_image::place::{INT_SLOTS, Place, Span};
 use lads_image::records::{
-    self, CallRecord, EntryRecord, Event, Fill, MAX_ROW_STATES, PortRecord, Repeat, Role, Scope,
-    Source, SourceKind, StateKind, StateRecord,
+    self, CallRecord, EntryRecord, Event, Fill, MAX_ROW_STATES, PortRecord, Repeat, Scope, Source,
+    SourceKind, StateKind, StateRecord,
 };
 use lads_image::{ExecError, Machine, Program, Tables};
 use lads_kernels::assign;
@@ -17,7 +17,6 @@ use crate::contract::ChannelId;
 use crate::errors::RunError;
 use crate::inputs::Data;
 use crate::normal::Normals;
-use crate::schedule::Chain;
 use crate::workspace::Workspace;
 
 /// The integers of a program.
@@ -89,8 +88,10 @@ pub(crate) struct Run<'r, 'a, 'm, 'd> {
     pub memory: &'r mut Workspace<'m>,
     /// Channel of the action.
     pub action: u32,
-    /// What the caller gave.
+    /// What the caller gave, but for noise, which is drawn.
     pub given: &'r [(ChannelId, Data<'d>)],
+    /// Channel of the noise.
+    pub noise: Option<u32>,
     pub draws: Draws<'d>,
     pub counters: Counters,
     /// Words of the instruction that is taken in.
@@ -263,15 +264,10 @@ impl Run<'_, '_, '_, '_> {
     fn read(&mut self, source: Source, span: Span, pass: u32) -> Result<(), RunError> {
         match source.kind {
             SourceKind::Channel => {
-                // Of noise the caller gave all draws of the step, of which each run takes the next.
-                let drawn = matches!(self.draws, Draws::Given(_))
-                    && self
-                        .tables
-                        .channel(source.of as usize)
-                        .is_some_and(|channel| channel.role == Role::Noise);
                 let given = self.given.iter().find(|(id, _)| id.0 == source.of);
                 let to = elements(self.memory.arena, span)?;
-                match given.filter(|_| !drawn) {
+                match given {
+                    _ if self.noise == Some(source.of) => self.draws.next(to),
                     Some(&(_, Data::F32(values))) => fill(to, values),
                     Some(&(_, Data::U8(values))) => {
                         to.iter_mut()
@@ -284,7 +280,8 @@ impl Run<'_, '_, '_, '_> {
                             .for_each(|(to, &value)| *to = value as f32);
                     }
                     None if source.of == self.action => assign(to, self.memory.now.action),
-                    None => self.draws.next(to),
+                    // Only where nothing is given at all: to warm up.
+                    None => to.fill(0.0),
                 }
                 Ok(())
             }
@@ -411,19 +408,4 @@ fn wrapped(ring: &StateRecord, start: u32, by: u32) -> u32 {
 fn row_at(ring: &StateRecord, start: u32, by: u32) -> usize {
     let row = wrapped(ring, start, by) as usize;
     (ring.offset as usize).saturating_add(row.saturating_mul(ring.width as usize))
-}
-
-/// The calls of one event that run at a timestep.
-#[inline]
-pub(crate) fn due<'a>(
-    tables: &Tables<'a>,
-    event: Event,
-    timestep: u32,
-) -> impl Iterator<Item = CallRecord> + use<'a> {
-    let mut chain = Chain::default();
-    tables
-        .calls()
-        .skip_while(move |call| call.event != event)
-        .take_while(move |call| call.event == event)
-        .filter(move |call| chain.runs(call, timestep))
 }

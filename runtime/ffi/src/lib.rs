@@ -5,13 +5,13 @@
 //! ```c
 //! static lads_policy policy;                                   // all memory is yours
 //! lads_status status = lads_policy_open(image, image_bytes, &policy);
-//! if (status != LADS_OK) fail(lads_status_text(status));
+//! if (status != LADS_STATUS_OK) fail(lads_status_text(status));
 //! void *workspace = aligned_alloc(LADS_WORKSPACE_ALIGN, lads_workspace_bytes(&policy));
 //! lads_controller *controller;
 //! lads_controller_init(&policy, workspace, lads_workspace_bytes(&policy), NULL, &controller);
 //! lads_self_test(controller, NULL);                            // arms
 //! lads_set_instruction(controller, 3);
-//! for (;;) {                                                   // every control period; `action` may always be executed
+//! for (;;) {                                                   // every control period; `action` may be executed, whatever it returns
 //!     status = lads_step(controller, observation, n, &tick, action, m, NULL);
 //! }
 //! ```
@@ -279,7 +279,7 @@ pub unsafe extern "C" fn lads_self_test(
     })
 }
 
-/// Follows a known instruction, by its number, from the next step on: a new episode. `LADS_INSTRUCT_FAILED`, which a sound image
+/// Follows a known instruction, by its number, from the next step on: a new episode. `LADS_STATUS_INSTRUCT_FAILED`, which a sound image
 /// never causes, leaves the controller without an instruction.
 ///
 /// # Safety
@@ -338,7 +338,7 @@ pub unsafe extern "C" fn lads_set_decision(
     status(unsafe { handle::handle(controller) }.map(|handle| handle.guarded.set_decision(rule)))
 }
 
-/// One control period: writes an action that is finite and inside limits and rates, whatever the observation is. `LADS_OK` says
+/// One control period: writes an action that is finite and inside limits and rates, whatever the observation is. `LADS_STATUS_OK` says
 /// that it is the policy's; any other status why it is the fallback's. A null `observation` says that there is none. `tick` may
 /// be null, then nothing is stale or late; so may `report`.
 ///

@@ -177,6 +177,8 @@ record! {
         pub joint: Text,
         /// What of the joint: position, velocity, effort; empty where nobody said.
         pub interface: Text,
+        /// Unit of the physical value that the element stands for; empty where nobody said.
+        pub physical_unit: Text,
         /// Physical value of one unit of the element: physical = reference + offset + scale * value.
         pub scale: f32,
         /// Physical value of zero, on top of the channel's reference.

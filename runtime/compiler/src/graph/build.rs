@@ -372,8 +372,8 @@ impl Graph {
     /// Rows of `table` along its first axis, by an integer of one element.
     pub fn gather_row(&mut self, table: Id, index: Id) -> Built {
         let shape = self.shape(table).to_vec();
-        if self.constant(table).is_none() || shape.is_empty() {
-            return Err("the table that is looked up must be a constant".into());
+        if shape.is_empty() || self.known_shape(table).is_none() {
+            return Err("the table that is looked up must have rows of known length".into());
         }
         if self.ty(index) != Type::I64 || self.shape(index).iter().any(|dim| !dim.is_one()) {
             return Err(format!(

@@ -68,6 +68,7 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
         "ArgMin" => arg(g, x, a, Op::ArgMin),
         "ArgMax" => arg(g, x, a, Op::ArgMax),
         "LSTM" => recurrent::lstm(g, x, a),
+        "GRU" => recurrent::gru(g, x, a),
         _ => shapes::translate(g, operator, x, a),
     }
 }

@@ -1,7 +1,12 @@
-//! The LSTM, unrolled: the horizon is static, so every step becomes operations of its own.
+//! LSTM and GRU, unrolled: the number of steps is static, so every step becomes operations of its own.
 //!
-//! With the gates in ONNX' order i, o, f, c (Hochreiter & Schmidhuber 1997, with forget gates):
+//! LSTM, with the gates in ONNX' order i, o, f, c (Hochreiter & Schmidhuber 1997, with forget gates):
 //! `g = x_t·W^T + h·R^T + Wb + Rb`, `c = sigmoid(g_f) * c + sigmoid(g_i) * tanh(g_c)`, `h = sigmoid(g_o) * tanh(c)`.
+//!
+//! GRU, with the gates in the order z, r, h (Cho et al. 2014): `z = sigmoid(..)`, `r = sigmoid(..)`,
+//! `n = tanh(x_t·W_h^T + Wb_h + (r * h)·R_h^T + Rb_h)`, or with `linear_before_reset`, as PyTorch has it,
+//! `n = tanh(x_t·W_h^T + Wb_h + r * (h·R_h^T + Rb_h))`; then `h = (1 - z) * n + z * h`.
+//!
 //! The input's share of all steps is one product.
 
 use lads_image::op::{BinaryKind, UnaryKind};
@@ -14,11 +19,42 @@ use crate::graph::{Dim, Graph, Id, Unary};
 /// The most steps that are unrolled.
 const MAX_STEPS: usize = 512;
 
+/// Which network.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Lstm,
+    Gru {
+        /// Whether the hidden state is multiplied by its weights before the reset gate is applied.
+        linear_before_reset: bool,
+    },
+}
+
+impl Kind {
+    fn gates(self) -> usize {
+        match self {
+            Self::Lstm => 4,
+            Self::Gru { .. } => 3,
+        }
+    }
+
+    /// The standard non-linearities, in ONNX' order.
+    fn activations(self) -> &'static [&'static str] {
+        match self {
+            Self::Lstm => &["sigmoid", "tanh", "tanh"],
+            Self::Gru { .. } => &["sigmoid", "tanh"],
+        }
+    }
+}
+
 /// Weights of one direction, transposed.
 struct Cell {
+    kind: Kind,
     input: Id,
     recurrent: Id,
+    /// Added to the input's share.
     bias: Option<Id>,
+    /// Added to the hidden state's share, where it is not part of `bias`.
+    recurrent_bias: Option<Id>,
     hidden: usize,
 }
 
@@ -31,7 +67,29 @@ struct Run {
 
 /// Adds an LSTM to the graph. Inputs `X, W, R, B, sequence_lens, initial_h, initial_c, P`, outputs `Y, Y_h, Y_c`.
 pub(super) fn lstm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
-    check(x, a)?;
+    x.at_most(7)?;
+    a.only("input_forget", 0)?;
+    unrolled(g, x, a, Kind::Lstm)
+}
+
+/// Adds a GRU to the graph. Inputs `X, W, R, B, sequence_lens, initial_h`, outputs `Y, Y_h`.
+pub(super) fn gru(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
+    x.at_most(6)?;
+    let linear_before_reset = a.flag("linear_before_reset", false)?;
+    let mut all = unrolled(
+        g,
+        x,
+        a,
+        Kind::Gru {
+            linear_before_reset,
+        },
+    )?;
+    all.truncate(2);
+    Ok(all)
+}
+
+fn unrolled(g: &mut Graph, x: &Operands, a: &Attributes, kind: Kind) -> Outputs {
+    check(x, a, kind)?;
     let reverse: &[bool] = match a.text("direction")?.as_deref() {
         None | Some("forward") => &[false],
         Some("reverse") => &[true],
@@ -54,7 +112,7 @@ pub(super) fn lstm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     }
     let mut runs = vec![];
     for (direction, &reverse) in reverse.iter().enumerate() {
-        let cell = cell(g, x, direction)?;
+        let cell = cell(g, x, direction, kind)?;
         if hidden >= 0 && cell.hidden as i64 != hidden {
             return Err(format!(
                 "has hidden_size = {hidden}, its weights have {}",
@@ -81,24 +139,23 @@ pub(super) fn lstm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
 }
 
 /// Refuses what the unrolled form does not compute.
-fn check(x: &Operands, a: &Attributes) -> Result<(), String> {
-    x.at_most(7)?;
+fn check(x: &Operands, a: &Attributes, kind: Kind) -> Result<(), String> {
     if x.optional(4).is_some() {
         return Err("does not support sequence_lens".into());
     }
-    a.only("input_forget", 0)?;
     if a.float("clip", f32::INFINITY)? != f32::INFINITY {
         return Err("does not support clip".into());
     }
     if let Some(names) = a.texts("activations")? {
-        let standard = ["sigmoid", "tanh", "tanh"];
+        let standard = kind.activations();
         if names
             .iter()
             .enumerate()
-            .any(|(i, name)| name.to_lowercase() != standard[i % 3])
+            .any(|(i, name)| name.to_lowercase() != standard[i % standard.len()])
         {
             return Err(format!(
-                "supports the activations Sigmoid, Tanh, Tanh only, not {}",
+                "supports the activations {} only, not {}",
+                standard.join(", "),
                 names.join(", ")
             ));
         }
@@ -111,7 +168,8 @@ fn check(x: &Operands, a: &Attributes) -> Result<(), String> {
     Ok(())
 }
 
-fn cell(g: &mut Graph, x: &Operands, direction: usize) -> Result<Cell, String> {
+fn cell(g: &mut Graph, x: &Operands, direction: usize, kind: Kind) -> Result<Cell, String> {
+    let gates = kind.gates();
     let mut matrix = |id: Id| -> Result<Id, String> {
         let shape = g
             .known_shape(id)
@@ -124,27 +182,29 @@ fn cell(g: &mut Graph, x: &Operands, direction: usize) -> Result<Cell, String> {
     let (input, recurrent) = (matrix(x.get(1)?)?, matrix(x.get(2)?)?);
     let shape = g.known_shape(recurrent).unwrap_or_default();
     let hidden = shape[0];
-    if shape[1] != 4 * hidden {
+    if shape[1] != gates * hidden {
         return Err(format!(
-            "has recurrent weights of shape {shape:?}, not hidden by 4 hidden"
+            "has recurrent weights of shape {shape:?}, not hidden by {gates} hidden"
         ));
     }
-    let bias = match x.optional(3) {
-        None => None,
-        Some(id) => {
-            let own = g.slice(id, 0, direction, 1)?;
-            let flat = g.reshape(own, &[Dim::of(8 * hidden)])?;
-            let (input, recurrent) = (
-                g.slice(flat, 0, 0, 4 * hidden)?,
-                g.slice(flat, 0, 4 * hidden, 4 * hidden)?,
-            );
-            Some(g.binary(BinaryKind::Add, input, recurrent)?)
+    let (mut bias, mut recurrent_bias) = (None, None);
+    if let Some(id) = x.optional(3) {
+        let len = gates * hidden;
+        let own = g.slice(id, 0, direction, 1)?;
+        let flat = g.reshape(own, &[Dim::of(2 * len)])?;
+        let (input, recurrent) = (g.slice(flat, 0, 0, len)?, g.slice(flat, 0, len, len)?);
+        if kind == Kind::Lstm {
+            bias = Some(g.binary(BinaryKind::Add, input, recurrent)?);
+        } else {
+            (bias, recurrent_bias) = (Some(input), Some(recurrent));
         }
-    };
+    }
     Ok(Cell {
+        kind,
         input,
         recurrent,
         bias,
+        recurrent_bias,
         hidden,
     })
 }
@@ -167,27 +227,16 @@ fn run(
     for step in 0..steps {
         let t = if reverse { steps - 1 - step } else { step };
         let share = g.slice(shares, 0, t, 1)?;
-        let mut gates = g.reshape(share, &[Dim::of(batch), Dim::of(4 * n)])?;
-        if let Some(h) = h {
-            let recurrent = g.matmul(h, cell.recurrent)?;
-            gates = g.binary(BinaryKind::Add, recurrent, gates)?;
-        }
-        let open = g.slice(gates, 1, 0, 3 * n)?;
-        let open = g.unary(Unary::of(UnaryKind::Sigmoid), open)?;
-        let (i, o, f) = (
-            g.slice(open, 1, 0, n)?,
-            g.slice(open, 1, n, n)?,
-            g.slice(open, 1, 2 * n, n)?,
-        );
-        let candidate = g.slice(gates, 1, 3 * n, n)?;
-        let candidate = g.unary(Unary::of(UnaryKind::Tanh), candidate)?;
-        let mut next = g.binary(BinaryKind::Mul, i, candidate)?;
-        if let Some(c) = c {
-            let kept = g.binary(BinaryKind::Mul, f, c)?;
-            next = g.binary(BinaryKind::Add, kept, next)?;
-        }
-        let bent = g.unary(Unary::of(UnaryKind::Tanh), next)?;
-        let out = g.binary(BinaryKind::Mul, o, bent)?;
+        let share = g.reshape(share, &[Dim::of(batch), Dim::of(cell.kind.gates() * n)])?;
+        let (out, next) = match cell.kind {
+            Kind::Lstm => lstm_step(g, cell, share, h, c)?,
+            Kind::Gru {
+                linear_before_reset,
+            } => {
+                let out = gru_step(g, cell, share, h, linear_before_reset)?;
+                (out, out)
+            }
+        };
         (h, c) = (Some(out), Some(next));
         all.push(out);
     }
@@ -198,6 +247,101 @@ fn run(
         return Err("has no steps".into());
     };
     Ok(Run { all, h, c })
+}
+
+/// One step of an LSTM from the input's share of the gates: the new `h` and `c`.
+fn lstm_step(
+    g: &mut Graph,
+    cell: &Cell,
+    share: Id,
+    h: Option<Id>,
+    c: Option<Id>,
+) -> Result<(Id, Id), String> {
+    let n = cell.hidden;
+    let mut gates = share;
+    if let Some(h) = h {
+        let recurrent = g.matmul(h, cell.recurrent)?;
+        gates = g.binary(BinaryKind::Add, recurrent, gates)?;
+    }
+    let open = g.slice(gates, 1, 0, 3 * n)?;
+    let open = g.unary(Unary::of(UnaryKind::Sigmoid), open)?;
+    let (i, o, f) = (
+        g.slice(open, 1, 0, n)?,
+        g.slice(open, 1, n, n)?,
+        g.slice(open, 1, 2 * n, n)?,
+    );
+    let candidate = g.slice(gates, 1, 3 * n, n)?;
+    let candidate = g.unary(Unary::of(UnaryKind::Tanh), candidate)?;
+    let mut next = g.binary(BinaryKind::Mul, i, candidate)?;
+    if let Some(c) = c {
+        let kept = g.binary(BinaryKind::Mul, f, c)?;
+        next = g.binary(BinaryKind::Add, kept, next)?;
+    }
+    let bent = g.unary(Unary::of(UnaryKind::Tanh), next)?;
+    Ok((g.binary(BinaryKind::Mul, o, bent)?, next))
+}
+
+/// One step of a GRU from the input's share of the gates: the new `h`.
+fn gru_step(
+    g: &mut Graph,
+    cell: &Cell,
+    share: Id,
+    h: Option<Id>,
+    linear_before_reset: bool,
+) -> Result<Id, String> {
+    let n = cell.hidden;
+    let sigmoid = Unary::of(UnaryKind::Sigmoid);
+    // The hidden state's share of gates `from..to`, with its bias; nothing without either.
+    let recurrent = |g: &mut Graph, h: Option<Id>, from: usize, to: usize| {
+        let mut sum = None;
+        if let Some(h) = h {
+            let weights = g.slice(cell.recurrent, 1, from * n, (to - from) * n)?;
+            sum = Some(g.matmul(h, weights)?);
+        }
+        if let Some(bias) = cell.recurrent_bias {
+            let bias = g.slice(bias, 0, from * n, (to - from) * n)?;
+            sum = Some(match sum {
+                Some(sum) => g.binary(BinaryKind::Add, sum, bias)?,
+                None => bias,
+            });
+        }
+        Ok::<_, String>(sum)
+    };
+    let mut gates = g.slice(share, 1, 0, 2 * n)?;
+    if let Some(sum) = recurrent(g, h, 0, 2)? {
+        gates = g.binary(BinaryKind::Add, sum, gates)?;
+    }
+    let gates = g.unary(sigmoid, gates)?;
+    let (z, r) = (g.slice(gates, 1, 0, n)?, g.slice(gates, 1, n, n)?);
+    let mut candidate = g.slice(share, 1, 2 * n, n)?;
+    let added = if linear_before_reset {
+        match recurrent(g, h, 2, 3)? {
+            Some(sum) => Some(g.binary(BinaryKind::Mul, r, sum)?),
+            None => None,
+        }
+    } else {
+        let reset = match h {
+            Some(h) => Some(g.binary(BinaryKind::Mul, r, h)?),
+            None => None,
+        };
+        recurrent(g, reset, 2, 3)?
+    };
+    if let Some(added) = added {
+        candidate = g.binary(BinaryKind::Add, candidate, added)?;
+    }
+    let candidate = g.unary(Unary::of(UnaryKind::Tanh), candidate)?;
+    // (1 - z) * n + z * h = n + z * (h - n)
+    match h {
+        Some(h) => {
+            let rest = g.binary(BinaryKind::Sub, h, candidate)?;
+            let kept = g.binary(BinaryKind::Mul, z, rest)?;
+            g.binary(BinaryKind::Add, candidate, kept)
+        }
+        None => {
+            let lost = g.binary(BinaryKind::Mul, z, candidate)?;
+            g.binary(BinaryKind::Sub, candidate, lost)
+        }
+    }
 }
 
 /// `Y [steps, directions, batch, hidden]`, `Y_h` and `Y_c [directions, batch, hidden]`; with `layout` 1 the batch comes first.

@@ -342,10 +342,14 @@ impl Lowering<'_> {
             .get(&index)
             .ok_or("looks up with an index that is not computed")?;
         let shift = i32::try_from(shift).map_err(|_| "adds too much to an index")?;
-        let table = self.plain(table)?;
+        let table = if self.g.constant(table).is_some() {
+            self.plain(table)?.into()
+        } else {
+            self.contiguous(table)?.into()
+        };
         let y = self.allocate(id, &shape);
         let op = GatherRow {
-            table: table.into(),
+            table,
             row_len: product(&shape) as u32,
             rows,
             index: slot,

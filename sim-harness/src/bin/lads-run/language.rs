@@ -4,7 +4,7 @@ use lads_compiler::Bundle;
 use lads_core::{KnownInstruction, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::results::{HeardBy, NearestKnown, Results};
-use lads_sim::spoken::{self, Sentence, WordBook};
+use lads_sim::spoken::{self, Sentence, Unaccepted, WordBook};
 
 use crate::arguments::Arguments;
 use crate::end::{End, refused};
@@ -182,8 +182,12 @@ fn hear_sentence<'p>(
             format!("'{shown}': {near}; {why}: followed because of --sentence-anyway\n\n")
         }
         Err(why) => {
+            let remedy = match why {
+                Unaccepted::Below { .. } => "say it in words that are more like a known one",
+                Unaccepted::Uncalibrated => "export it with a calibration",
+            };
             return Err(refused(format!(
-                "--instruction '{shown}': {near}; {why}; say it in words that are more like a known one, or insist with --sentence-anyway"
+                "--instruction '{shown}': {near}; {why}; {remedy}, or insist with --sentence-anyway"
             )));
         }
     };

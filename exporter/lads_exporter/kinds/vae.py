@@ -1,0 +1,70 @@
+"""`vae`: the high level gives the mean and the deviation of a continuous plan, the low level is an MLP on observation and plan."""
+
+import torch
+from torch import nn
+
+from .. import config, graphs
+from ..model import LowLevelPolicy, TrajectoryEncoder
+from . import common
+
+LOG_STD = (-10.0, 2.0)
+
+
+class Vae(nn.Module):
+    """High level with a Gaussian head, low level, and the trajectory encoder's mean."""
+
+    def __init__(self, sizes):
+        super().__init__()
+        self.normalizer = common.normalizer()
+        self.high_level = common.high_level(sizes, 2 * sizes.plan)
+        low_level = config.LowLevel(sizes.hidden, 4, 0.2, 1.0)
+        self.low_level = LowLevelPolicy(low_level, sizes.observation, sizes.plan, sizes.action)
+        self.encoder = TrajectoryEncoder(16, sizes.observation, sizes.action, sizes.plan, sizes.observation, False)
+
+    def plans(self, words, observations, actions):
+        """words [L, E], observations [T, O] in raw units, actions [T, A] as executed -> mean and log deviation [T, D]."""
+        mean, log_std = self.high_level([words], self.normalizer(observations)[None], actions[None])[0].chunk(2, -1)
+        return mean, log_std.clamp(*LOG_STD)
+
+    def act(self, observations, plans):
+        return self.low_level(self.normalizer(observations), plans)
+
+
+def _half(module, part):
+    """Half of a linear layer's outputs as a layer of its own."""
+    rows = module.out_features // 2
+    half = nn.Linear(module.in_features, rows)
+    pick = slice(part * rows, (part + 1) * rows)
+    with torch.no_grad():
+        half.weight.copy_(module.weight[pick])
+        half.bias.copy_(module.bias[pick])
+    return half
+
+
+def _sample(graph, dim):
+    entry = graphs.Entry(graph, "plan/sample")
+    mean, log_std, noise = (entry.input(name, [1, dim]) for name in ("plan_mean", "plan_log_std", "noise"))
+    scaled = entry.op("Mul", [entry.op("Exp", [log_std], "std"), noise], "scaled_noise")
+    entry.op("Add", [mean, scaled], "plan")
+    entry.output("plan", [1, dim])
+
+
+def build(policy, sizes):
+    graph = common.graph_of(policy)
+    mean, log_std = (_half(policy.high_level.head, part) for part in (0, 1))
+    for first in (True, False):
+        entry, x, _ = graphs.high_level_state(graph, policy.high_level, policy.normalizer, first, "action")
+        graphs.head(entry, x, mean, "plan_mean", "high_level.plan_mean")
+        wide = entry.gemm(x, entry.weight("high_level.plan_log_std.weight", log_std.weight), entry.weight("high_level.plan_log_std.bias", log_std.bias), "log_std")
+        low, high = (entry.scalar(f"log_std_{name}", value) for name, value in zip(("low", "high"), LOG_STD))
+        entry.op("Clip", [wide, low, high], "plan_log_std")
+        entry.output("plan_log_std", [1, sizes.plan])
+    _sample(graph, sizes.plan)
+    graphs.low_level_act(graph, policy.low_level, policy.normalizer)
+    graphs.trajectory_encode(graph, policy.encoder, None, policy.normalizer, sizes.horizon)
+    return graph.model("vae")
+
+
+def contract(sizes, seed):
+    family = {"kind": "vae", "horizon": sizes.horizon, "plan": {"dim": sizes.plan}, "decision": {"rule": "sample", "seed": seed}}
+    return common.contract(family, sizes, seed, noise=[sizes.plan], segment=sizes.horizon)

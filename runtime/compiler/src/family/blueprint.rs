@@ -1,0 +1,344 @@
+//! How a policy is put together, before shapes are known: states, entries and calls by their names.
+
+use lads_image::records::{Event, Fill, Scope, When};
+
+use crate::contract::{Contract, Network, Role};
+
+/// The parts of a policy.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Blueprint {
+    pub states: Vec<State>,
+    pub entries: Vec<Entry>,
+    pub calls: Vec<Call>,
+    /// Control steps of a phase, where an entry reads one.
+    pub period: usize,
+}
+
+/// How a state is kept.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Keep {
+    Plain,
+    Ring { rows: usize, fill: Fill },
+    Kv(Network),
+}
+
+/// A state whose width follows from the values that are bound to it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct State {
+    pub name: String,
+    pub keep: Keep,
+    pub scope: Scope,
+    /// Elements of it or of its row, and the field of the contract that says so.
+    pub width: Option<(usize, String)>,
+}
+
+/// What a program is compiled from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Origin {
+    /// Graph of the bundle.
+    Graph(String),
+    /// A copy of a channel, to be appended to a ring.
+    Copy { channel: String },
+}
+
+/// One program.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Entry {
+    pub name: String,
+    pub origin: Origin,
+    /// Outputs of the graph that are kept, besides the cache.
+    pub outputs: Vec<String>,
+    /// KV cache that it appends to.
+    pub cache: Option<String>,
+    /// Whether its weights are in the action.
+    pub acts: bool,
+    /// Whether a bundle may leave its graph out.
+    pub optional: bool,
+}
+
+impl Entry {
+    /// An entry under its graph's name.
+    pub fn new(graph: &str, outputs: &[&str]) -> Self {
+        Self::variant(graph, graph, outputs)
+    }
+
+    /// An entry that keeps only some outputs of its graph.
+    pub fn variant(name: &str, graph: &str, outputs: &[&str]) -> Self {
+        Self {
+            name: name.into(),
+            origin: Origin::Graph(graph.into()),
+            outputs: outputs.iter().map(|&output| output.into()).collect(),
+            cache: None,
+            acts: false,
+            optional: false,
+        }
+    }
+
+    pub fn cache(mut self, state: &str) -> Self {
+        self.cache = Some(state.into());
+        self
+    }
+
+    pub fn acts(mut self) -> Self {
+        self.acts = true;
+        self
+    }
+
+    pub fn optional(mut self) -> Self {
+        self.optional = true;
+        self
+    }
+
+    /// The graph that it is compiled from, if it is one.
+    pub fn graph(&self) -> Option<&str> {
+        match &self.origin {
+            Origin::Graph(graph) => Some(graph),
+            Origin::Copy { .. } => None,
+        }
+    }
+}
+
+/// How often a call runs its entry.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Times {
+    Times(usize),
+    /// Once for each valid row of a ring.
+    Rows(String),
+}
+
+/// One line of the schedule.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Call {
+    pub event: Event,
+    pub entry: String,
+    pub when: When,
+    pub every: usize,
+    pub otherwise: bool,
+    pub times: Times,
+    pub select: Option<String>,
+    pub clears: Vec<String>,
+}
+
+impl Call {
+    /// A call of an event, at all times.
+    pub fn on(event: Event, entry: &str) -> Self {
+        Self {
+            event,
+            entry: entry.into(),
+            when: When::Always,
+            every: 0,
+            otherwise: false,
+            times: Times::Times(1),
+            select: None,
+            clears: vec![],
+        }
+    }
+
+    /// A call of every control step.
+    pub fn step(entry: &str) -> Self {
+        Self::on(Event::Step, entry)
+    }
+
+    /// Only in the first step of a context.
+    pub fn first(mut self) -> Self {
+        self.when = When::First;
+        self
+    }
+
+    /// Only at multiples of a period.
+    pub fn every(mut self, period: usize) -> Self {
+        (self.when, self.every) = (When::Every, period);
+        self
+    }
+
+    /// Only if nothing before it in its chain has run.
+    pub fn otherwise(mut self) -> Self {
+        self.otherwise = true;
+        self
+    }
+
+    pub fn times(mut self, count: usize) -> Self {
+        self.times = Times::Times(count);
+        self
+    }
+
+    pub fn rows(mut self, ring: &str) -> Self {
+        self.times = Times::Rows(ring.into());
+        self
+    }
+
+    pub fn select(mut self, scores: &str) -> Self {
+        self.select = Some(scores.into());
+        self
+    }
+
+    pub fn clears(mut self, state: &str) -> Self {
+        self.clears.push(state.into());
+        self
+    }
+}
+
+/// What a value at an entry's edge is bound to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Bound {
+    /// Index into the contract's channels.
+    Channel(usize),
+    /// Index into the blueprint's states.
+    State(usize),
+    /// A row of the ring of this index.
+    Row(usize),
+    Timestep,
+    Phase,
+    Pass,
+    Selected,
+    /// Keys or values of a layer.
+    Cache,
+}
+
+impl Blueprint {
+    pub fn state(mut self, name: &str, keep: Keep, scope: Scope) -> Self {
+        self.states.push(State {
+            name: name.into(),
+            keep,
+            scope,
+            width: None,
+        });
+        self
+    }
+
+    /// Says how wide the last state is, and which field of the contract has it from.
+    pub fn wide(mut self, width: usize, field: &str) -> Self {
+        if let Some(state) = self.states.last_mut() {
+            state.width = Some((width, field.into()));
+        }
+        self
+    }
+
+    /// A KV cache.
+    pub fn kv(self, name: &str, network: Option<Network>) -> Self {
+        // Contracts without one were refused.
+        let network = network.unwrap_or(Network {
+            layers: 0,
+            heads: 0,
+            head_dim: 0,
+        });
+        self.state(name, Keep::Kv(network), Scope::Episode)
+    }
+
+    /// A state that is taken over as a whole and lasts an episode.
+    pub fn plain(self, name: &str) -> Self {
+        self.state(name, Keep::Plain, Scope::Episode)
+    }
+
+    /// A value that one entry hands to another within a step.
+    pub fn handed(self, name: &str) -> Self {
+        self.state(name, Keep::Plain, Scope::Step)
+    }
+
+    pub fn entry(mut self, entry: Entry) -> Self {
+        self.entries.push(entry);
+        self
+    }
+
+    pub fn call(mut self, call: Call) -> Self {
+        self.calls.push(call);
+        self
+    }
+
+    /// What a value of an entry's graph is bound to, by its name; `None` for a name that means nothing.
+    pub fn bind(&self, contract: &Contract, entry: &str, name: &str, input: bool) -> Option<Bound> {
+        let channel = |found: &dyn Fn(&crate::contract::Channel) -> bool| {
+            contract.channels.iter().position(found).map(Bound::Channel)
+        };
+        let state = |name: &str| self.states.iter().position(|state| state.name == name);
+        if name.starts_with("past_key_values.") || name.starts_with("present.") {
+            return Some(Bound::Cache);
+        }
+        if matches!(name, "action") || (input && name == "previous_action") {
+            return channel(&|channel| channel.role == Role::Action);
+        }
+        if input {
+            let int = match name {
+                "timestep" => Some(Bound::Timestep),
+                "phase" => Some(Bound::Phase),
+                "pass" => Some(Bound::Pass),
+                "index" => Some(Bound::Selected),
+                _ => None,
+            };
+            if int.is_some() {
+                return int;
+            }
+            if let Some(found) = channel(&|channel| channel.name == name) {
+                return Some(found);
+            }
+            let ring = state(name)?;
+            let row = self
+                .calls
+                .iter()
+                .any(|call| call.entry == entry && call.times == Times::Rows(name.into()));
+            return Some(if row {
+                Bound::Row(ring)
+            } else {
+                Bound::State(ring)
+            });
+        }
+        if name == "index" {
+            return Some(Bound::Selected);
+        }
+        channel(&|channel| channel.role == Role::Action && channel.name == name).or_else(|| {
+            state(name.strip_prefix("next_").unwrap_or(name))
+                .or_else(|| state(name))
+                .map(Bound::State)
+        })
+    }
+
+    /// Rows that each KV cache needs, in the order of the states: the schedule is gone through step by step with the longest
+    /// instruction. `tokens` says how many rows a run of an entry appends.
+    pub fn rows(&self, contract: &Contract, tokens: impl Fn(&Entry) -> usize) -> Vec<usize> {
+        let (mut now, mut most) = (vec![0; self.states.len()], vec![0; self.states.len()]);
+        let index = |name: &str| self.states.iter().position(|state| state.name == name);
+        let mut run = |event: Event, timestep: usize| {
+            let mut taken = false;
+            for call in self.calls.iter().filter(|call| call.event == event) {
+                let due = match call.when {
+                    When::Always => true,
+                    When::First => timestep == 0,
+                    When::Every => timestep.is_multiple_of(call.every.max(1)),
+                };
+                let runs = due && !(call.otherwise && taken);
+                taken = runs || (call.otherwise && taken);
+                let found = self.entries.iter().find(|entry| entry.name == call.entry);
+                let (Some(entry), true) = (found, runs) else {
+                    continue;
+                };
+                for state in call.clears.iter().filter_map(|name| index(name)) {
+                    now[state] = 0;
+                }
+                let times = match &call.times {
+                    Times::Times(times) => *times,
+                    Times::Rows(ring) => index(ring).map_or(0, |ring| now[ring]),
+                };
+                if let Some(cache) = entry.cache.as_deref().and_then(index) {
+                    now[cache] += times * tokens(entry);
+                    most[cache] = most[cache].max(now[cache]);
+                }
+                for output in &entry.outputs {
+                    let name = output.strip_prefix("next_").unwrap_or(output);
+                    if let Some(state) = index(name)
+                        && let Keep::Ring { rows, .. } = self.states[state].keep
+                    {
+                        now[state] = (now[state] + 1).min(rows);
+                    }
+                }
+            }
+        };
+        run(Event::Instruct, 0);
+        let steps = contract
+            .context
+            .map_or(self.period.max(1), |context| context.steps);
+        for timestep in 0..steps {
+            run(Event::Step, timestep);
+        }
+        most
+    }
+}

@@ -1,0 +1,92 @@
+//! A low level that attends to a window of earlier steps and to those under its plan (the paper's Kitchen setting with images).
+//!
+//! The window is kept as a ring of rows. When the plan changes the low level's cache is emptied and filled again: with the plan, then
+//! with the rows of the window, the oldest first, then with the steps as they come.
+
+use lads_image::records::{Event, Fill, Scope};
+use serde::Deserialize;
+
+use super::{
+    Blueprint, Call, Codebook, Decision, Entry, Keep, Kind, Selection, instructed, lengths, network,
+};
+use crate::contract::{Contract, Network};
+
+/// Sizes of a row of the window.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+pub struct Memory {
+    /// Elements, `R`.
+    pub dim: usize,
+}
+
+/// The fields of the family.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct History {
+    /// Control steps from one decision to the next, `H`.
+    pub horizon: usize,
+    /// The codebook of latent plans.
+    pub codebook: Codebook,
+    /// How plans are picked.
+    pub decision: Decision,
+    /// Steps of the window, `W`.
+    pub window: usize,
+    /// Sizes of a row of the window.
+    pub memory: Memory,
+    /// The low level's transformer.
+    pub low_level: Network,
+}
+
+impl Kind for History {
+    fn period(&self) -> Option<usize> {
+        Some(self.horizon)
+    }
+
+    fn selection(&self) -> Selection {
+        self.decision.selection()
+    }
+
+    fn check(&self, contract: &Contract) -> Result<(), String> {
+        lengths([
+            ("horizon", self.horizon),
+            ("codebook.size", self.codebook.size),
+            ("codebook.dim", self.codebook.dim),
+            ("window", self.window),
+            ("memory.dim", self.memory.dim),
+        ])?;
+        network(Some(self.low_level), "family.low_level")?;
+        self.decision.check()?;
+        instructed(contract)
+    }
+
+    fn blueprint(&self, contract: &Contract) -> Blueprint {
+        let (step, record) = ("high_level/step", "high_level/record");
+        let (plan, recall, low_step) = ("low_level/plan", "low_level/recall", "low_level/step");
+        let h = self.horizon;
+        let ring = Keep::Ring {
+            rows: self.window,
+            fill: Fill::Zero,
+        };
+        let mut blueprint = Blueprint::default()
+            .kv("context", contract.network)
+            .kv("chunk", Some(self.low_level))
+            .state("row", ring, Scope::Episode)
+            .wide(self.memory.dim, "family.memory.dim")
+            .plain("logits")
+            .wide(self.codebook.size, "family.codebook.size")
+            .entry(Entry::new(step, &["logits"]).cache("context"))
+            .entry(Entry::variant(record, step, &[]).cache("context"))
+            .entry(Entry::new(plan, &[]).cache("chunk").acts())
+            .entry(Entry::new(recall, &[]).cache("chunk").acts())
+            .entry(Entry::new(low_step, &["action"]).cache("chunk").acts())
+            .entry(Entry::new("memory/append", &["next_row"]).acts())
+            .entry(Entry::new("high_level/instruct", &[]).cache("context"))
+            .call(Call::on(Event::Instruct, "high_level/instruct"))
+            .call(Call::step(step).every(h).select("logits"))
+            .call(Call::step(record).otherwise())
+            .call(Call::step(plan).every(h).clears("chunk"))
+            .call(Call::step(recall).every(h).rows("row"))
+            .call(Call::step(low_step))
+            .call(Call::step("memory/append"));
+        blueprint.period = h;
+        blueprint
+    }
+}

@@ -1,0 +1,67 @@
+//! LCSD (our reading of it): a plan in every step, and one action by denoising.
+
+use lads_image::records::Event;
+use serde::Deserialize;
+
+use super::{
+    Blueprint, Call, Codebook, Decision, Denoise, Entry, Kind, Noise, NoiseSource, Selection,
+    instructed, lengths, one_noise,
+};
+use crate::contract::Contract;
+
+/// The fields of the family.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct Lcsd {
+    /// The codebook of latent plans.
+    pub codebook: Codebook,
+    /// How plans are picked.
+    pub decision: Decision,
+    /// Denoising of an action.
+    pub denoise: Denoise,
+    /// Where its noise comes from.
+    pub noise: NoiseSource,
+}
+
+impl Kind for Lcsd {
+    fn period(&self) -> Option<usize> {
+        Some(1)
+    }
+
+    fn selection(&self) -> Selection {
+        self.decision.selection()
+    }
+
+    fn noise(&self) -> Noise {
+        self.noise.noise()
+    }
+
+    fn check(&self, contract: &Contract) -> Result<(), String> {
+        lengths([
+            ("codebook.size", self.codebook.size),
+            ("codebook.dim", self.codebook.dim),
+            ("denoise.steps", self.denoise.steps),
+        ])?;
+        self.decision.check()?;
+        one_noise(contract)?;
+        instructed(contract)
+    }
+
+    fn blueprint(&self, contract: &Contract) -> Blueprint {
+        let (init, denoise, act) = ("low_level/init", "low_level/denoise", "low_level/act");
+        Blueprint::default()
+            .kv("context", contract.network)
+            .plain("logits")
+            .wide(self.codebook.size, "family.codebook.size")
+            .handed("x")
+            .entry(Entry::new("high_level/step", &["logits"]).cache("context"))
+            .entry(Entry::new(init, &["x"]).acts())
+            .entry(Entry::new(denoise, &["next_x"]).acts())
+            .entry(Entry::new(act, &["action"]).acts())
+            .entry(Entry::new("high_level/instruct", &[]).cache("context"))
+            .call(Call::on(Event::Instruct, "high_level/instruct"))
+            .call(Call::step("high_level/step").select("logits"))
+            .call(Call::step(init))
+            .call(Call::step(denoise).times(self.denoise.steps))
+            .call(Call::step(act))
+    }
+}

@@ -1,0 +1,71 @@
+//! LISA: a high level that sees one token a step, and a low level that attends to the steps under the plan in force.
+//!
+//! ```text
+//! t % H == 0   step:      s_t -> logits, select        otherwise   record:   s_t
+//! t % H == 0   low start: (index, s_t) -> a_t          otherwise   low step: (a_{t-1}, index, s_t) -> a_t
+//! ```
+//!
+//! The low level's cache is emptied when the plan changes.
+
+use lads_image::records::Event;
+use serde::Deserialize;
+
+use super::{
+    Blueprint, Call, Codebook, Decision, Entry, Kind, Selection, instructed, lengths, network,
+};
+use crate::contract::{Contract, Network};
+
+/// The fields of the family.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct Lisa {
+    /// Control steps from one decision to the next, `H`.
+    pub horizon: usize,
+    /// The codebook of latent plans.
+    pub codebook: Codebook,
+    /// How plans are picked.
+    pub decision: Decision,
+    /// The low level's transformer.
+    pub low_level: Network,
+}
+
+impl Kind for Lisa {
+    fn period(&self) -> Option<usize> {
+        Some(self.horizon)
+    }
+
+    fn selection(&self) -> Selection {
+        self.decision.selection()
+    }
+
+    fn check(&self, contract: &Contract) -> Result<(), String> {
+        lengths([
+            ("horizon", self.horizon),
+            ("codebook.size", self.codebook.size),
+            ("codebook.dim", self.codebook.dim),
+        ])?;
+        network(Some(self.low_level), "family.low_level")?;
+        self.decision.check()?;
+        instructed(contract)
+    }
+
+    fn blueprint(&self, contract: &Contract) -> Blueprint {
+        let (step, record) = ("high_level/step", "high_level/record");
+        let (low_start, low_step) = ("low_level/start", "low_level/step");
+        let h = self.horizon;
+        Blueprint::default()
+            .kv("context", contract.network)
+            .kv("chunk", Some(self.low_level))
+            .plain("logits")
+            .wide(self.codebook.size, "family.codebook.size")
+            .entry(Entry::new(step, &["logits"]).cache("context"))
+            .entry(Entry::variant(record, step, &[]).cache("context"))
+            .entry(Entry::new(low_start, &["action"]).cache("chunk").acts())
+            .entry(Entry::new(low_step, &["action"]).cache("chunk").acts())
+            .entry(Entry::new("high_level/instruct", &[]).cache("context"))
+            .call(Call::on(Event::Instruct, "high_level/instruct"))
+            .call(Call::step(step).every(h).select("logits"))
+            .call(Call::step(record).otherwise())
+            .call(Call::step(low_start).every(h).clears("chunk"))
+            .call(Call::step(low_step).otherwise())
+    }
+}

@@ -1,0 +1,73 @@
+//! One graph from observations to an action: memoryless, recurrent, or over the last observations.
+//!
+//! What the graph remembers stands in the contract's `states`. A ring with a source gets that channel's values appended before the
+//! graph runs, by a program of its own that only copies.
+
+use lads_image::records::{self, Scope};
+use serde::Deserialize;
+
+use super::{Blueprint, Call, Entry, Keep, Kind, Origin};
+use crate::contract::{Channel, ClearedBy, Contract, Fill, StateKind};
+
+/// The one graph.
+const ACT: &str = "policy/act";
+
+/// The family has no fields of its own.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct Plain {}
+
+impl Kind for Plain {
+    fn check(&self, contract: &Contract) -> Result<(), String> {
+        if contract.words().is_some() {
+            return Err("field `channels`: family plain takes no instruction".into());
+        }
+        Ok(())
+    }
+
+    fn blueprint(&self, contract: &Contract) -> Blueprint {
+        let mut blueprint = Blueprint::default();
+        let mut outputs = vec!["action".to_owned()];
+        for state in &contract.states {
+            let scope = match state.cleared_by {
+                ClearedBy::Episode => Scope::Episode,
+                ClearedBy::Instruction => Scope::Instruction,
+            };
+            let keep = match state.kind {
+                StateKind::Plain => {
+                    outputs.push(format!("next_{}", state.name));
+                    Keep::Plain
+                }
+                StateKind::Ring => Keep::Ring {
+                    rows: state.rows,
+                    fill: match state.fill {
+                        Fill::Zero => records::Fill::Zero,
+                        Fill::First => records::Fill::First,
+                    },
+                },
+            };
+            let (width, field) = match &state.source {
+                Some(channel) => (
+                    contract.channel(channel).map_or(0, Channel::len),
+                    "channels",
+                ),
+                None => (state.shape.iter().product(), "states"),
+            };
+            blueprint = blueprint.state(&state.name, keep, scope).wide(width, field);
+            if let Some(channel) = &state.source {
+                let append = format!("{}/append", state.name);
+                blueprint = blueprint
+                    .entry(Entry {
+                        origin: Origin::Copy {
+                            channel: channel.clone(),
+                        },
+                        ..Entry::variant(&append, "", &[&format!("next_{}", state.name)])
+                    })
+                    .call(Call::step(&append));
+            }
+        }
+        let outputs: Vec<&str> = outputs.iter().map(String::as_str).collect();
+        blueprint
+            .entry(Entry::new(ACT, &outputs).acts())
+            .call(Call::step(ACT))
+    }
+}
