@@ -20,7 +20,7 @@ use lads_image::records::{
 };
 use lads_image::{Program, Spaces, Tables};
 
-use crate::contract::{Contract, DType, Role};
+use crate::contract::{Contract, DType, Role, same_text};
 
 pub use error::ScheduleError;
 
@@ -124,7 +124,7 @@ fn states(tables: &Tables, sizes: &mut Sizes) -> Checked {
         let twice = (0..i).any(|j| {
             tables
                 .state(j)
-                .is_some_and(|other| tables.text(other.name) == tables.text(state.name))
+                .is_some_and(|other| same_text(tables.text(other.name), tables.text(state.name)))
         });
         let (end, words, sound) = match state.kind {
             StateKind::Plain => {
