@@ -51,8 +51,7 @@ fn statuses() -> String {
 #[test]
 fn the_header_is_not_stale() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let mut config =
-        cbindgen::Config::from_file(root.join("cbindgen.toml")).expect("it is sound");
+    let mut config = cbindgen::Config::from_file(root.join("cbindgen.toml")).expect("it is sound");
     config.after_includes = Some(statuses());
     let builder = cbindgen::Builder::new()
         .with_crate(root)
@@ -143,7 +142,10 @@ fn every_name_in_a_comment_exists() {
     texts.extend(["include/lads.h", "include/lads.hpp", "archive.sh"].map(crate_path));
     for path in texts {
         let text = fs::read_to_string(&path).expect("it is text");
-        let wrong: Vec<_> = names(&text).into_iter().filter(|name| !known(name)).collect();
+        let wrong: Vec<_> = names(&text)
+            .into_iter()
+            .filter(|name| !known(name))
+            .collect();
         assert!(wrong.is_empty(), "{}: {wrong:?}", path.display());
     }
 }
