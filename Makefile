@@ -13,26 +13,33 @@ COLLECT_lorel   := --episodes 50000
 # What lints and tests cover; one selection, because each is a build of its own, of tract too: the oracle and the language encoder's engine.
 FEATURES := lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language
 ALL      := --workspace --features $(FEATURES)
-RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-ffi -p lads-cli
+RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-host -p lads-pace -p lads-ffi -p lads-cli -p lads-proof
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report record viewer say language verify test setup lint test-rust test-runtime test-exporter sanitize collect train export reference install bench clean help
+.PHONY: run report record viewer say language verify mutate test test-full setup lint test-rust test-runtime test-exporter sanitize collect train export reference install bench clean help
+
+# Says before a build that takes long what it takes, where nothing of it is there yet: $(call first-build,a crate of it,what,minutes)
+first-build = @ls target/release/deps/lib$(1)-*.rlib >/dev/null 2>&1 || echo "The first build of $(2) takes some $(3) minutes of one core; later ones take seconds."
 
 ## run: the shipped policy over the paper's seen and unseen instructions
 run: setup
+	$(call first-build,lads_sim,the simulator,2)
 	cargo run --release -p lads-sim --bin lads-run -- --model $(MODEL) $(ARGS)
 
 ## report: the same with charts, as one HTML page
 report: setup
+	$(call first-build,kuva,the charts,4)
 	cargo run --release -p lads-sim --features report,record --bin lads-run -- --model $(MODEL) --report report.html $(ARGS)
 
 ## record: the first episode of an instruction as episode.gif; ARGS="--instruction kbls"
 record: setup
+	$(call first-build,gif,the pictures,4)
 	cargo run --release -p lads-sim --features report,record --bin lads-run -- --model $(MODEL) --episodes 1 --record episode.gif $(ARGS)
 
 ## viewer: the policy at real time in a window (X display); ARGS="--instruction kbls --episodes 3"
 viewer: setup
+	$(call first-build,winit,the window,5)
 	cargo run --release -p lads-sim --features viewer --bin lads-run -- --model $(MODEL) --viewer $(ARGS)
 
 ## language: the language encoder into the user's cache, once, for `make say`; ENCODER=FOLDER for another BERT-family model
@@ -41,11 +48,16 @@ language: $(VENV)/stamp
 
 ## say: any sentence to the policy, SAY="open the microwave"; without SAY, every instruction as the language encoder hears it
 say: setup language
+	$(call first-build,tract_onnx,the language encoder's engine,13)
 	cargo run --release -p lads-sim --features language --bin lads-run -- --model $(MODEL) $(if $(SAY),--instruction "$$SAY",--encode-language) $(ARGS)
 export SAY
 
 ## test: format, lints, documentation, all Rust tests, the exporter's tests
 test: setup lint test-rust test-exporter
+
+## test-full: the same, and every command that README.md and the other documents show, as typed, in a copy of the project; hours
+test-full: test
+	cargo test -p lads-tests --test documents -- --ignored --nocapture
 
 ## setup: MuJoCo and the simulator's assets into vendor/ (idempotent)
 setup:
@@ -116,10 +128,18 @@ reference: $(VENV)/stamp
 verify: setup
 	cargo run --release -p lads-sim --bin lads-run -- --model $(MODEL) --verify $(ARGS)
 
+## mutate: changes of every kind to $(MODEL), what each moves and what its verification says; minutes
+mutate: setup
+	cargo run --release -p lads-sim --example mutate -- $(MODEL)
+
 # OpenVINO is a peer of the benchmarks only; where it does not install, the page says so.
 $(VENV)/bench-stamp: $(VENV)/stamp
 	-$(PY) -m pip install --quiet --disable-pip-version-check openvino==2026.4.1
 	touch $@
+
+## install: liblads.a, lads.h, lads.hpp, and their CMake and pkg-config files, into PREFIX (/usr/local)
+install:
+	runtime/ffi/install.sh "$(PREFIX)"
 
 ## bench: everything measured, beside what one would use instead, into benches/RESULTS.md; on a quiet machine, ten minutes after the build
 bench: setup $(VENV)/bench-stamp

@@ -122,15 +122,18 @@ def main():
     parser.add_argument("--force", action="store_true", help="fetch again even if everything is in place")
     arguments = parser.parse_args()
     arch = platform.machine()
-    stamp = arguments.vendor / "STAMP"
+    vendor = pathlib.Path(os.path.realpath(arguments.vendor))  # a link stays one
+    stamp = vendor / "STAMP"
     if not arguments.force and stamp.is_file() and stamp.read_text() == stamp_text(arch):
         print("vendor/ is up to date")
         return
+    if vendor.exists() and not stamp.is_file() and (not vendor.is_dir() or any(vendor.iterdir())):
+        raise SetupError(f"{vendor} holds something else, which would be replaced; name another folder with --vendor")
     if sys.platform != "linux" or ("mujoco", arch) not in SHA256:
         raise SetupError(f"no pinned MuJoCo for {sys.platform} {arch}; supported: Linux on x86_64 or aarch64")
     if importlib.util.find_spec("pip") is None:
         raise SetupError(f"{sys.executable} has no pip: install it (for example `apt install python3-pip`) and run again")
-    fill(arguments.vendor, arch)
+    fill(vendor, arch)
     print(f"vendor/ is ready: mujoco {MUJOCO}, gymnasium-robotics {GYMNASIUM_ROBOTICS}, metaworld {METAWORLD} ({arch})")
 
 

@@ -9,30 +9,34 @@ use std::time::{Duration, Instant};
 use criterion::{Criterion, criterion_group, criterion_main};
 use lads_benches::bundle;
 use lads_compiler::{Bundle, compile};
-use lads_core::{Controller, Instruction, PlanIndex, Policy, Workspace};
+use lads_core::{Controller, Data, Instruction, Policy, Role};
+use lads_host::schedule;
+use lads_image::Tables;
 
 /// Tokens in the context of a measured control step.
 const CONTEXT: usize = 300;
 
-/// The first control step that decides with at least [`CONTEXT`] tokens, or the last that decides in a shorter context.
+/// Control steps after which the schedule repeats.
+fn period(policy: &Policy<'_>) -> usize {
+    Tables::new(policy.image()).map_or(1, |tables| schedule::period(&tables) as usize)
+}
+
+/// The first control step that begins a period with at least [`CONTEXT`] tokens, or the last that does in a shorter context.
 fn deciding_step(policy: &Policy<'_>, words: usize) -> usize {
-    let contract = policy.contract();
-    let (horizon, last) = (contract.horizon(), contract.context_steps() - 1);
+    let steps = policy.contract().context_steps();
+    let (period, last) = (period(policy), steps.map_or(CONTEXT, |steps| steps - 1));
     let wanted = CONTEXT
         .saturating_sub(words)
         .div_ceil(2)
-        .next_multiple_of(horizon);
-    wanted.min(last - last % horizon)
+        .next_multiple_of(period);
+    wanted.min(last - last % period)
 }
 
 fn control(criterion: &mut Criterion) {
-    let bundle = Bundle::open(&bundle()).expect("the bundle that ships opens");
-    let image = compile(&bundle).expect("it compiles");
-    let policy = Policy::new_checked(image.as_bytes()).expect("its image is sound");
-    let mut arena = vec![0.0; policy.arena_len()];
-    let mut state = vec![0.0; policy.state_len()];
-    let workspace = Workspace::new(&policy, &mut arena, &mut state).expect("it is large enough");
-    let mut controller = Controller::new(policy, workspace);
+    let opened = lads_host::open(&bundle()).expect("the bundle that ships opens");
+    let mut loaded = opened.load().expect("there is memory for it");
+    let mut controller = loaded.controller();
+    let policy = *controller.policy();
     controller
         .set_instruction(Instruction::Id(0))
         .expect("there is one");
@@ -42,7 +46,7 @@ fn control(criterion: &mut Criterion) {
         .instruction(0)
         .map_or(0, |known| known.words.len() / policy.contract().word_dim());
     let decides = deciding_step(&policy, words);
-    let horizon = policy.contract().horizon();
+    let period = period(&policy);
     let mut group = criterion.benchmark_group("control_step");
     // Most of the time goes into the steps before the measured ones.
     group.sample_size(10);
@@ -52,7 +56,7 @@ fn control(criterion: &mut Criterion) {
     });
     group.bench_function("ordinary/300", |bencher| {
         bencher.iter_custom(|iterations| {
-            measure(&mut controller, decides + 1..decides + horizon, iterations)
+            measure(&mut controller, decides + 1..decides + period, iterations)
         });
     });
     group.finish();
@@ -71,21 +75,32 @@ fn entries(criterion: &mut Criterion, controller: &mut Controller<'_, '_>) {
     let policy = *controller.policy();
     let (contract, golden) = (policy.contract(), policy.golden());
     let golden = golden.expect("the bundle that ships has a golden episode");
-    let horizon = contract.horizon();
-    let steps: Vec<_> = golden.steps().take(horizon).collect();
-    let observations: Vec<f32> = steps.iter().flat_map(|step| step.0).copied().collect();
-    let actions: Vec<f32> = steps.iter().flat_map(|step| step.2).copied().collect();
-    let (observation, plan, _) = steps[0];
+    let steps: Vec<_> = golden.steps().take(period(&policy)).collect();
+    let observations: Vec<f32> = steps
+        .iter()
+        .flat_map(|step| step.observation())
+        .copied()
+        .collect();
+    let actions: Vec<f32> = steps.iter().flat_map(|step| step.action).copied().collect();
+    let (seen, index) = (steps[0].observations(), steps[0].selected.unwrap_or(0));
+    let demonstration: Vec<_> = contract
+        .channels()
+        .filter(|channel| channel.role() == Role::Demonstration)
+        .map(|channel| match channel.name() {
+            "actions" => (channel.id(), Data::F32(&actions)),
+            _ => (channel.id(), Data::F32(&observations)),
+        })
+        .collect();
     let mut action = vec![0.0; contract.action_len()];
     let mut group = criterion.benchmark_group("entry");
     group.bench_function("high_level/instruct", |bencher| {
         bencher.iter(|| controller.set_instruction(black_box(Instruction::Id(0))));
     });
     group.bench_function("low_level/act", |bencher| {
-        bencher.iter(|| controller.act(black_box(observation), PlanIndex(plan), &mut action));
+        bencher.iter(|| controller.follow(black_box(seen), index, &mut action));
     });
     group.bench_function("trajectory_encoder/encode", |bencher| {
-        bencher.iter(|| controller.encode(black_box(&observations), &actions));
+        bencher.iter(|| controller.encode(black_box(&demonstration)));
     });
     group.finish();
 }
@@ -105,7 +120,8 @@ fn measure(
     while left > 0 {
         controller.reset();
         let episodes = std::iter::repeat_with(|| golden.steps()).flatten();
-        for (step, (observation, _, _)) in episodes.enumerate().take(measured.end) {
+        for (step, recorded) in episodes.enumerate().take(measured.end) {
+            let observation = recorded.observation();
             let start = Instant::now();
             let report = controller.step(black_box(observation), &mut action);
             let elapsed = start.elapsed();

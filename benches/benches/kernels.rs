@@ -6,7 +6,7 @@ use bytemuck::Pod;
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main};
 use lads_benches::sweep::Sweep;
-use lads_compiler::Aligned;
+use lads_host::Aligned;
 use lads_kernels::stored::{round_to_f16, to_f16, to_int16};
 use lads_kernels::{
     Activation, Attention, Cache, CacheFormat, Isa, LayerNorm, Linear, Panels, WeightFormat,

@@ -8,7 +8,7 @@
     reason = "the loop gets the vectors of the body that it is inlined into"
 )]
 
-use lads_compiler::Aligned;
+use lads_host::Aligned;
 use pulp::{Arch, Simd, WithSimd};
 
 /// Memory of some size, where an image would lie too, and the machine's vectors.

@@ -5,6 +5,7 @@ import hashlib
 import sys
 from pathlib import Path
 
+from . import output
 from .config import UserError
 
 
@@ -17,6 +18,8 @@ def _encode(setting):
 def _random(arguments):
     from . import bundle, config, kinds, random_policy
 
+    read = [] if arguments.kind else [arguments.config]
+    output.check_apart(read, [arguments.output])
     if arguments.kind:
         _, model = kinds.export(arguments.kind, arguments.seed)
     else:
@@ -65,8 +68,16 @@ def _train(arguments):
     return 0
 
 
+def _check_card(arguments, more):
+    """Refuses a bundle or card in the place of something that the card is made from."""
+    path = Path(arguments.output)
+    results = [pair.rpartition("=")[2] for pair in arguments.beside]
+    read = [arguments.results, *results, path.with_suffix(".notes.md")]
+    output.check_apart(read, [*more, path.with_suffix(".md")])
+
+
 def _card(arguments, saved, sha256):
-    from . import acceptance, bundle, card
+    from . import acceptance, card
 
     beside = []
     for pair in arguments.beside:
@@ -78,7 +89,7 @@ def _card(arguments, saved, sha256):
     path = Path(arguments.output).with_suffix(".md")
     notes = Path(arguments.output).with_suffix(".notes.md")
     notes = notes.read_text(encoding="utf-8") if notes.is_file() else ""
-    bundle.write_atomically(path, card.write(arguments.run, saved, sha256, results, beside, notes, acceptance.beside(arguments.output)).encode())
+    output.write_atomically(path, card.write(arguments.run, saved, sha256, results, beside, notes, acceptance.beside(arguments.output)).encode())
     print(f"{path}: model card")
 
 
@@ -86,6 +97,7 @@ def _export(arguments):
     from . import acceptance, bundle, training
     from .model import Lads
 
+    _check_card(arguments, [arguments.output])
     saved, setting = training.load_run(arguments.run)
     encoded = _encode(setting)
     identity = saved["identity"]
@@ -112,6 +124,7 @@ def _export(arguments):
 def _card_alone(arguments):
     from . import training
 
+    _check_card(arguments, [])
     saved, _ = training.load_run(arguments.run)
     if not Path(arguments.output).is_file():
         raise UserError(f"no bundle at {arguments.output}; export one first (make export)")
@@ -121,6 +134,13 @@ def _card_alone(arguments):
 def _reference(arguments):
     from . import reference
 
+    output.check_apart([arguments.model], [arguments.output, f"{arguments.output}.progress"])
+    if arguments.complete:
+        from . import questions
+
+        questions.complete(arguments.model, arguments.output, arguments.run)
+        print(f"{arguments.output}: completed; next: lads-run --model {arguments.model} --verify {arguments.output}")
+        return
     chosen = {key: getattr(arguments, key) for key in ("run", "episodes", "traced", "seed", "noise")}
     reference.write(arguments.model, arguments.output, **chosen)
     print(f"{arguments.output}: written; next: lads-run --model {arguments.model} --verify {arguments.output}")
@@ -200,6 +220,7 @@ def _parser():
     rollouts.add_argument("--episodes", type=int, default=20, help="of each instruction (20)")
     rollouts.add_argument("--traced", type=int, default=2, help="of these, so many with all actions and the first states (2)")
     rollouts.add_argument("--seed", type=int, default=0)
+    rollouts.add_argument("--complete", action="store_true", help="add to the reference that is there what an earlier version did not record")
     rollouts.add_argument("--noise", default="v0", help="observation noise: v0, v1 or none")
     rollouts.set_defaults(run_command=_reference)
 

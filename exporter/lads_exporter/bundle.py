@@ -6,9 +6,6 @@
 import base64
 import hashlib
 import json
-import os
-import tempfile
-from pathlib import Path
 
 import numpy as np
 import onnx
@@ -17,6 +14,7 @@ from safetensors.numpy import save as save_safetensors
 
 from . import __version__, contract as contracts, graphs, twin
 from .config import UserError
+from .output import write_atomically
 
 GOLDEN_TOLERANCE = 1e-4
 GOLDEN_MARGIN = 1e-2  # smallest difference between the two best logits at any decision of a golden episode
@@ -135,21 +133,6 @@ def assemble(lads, setting, encoded, provenance, candidates):
     lads.eval()
     model = graphs.build(lads, encoded, setting.config.encoder.horizon)
     return seal(model, contract(setting, encoded, provenance), candidates)
-
-
-def write_atomically(path, data):
-    """Writes beside the target and renames: a reader sees the old file or the new one, never a part."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
 
 
 def save(model, path):

@@ -7,7 +7,7 @@ language are the base's, but the language's words are random: no encoder has to 
 import copy
 import json
 
-from . import bundle, config, language, random_policy
+from . import bundle, config, language, output, random_policy
 
 SERIES = {
     "layers": [1, 2, 4, 8],
@@ -53,4 +53,4 @@ def export(base, folder, seed=0, steps=40):
             bundle.save(model, folder / name)
             index.append([series, value, name])
             yield name
-    bundle.write_atomically(folder / "index.json", json.dumps(index).encode())
+    output.write_atomically(folder / "index.json", json.dumps(index).encode())

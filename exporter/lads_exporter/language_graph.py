@@ -202,7 +202,7 @@ def write(encoder, folder):
     """Exports the encoder, unless the folder holds it already; returns whether it wrote."""
     if encoder.startswith("random-"):
         raise UserError(f"{encoder} is an encoder for tests, without a network; name a BERT-family model")
-    folder = Path(folder)
+    folder = Path(os.path.realpath(folder))  # a link stays one
     if folder.exists() and not (folder / MANIFEST).is_file() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"{folder} is something else than a language encoder; name another folder")
     if is_whole(folder, language.weights_sha256(encoder)):

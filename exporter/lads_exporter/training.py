@@ -27,7 +27,7 @@ import torch.nn.functional as F
 from tqdm import tqdm
 
 from . import __version__, config as configuration, language
-from .bundle import write_atomically
+from .output import write_atomically
 from .codebook import nearest, perplexity
 from .config import UserError
 from .corpus import Corpus

@@ -8,7 +8,7 @@
 set -eu
 output=$1
 target=${2:-}
-root=$(cd "$(dirname "$0")/../.." && pwd)
+root=$(cd "$(dirname "$0")/../.." && pwd -P)
 : "${LD:=ld}" "${OBJCOPY:=objcopy}" "${AR:=ar}" "${NM:=nm}" "${CARGO:=cargo}"
 
 work=$(mktemp -d)

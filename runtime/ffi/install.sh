@@ -5,7 +5,7 @@
 set -eu
 [ $# -ge 1 ] || { echo "usage: runtime/ffi/install.sh <prefix> [<target>]" >&2; exit 2; }
 prefix=$1
-here=$(cd "$(dirname "$0")" && pwd)
+here=$(cd "$(dirname "$0")" && pwd -P)
 case $prefix in /*) ;; *) prefix=$PWD/$prefix ;; esac
 
 version=$(sed -n 's/^version = "\(.*\)"/\1/p' "$here/../../Cargo.toml" | head -n 1)

@@ -2,8 +2,10 @@
 
 use std::fmt::Display;
 use std::process::ExitCode;
+use std::time::Duration;
 
 use clap::Parser;
+use indicatif::{ProgressBar, ProgressStyle};
 
 /// Exit code of everything that was refused.
 pub const REFUSED: u8 = 2;
@@ -30,6 +32,45 @@ pub fn refuse(wrong: impl Display) -> ExitCode {
     ExitCode::from(REFUSED)
 }
 
+/// A progress bar over `count` things, as wide as the terminal leaves room; indicatif hides it where stderr is no terminal.
+pub fn progress(count: usize, things: &str) -> ProgressBar {
+    let bar = ProgressBar::new(count as u64).with_style(style(things));
+    bar.enable_steady_tick(Duration::from_millis(200));
+    bar
+}
+
+/// Everything beside the bar fits into 40 columns.
+fn style(things: &str) -> ProgressStyle {
+    let style = ProgressStyle::with_template(&format!(
+        "{{wide_bar}} {{pos}}/{{len}} {things} {{elapsed}}, {{eta}} left {{msg}}"
+    ));
+    style.unwrap_or_else(|_| ProgressStyle::default_bar())
+}
+
 fn one_line(text: &str) -> String {
     text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+#[cfg(test)]
+mod tests {
+    use indicatif::{InMemoryTerm, ProgressDrawTarget};
+
+    use super::*;
+
+    #[test]
+    fn a_narrow_terminal_has_one_line_of_progress() {
+        for columns in [40, 80, 200] {
+            let terminal = InMemoryTerm::new(6, columns);
+            let target = ProgressDrawTarget::term_like(Box::new(terminal.clone()));
+            let bar = ProgressBar::with_draw_target(Some(500), target);
+            bar.set_style(style("episodes"));
+            bar.inc(123);
+            bar.tick();
+            let shown = terminal.contents();
+            assert_eq!(shown.lines().count(), 1, "{columns}: {shown}");
+            assert!(shown.contains("123/500 episodes"), "{columns}: {shown}");
+            bar.finish_and_clear();
+            assert_eq!(terminal.contents(), "", "{columns}");
+        }
+    }
 }

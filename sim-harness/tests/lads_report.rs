@@ -68,6 +68,24 @@ fn the_page_has_the_numbers_of_the_json_and_every_chart() {
         let charts = section(&page, title).matches("<svg viewBox=").count();
         assert!(charts > 0, "{title}");
     }
+    // Every cell of a heat map says which it is.
+    let cells: Vec<_> = page.split("<title>").skip(2).collect();
+    let cells: Vec<_> = cells
+        .iter()
+        .filter_map(|cell| cell.split("</title>").next())
+        .collect();
+    assert!(cells.len() > 10);
+    for cell in cells {
+        let (row, rest) = cell
+            .split_once(", plan ")
+            .unwrap_or_else(|| panic!("'{cell}'"));
+        assert!(!row.is_empty() && rest.contains(": "), "'{cell}'");
+    }
+    // Two episodes say little of an instruction, and no instruction here is made of others.
+    assert!(table.contains("With 2 episodes of each instruction these are wide"));
+    assert!(!section(&page, "Plans at the start of an episode").contains("composite"));
+    let latency = section(&page, "Latency of the controller");
+    assert!(latency.contains(">Duration of a control step<"));
     // The one chosen episode is a timeline with a line and a name for each completion.
     let timeline = section(&page, "Latent plans over an episode");
     assert_eq!(timeline.matches("<svg ").count(), 1);
@@ -78,7 +96,10 @@ fn the_page_has_the_numbers_of_the_json_and_every_chart() {
         .unwrap_or(&runs[0]);
     for done in shown["completions"].as_array().unwrap() {
         let name = done["sub_task"].as_str().unwrap();
-        assert!(timeline.contains(&format!(">{name}<")), "{name}");
+        let asked = done["commanded"].as_bool().unwrap();
+        let said = if asked { "" } else { ", not asked for" };
+        let mark = format!("<span>{name}</span>, step {}{said}</li>", done["step"]);
+        assert!(timeline.contains(&mark), "{mark}");
     }
     let films = section(&page, "Film strips");
     let pictures = films.matches("src=\"data:image/jpeg;base64,/9j/").count();

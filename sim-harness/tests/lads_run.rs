@@ -90,7 +90,7 @@ fn altered(bundle: &Path, folder: &Path, from: &str, to: &str) -> PathBuf {
 fn every_instruction_runs_and_the_json_has_its_schema() {
     let folder = tempfile::tempdir().unwrap();
     let (table, results) = results(&["--episodes", "1"], &folder.path().join("r.json"));
-    let text = fs::read_to_string(project_file("sim-harness/results.schema.json")).unwrap();
+    let text = fs::read_to_string(project_file("sim-harness/proof/results.schema.json")).unwrap();
     let root: Value = serde_json::from_str(&text).unwrap();
     schema::check(&results, &root, &root, "results");
 
@@ -368,7 +368,7 @@ fn a_log_replays_and_its_plans_run() {
     let recorded = [&first[..], &["--log", log, "--monitor"]].concat();
     let (table, results) = results(&recorded, &json);
     assert!(table.contains("executed segments are encoded as the plan in force"));
-    let text = fs::read_to_string(project_file("sim-harness/results.schema.json")).unwrap();
+    let text = fs::read_to_string(project_file("sim-harness/proof/results.schema.json")).unwrap();
     let root: Value = serde_json::from_str(&text).unwrap();
     schema::check(&results, &root, &root, "results");
     assert!(out(&["--replay", log]).starts_with("EQUAL: 1 episodes"));
@@ -434,4 +434,128 @@ fn a_sweep_runs_every_level_of_every_fault() {
         let rates: Vec<_> = of(fault).into_iter().map(rate).collect();
         assert!(rates[4] < rates[0], "{fault}: {rates:?}");
     }
+}
+
+#[test]
+fn outputs_are_never_what_is_read_nor_each_other() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let said = |name: &str| path(name).to_str().unwrap().to_owned();
+    let model = path("kitchen.onnx");
+    fs::copy(kitchen_bundle(), &model).unwrap();
+    std::os::unix::fs::symlink("kitchen.onnx", path("link.json")).unwrap();
+    let before = fs::read(&model).unwrap();
+    let reads = "--model reads";
+    refused(
+        &model,
+        &["--json", &said("kitchen.onnx")],
+        &["--json", reads],
+    );
+    refused(
+        &model,
+        &["--json", &said("link.json")],
+        &["link.json", reads],
+    );
+    refused(&model, &["--log", &said("kitchen.onnx")], &["--log", reads]);
+    let [one, two] = [said("one.json"), said("./one.json")];
+    refused(
+        &model,
+        &["--json", &one, "--log", &two],
+        &["--log", "--json writes the same file"],
+    );
+    let plans = said("plans.json");
+    fs::write(&plans, "{}").unwrap();
+    refused(
+        &model,
+        &["--plans", &plans, "--json", &plans],
+        &["--json", "--plans reads"],
+    );
+    let reference = project_file("models/kitchen.reference.json");
+    fs::copy(reference, path("kitchen.reference.json")).unwrap();
+    refused(
+        &model,
+        &["--verify", "--certificate", &said("kitchen.reference.json")],
+        &["--certificate", "--verify reads"],
+    );
+    refused(
+        &model,
+        &["--verify", "--certificate", &one, "--certificate", &two],
+        &["--certificate writes the same file"],
+    );
+    assert_eq!(fs::read(&model).unwrap(), before);
+    assert!(!Path::new(&one).exists());
+}
+
+#[test]
+fn results_go_into_devices_and_through_links() {
+    use std::os::unix::fs::{FileTypeExt as _, symlink};
+
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    fs::create_dir(path("there")).unwrap();
+    symlink("there/r.json", path("link.json")).unwrap();
+    let short = [
+        "--instruction",
+        "kbls",
+        "--episodes",
+        "1",
+        "--noise",
+        "none",
+    ];
+    let (_, read) = results(&short, &path("link.json"));
+    assert!(read["instructions"].is_array() && path("there/r.json").is_file());
+    assert!(
+        fs::symlink_metadata(path("link.json"))
+            .unwrap()
+            .is_symlink()
+    );
+    let output = lads_run(&kitchen_bundle(), &short)
+        .args(["--json", "/dev/null", "--log", "/dev/null"])
+        .output()
+        .unwrap();
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+    assert!(
+        fs::metadata("/dev/null")
+            .unwrap()
+            .file_type()
+            .is_char_device()
+    );
+}
+
+#[test]
+fn another_mujoco_is_refused_in_one_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let [source, library] = ["other.c", "other.so"].map(|name| folder.path().join(name));
+    let other = "const char *mj_versionString(void) { return \"3.3.7\"; }\nint mj_version(void) { return 337; }\n";
+    fs::write(&source, other).unwrap();
+    let mut cc = Command::new("cc");
+    cc.args(["-shared", "-fPIC", "-o"])
+        .arg(&library)
+        .arg(&source);
+    assert!(cc.status().unwrap().success());
+    for model in ["models/kitchen.onnx", "models/lorel.onnx"] {
+        let mut command = lads_run(&project_file(model), &["--episodes", "1"]);
+        let output = command.env("LD_PRELOAD", &library).output().unwrap();
+        assert_refused(&output, &["MuJoCo 3.3.7", "LD_PRELOAD", "make setup"]);
+    }
+}
+
+#[test]
+fn what_has_no_end_is_not_waited_for() {
+    for option in ["--image", "--replay", "--encode", "--plans", "--verify"] {
+        refused(
+            &kitchen_bundle(),
+            &[option, "/dev/zero"],
+            &["/dev/zero", "not a regular file"],
+        );
+    }
+    refused(
+        Path::new("/dev/zero"),
+        &[],
+        &["/dev/zero", "not a regular file"],
+    );
 }

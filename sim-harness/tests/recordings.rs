@@ -282,6 +282,25 @@ fn commanded_plans_are_followed_and_encoded() {
         assert_eq!(agreement.agreed, agreed.filter(|(a, b)| a == b).count());
     }
 
+    // Every step has a plan: of the horizon that ends with the last step where the last one is not full.
+    let steps = evaluated.traces[0].steps.as_slice();
+    let parts = [
+        &steps[..2 * horizon],
+        &steps[..=horizon],
+        &steps[1..=horizon],
+        &steps[..horizon - 1],
+    ];
+    let of_parts = plans::encode(&policy, parts).unwrap();
+    assert_eq!(
+        of_parts.iter().map(Vec::len).collect::<Vec<_>>(),
+        [2, 2, 1, 0]
+    );
+    assert_eq!(of_parts[1][0], of_parts[0][0]);
+    assert_eq!(
+        of_parts[1][1], of_parts[2][0],
+        "the last steps of the recording"
+    );
+
     let refused = |change: &dyn Fn(&mut PlanFile)| {
         let mut file = file.clone();
         change(&mut file);

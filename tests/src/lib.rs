@@ -1,6 +1,7 @@
 //! What suites that need more than one crate share; the suites are in `tests/`.
 #![forbid(unsafe_code)]
 
+pub mod documents;
 pub mod hostile;
 mod wire;
 

@@ -6,7 +6,7 @@ use std::collections::{HashMap, HashSet};
 
 use prost::Message;
 
-use crate::error::BenchError;
+use lads_pace::BenchError;
 
 /// `ModelProto`, its parts undecoded.
 #[derive(Clone, PartialEq, Message)]

@@ -1,6 +1,6 @@
 //! What a general runtime has to do here: load one ONNX model, and run it again and again on inputs that stay where they are.
 
-use crate::error::BenchError;
+use lads_pace::BenchError;
 
 use super::cut::Tensor;
 

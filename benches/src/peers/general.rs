@@ -8,8 +8,8 @@ use std::collections::BTreeMap;
 
 use super::cut::{Source, Tensor};
 use super::engine::{Engine, Session, failed};
-use crate::contender::{Block, Computed, Contender, Episode, Kind, Sample, Work, measure};
-use crate::error::BenchError;
+use lads_pace::contender::{Block, Computed, Contender, Episode, Kind, Sample, Work, measure};
+use lads_pace::BenchError;
 
 /// What a control step at some context starts from.
 #[derive(Debug, Clone)]
@@ -56,7 +56,11 @@ impl<'e> General<'e> {
     ) -> Result<Self, BenchError> {
         let load = |entry: &str| engine.load(&source.cut(entry)?);
         let mut instructions = load("instruction/lookup")?;
-        let id = Tensor::integer(episode.instruction as usize);
+        let instruction = episode.instruction.ok_or_else(|| {
+            let wrong = "it runs policies that take instructions, which this one does not";
+            failed(engine.name(), wrong)
+        })?;
+        let id = Tensor::integer(instruction as usize);
         instructions.bind(&[("instruction/lookup/id".into(), &id)])?;
         instructions.call()?;
         let known = instructions.outputs()?;
@@ -313,7 +317,7 @@ impl Contender for General<'_> {
                 in_force = best;
             }
             computed.push(Computed {
-                plan: in_force,
+                selected: Some(in_force),
                 action: past.action.clone(),
             });
         }

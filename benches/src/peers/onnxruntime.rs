@@ -11,7 +11,7 @@ use ort::value::{DynValue, Tensor as OrtTensor, TensorElementType};
 
 use super::cut::{Data, Tensor};
 use super::engine::{Engine, Named, Session, failed, given};
-use crate::error::BenchError;
+use lads_pace::BenchError;
 
 const NAME: &str = "ONNX Runtime";
 

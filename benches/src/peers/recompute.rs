@@ -6,8 +6,8 @@ use serde_json::Value;
 
 use super::cut::{Data, Tensor, signature};
 use super::engine::{Engine, Session, failed};
-use crate::contender::{Block, Computed, Contender, Kind, Sample, Work, measure};
-use crate::error::BenchError;
+use lads_pace::contender::{Block, Computed, Contender, Kind, Sample, Work, measure};
+use lads_pace::BenchError;
 
 /// A loaded model without a KV cache.
 pub struct Recompute {

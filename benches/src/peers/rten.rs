@@ -8,7 +8,7 @@ use rten_tensor::prelude::{AsView, Layout};
 
 use super::cut::{Data, Tensor};
 use super::engine::{Engine, Named, Session, failed, given};
-use crate::error::BenchError;
+use lads_pace::BenchError;
 use crate::realtime::Realtime;
 
 const NAME: &str = "rten";

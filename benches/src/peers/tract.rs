@@ -4,7 +4,7 @@ use tract_onnx::prelude::{Tensor as TractTensor, *};
 
 use super::cut::{self, Data};
 use super::engine::{Engine, Named, Session, failed, given};
-use crate::error::BenchError;
+use lads_pace::BenchError;
 
 const NAME: &str = "tract";
 

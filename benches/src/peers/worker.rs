@@ -7,9 +7,9 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use serde_json::{Value, json};
 
 use super::engine::failed;
-use crate::clock::Pace;
-use crate::contender::{Block, Computed, Contender, Episode, Kind, Sample, Work};
-use crate::error::BenchError;
+use lads_pace::clock::Pace;
+use lads_pace::contender::{Block, Computed, Contender, Episode, Kind, Sample, Work};
+use lads_pace::BenchError;
 
 /// The contenders that the script knows.
 pub const NAMES: [&str; 2] = ["PyTorch", "OpenVINO"];
@@ -109,7 +109,10 @@ impl Contender for Worker {
         Ok(plans
             .into_iter()
             .zip(actions)
-            .map(|(plan, action)| Computed { plan, action })
+            .map(|(plan, action)| Computed {
+                selected: Some(plan),
+                action,
+            })
             .collect())
     }
 

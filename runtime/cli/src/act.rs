@@ -1,9 +1,10 @@
 //! `lads act`: the controller on a pipe. One observation per line of input, one action per line of output, flushed, in the same form.
 //!
-//! An empty line starts a new episode of the same instruction and is not answered. An observation that is refused ends the command with
+//! A line is read up to the length that an observation can have, whatever comes. An empty line starts a new episode of the same instruction and is not answered. An observation that is refused ends the command with
 //! the number of its line; the lines before it have been answered.
 
-use std::io::{BufRead, ErrorKind, Write};
+use std::fmt::Display;
+use std::io::{BufRead, ErrorKind, Read as _, Write};
 
 use lads_compiler::Memory;
 use lads_core::{Controller, Decision, Instruction, Policy};
@@ -12,6 +13,10 @@ use crate::line;
 use crate::model::Model;
 use crate::refusal::Refusal;
 use crate::self_test;
+
+/// Bytes of a line that are read at most: for every element, and for the rest of it. A number of f32 in any usual form takes fewer.
+const BYTES_PER_ELEMENT: usize = 64;
+const BYTES_BESIDE: usize = 1024;
 
 /// What to act on.
 pub struct Request<'r> {
@@ -76,24 +81,31 @@ impl Pipe<'_, '_> {
     ) -> Result<(), Refusal> {
         let mut observation = vec![0.0; self.policy.contract().observation_len()];
         let mut action = vec![0.0; self.policy.contract().action_len()];
-        let (mut asked, mut answered) = (String::new(), String::new());
+        let most = BYTES_BESIDE + BYTES_PER_ELEMENT * observation.len();
+        let (mut bytes, mut answered) = (vec![], String::new());
         for number in 1_u64.. {
-            asked.clear();
-            let read = input.read_line(&mut asked).map_err(|error| {
-                Refusal::new(
-                    format_args!("input line {number}"),
-                    error,
-                    "send lines of UTF-8 text",
-                )
-            })?;
-            if read == 0 {
+            bytes.clear();
+            let unreadable = |wrong: &dyn Display| {
+                let line = format_args!("input line {number}").to_string();
+                Refusal::new(line, wrong, "send lines of UTF-8 text")
+            };
+            let read = input
+                .by_ref()
+                .take(most as u64 + 1)
+                .read_until(b'\n', &mut bytes);
+            if read.map_err(|error| unreadable(&error))? == 0 {
                 break;
             }
+            if bytes.len() > most {
+                let wrong = format!("it is longer than {most} bytes");
+                return Err(self.refuse(number, &wrong));
+            }
+            let asked = str::from_utf8(&bytes).map_err(|error| unreadable(&error))?;
             if asked.trim().is_empty() {
                 self.controller.reset();
                 continue;
             }
-            let plan = self.answer(&asked, &mut observation, &mut action);
+            let plan = self.answer(asked, &mut observation, &mut action);
             let (form, plan) = plan.map_err(|wrong| self.refuse(number, &wrong))?;
             line::format(form, &action, plan, &mut answered);
             match output

@@ -110,7 +110,7 @@ pub fn bench(request: &Request) -> Result<Report, Refusal> {
                 "give the bundle (.onnx)",
             ));
         }
-        bundle = std::fs::read(&model.path)
+        bundle = lads_host::input::read(&model.path)
             .map_err(|error| Refusal::new(model.path.display(), error, "name a bundle (.onnx)"))?;
         peers.onnxruntime = Some(request.onnxruntime.clone());
         peers.crates = true;

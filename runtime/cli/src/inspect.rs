@@ -9,8 +9,27 @@ use lads_core::op::Port;
 use lads_core::{Contract, Decision, Element, GuardedController, Interval, Policy, Program};
 use serde_json::{Value, json};
 
+use crate::line::{self, Form};
 use crate::model::Model;
 use crate::refusal::Refusal;
+
+/// The observations of the golden episode as lines of CSV, the shortest decimal form of each element.
+pub fn observations(model: &Model) -> Result<String, Refusal> {
+    let policy = model.policy()?;
+    let golden = policy.golden().ok_or_else(|| {
+        Refusal::new(
+            model.path.display(),
+            "it carries no golden episode, so there are no observations to show",
+            "export the bundle with one",
+        )
+    })?;
+    let (mut text, mut row) = (String::new(), String::new());
+    for (observation, _, _) in golden.steps() {
+        line::format(Form::Csv, observation, None, &mut row);
+        text.push_str(&row);
+    }
+    Ok(text)
+}
 
 /// A policy that can describe itself, for people or as JSON.
 pub struct Report<'m> {

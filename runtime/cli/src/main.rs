@@ -1,7 +1,7 @@
 //! The `lads` command: looks into a policy, compiles it, tests it on this machine, and drives it from a pipe. No simulator, no Python.
 //!
-//! Whatever is refused ends with one line on stderr that names the thing and the remedy, and with exit code 2. Files are written to a
-//! temporary file in the same folder and renamed when complete.
+//! Whatever is refused ends with one line on stderr that names the thing and the remedy, and with exit code 2. Files are written as
+//! [`lads_host::output`] has it: whole or not at all, and never over what is read.
 #![forbid(unsafe_code)]
 
 mod act;
@@ -19,6 +19,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use lads_compiler::{CacheFormat, Options, WeightFormat};
+use lads_host::output;
 
 use crate::model::Model;
 use crate::refusal::Refusal;
@@ -43,6 +44,9 @@ enum Command {
         /// As one JSON object
         #[arg(long)]
         json: bool,
+        /// Instead, the observations of the golden episode as CSV, one per line: input for `lads act`
+        #[arg(long, conflicts_with = "json")]
+        observations: bool,
     },
     /// Compiles a bundle to a program image, and writes it as a file, as source, or both
     Compile {
@@ -141,8 +145,15 @@ fn run(command: Command) -> Result<(), Refusal> {
                 print(&report.to_string())
             }
         }
-        Command::Inspect { model, json } => {
+        Command::Inspect {
+            model,
+            json,
+            observations,
+        } => {
             let model = Model::open(&model)?;
+            if observations {
+                return print(&inspect::observations(&model)?);
+            }
             let report = inspect::Report::of(&model)?;
             if json {
                 print(&format!("{:#}\n", report.json()))
@@ -168,6 +179,15 @@ fn run(command: Command) -> Result<(), Refusal> {
                 tolerance,
                 force,
             };
+            let outputs: Vec<_> = [
+                ("-o", &output),
+                ("--emit-c", &emit_c),
+                ("--emit-rust", &emit_rust),
+            ]
+            .into_iter()
+            .filter_map(|(option, path)| Some((option, path.as_deref()?)))
+            .collect();
+            output::check(&[("", &model)], &outputs).map_err(Refusal::of)?;
             let model = Model::compile(&model, options)?;
             let again = output.is_some() || options != Options::default();
             if again && !model.is_bundle() {
@@ -187,9 +207,18 @@ fn run(command: Command) -> Result<(), Refusal> {
                 .iter()
                 .flatten()
                 .map(|(path, text)| (path, text.as_bytes()));
+            let mut drafts = vec![];
             for (path, bytes) in output.iter().map(|path| (path, image)).chain(sources) {
-                write_file(path, bytes)?;
-                print(&format!("{}: {} bytes\n", path.display(), bytes.len()))?;
+                let draft = output::draft(path).and_then(|mut draft| {
+                    draft.write_all(bytes)?;
+                    Ok(draft)
+                });
+                let draft = draft.map_err(|error| unwritable(path, &error))?;
+                drafts.push((path, bytes.len(), draft));
+            }
+            for (path, bytes, draft) in drafts {
+                draft.commit().map_err(|error| unwritable(path, &error))?;
+                print(&format!("{}: {bytes} bytes\n", path.display()))?;
             }
             if options.is_exact() || force {
                 return Ok(());
@@ -263,27 +292,10 @@ fn print(text: &str) -> Result<(), Refusal> {
     }
 }
 
-/// Writes `bytes` to a temporary file beside `path` and renames it, so that a failure leaves what was there.
-fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Refusal> {
-    let folder = match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder,
-        _ => Path::new("."),
-    };
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(".lads-").suffix(".tmp");
-    // As `File::create` would: readable by all whom the umask lets.
-    #[cfg(unix)]
-    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-    let written = builder.tempfile_in(folder).and_then(|mut file| {
-        file.write_all(bytes)?;
-        file.as_file().sync_all()?;
-        file.persist(path).map_err(|error| error.error)
-    });
-    written.map(drop).map_err(|error| {
-        Refusal::new(
-            path.display(),
-            error,
-            "name a file in an existing, writable folder",
-        )
-    })
+fn unwritable(path: &Path, error: &io::Error) -> Refusal {
+    Refusal::new(
+        path.display(),
+        error,
+        "name a file in an existing, writable folder",
+    )
 }

@@ -37,7 +37,7 @@ impl Model {
 
     /// The same with other weights or another cache; an image has those that it was compiled with.
     pub fn compile(path: &Path, options: Options) -> Result<Self, Refusal> {
-        let file = std::fs::read(path).map_err(|error| {
+        let file = lads_host::input::read(path).map_err(|error| {
             Refusal::new(
                 path.display(),
                 error,

@@ -15,6 +15,11 @@ impl Refusal {
         Self(one_line(&format!("{thing}: {wrong}; {remedy}")))
     }
 
+    /// An error that names the thing and the remedy itself.
+    pub fn of(error: impl Display) -> Self {
+        Self(one_line(&error.to_string()))
+    }
+
     /// The same with an error that says itself what to do.
     pub fn with_remedy_inside(thing: impl Display, error: impl Display) -> Self {
         Self(one_line(&format!("{thing}: {error}")))

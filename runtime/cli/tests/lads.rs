@@ -525,6 +525,115 @@ fn a_failed_compile_overwrites_nothing() {
 }
 
 #[test]
+fn outputs_are_never_what_is_read_nor_each_other() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    fs::copy(tiny(), path("x.onnx")).unwrap();
+    let before = fs::read(tiny()).unwrap();
+    let (model, same) = (path("x.onnx"), path("sub/../x.onnx"));
+    fs::create_dir(path("sub")).unwrap();
+    for output in [&model, &same] {
+        for option in ["-o", "--emit-c", "--emit-rust"] {
+            refused(
+                &["compile", &model, option, output],
+                "",
+                &[option, "x.onnx", "reads", "another file"],
+            );
+        }
+    }
+    let c = path("x.c");
+    refused(
+        &["compile", &model, "-o", &c, "--emit-c", &c],
+        "",
+        &["--emit-c", "x.c", "-o writes the same file"],
+    );
+    refused(
+        &["compile", &model, "--emit-c", &c, "--emit-rust", &c],
+        "",
+        &["--emit-rust", "x.c", "--emit-c writes the same file"],
+    );
+    assert_eq!(fs::read(&model).unwrap(), before, "it was not touched");
+    assert!(!Path::new(&c).exists());
+}
+
+#[cfg(unix)]
+#[test]
+fn devices_and_links_stay_what_they_are() {
+    use std::os::unix::fs::{FileTypeExt as _, symlink};
+
+    let (tiny, folder) = (tiny(), tempfile::tempdir().unwrap());
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let model = tiny.to_str().unwrap();
+    fs::create_dir(path("there")).unwrap();
+    symlink("there/a.lads", path("link.lads")).unwrap();
+    symlink("/dev/null", path("null.lads")).unwrap();
+    answer(&["compile", model, "-o", &path("link.lads")], "");
+    answer(&["compile", model, "-o", &path("null.lads")], "");
+    answer(&["compile", model, "-o", "/dev/null"], "");
+    assert!(
+        fs::metadata("/dev/null")
+            .unwrap()
+            .file_type()
+            .is_char_device()
+    );
+    for link in ["link.lads", "null.lads"] {
+        assert!(
+            fs::symlink_metadata(path(link)).unwrap().is_symlink(),
+            "{link}"
+        );
+    }
+    answer(&["self-test", &path("there/a.lads")], "");
+    // The image, and after it the line about it.
+    let output = lads(&["compile", model, "-o", "/dev/stdout"], "");
+    let image = fs::read(path("there/a.lads")).unwrap();
+    assert!(output.status.success() && output.stdout.starts_with(&image));
+}
+
+#[cfg(unix)]
+#[test]
+fn what_has_no_end_is_not_waited_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let fifo = folder.path().join("fifo.onnx");
+    let made = Command::new("mkfifo").arg(&fifo).status().unwrap();
+    assert!(made.success());
+    for model in ["/dev/zero", fifo.to_str().unwrap()] {
+        for arguments in [
+            &["self-test", model][..],
+            &["inspect", model],
+            &act(model, &[]),
+        ] {
+            refused(arguments, "", &[model, "not a regular file"]);
+        }
+    }
+    // Three elements and the rest of a line, and no memory for what never ends.
+    let tiny = tiny();
+    let endless = "1".repeat(1 << 20);
+    refused(
+        &act(tiny.to_str().unwrap(), &[]),
+        &endless,
+        &["line 1", "longer than", "bytes"],
+    );
+}
+
+#[test]
+fn observations_of_the_golden_episode_go_through_the_pipe() {
+    let tiny = tiny();
+    let model = tiny.to_str().unwrap();
+    let observations = answer(&["inspect", model, "--observations"], "");
+    with_golden(|_, golden| {
+        let written: String = golden
+            .steps()
+            .map(|(observation, _, _)| csv(observation))
+            .collect();
+        assert_eq!(observations, written);
+        assert_eq!(
+            answer(&act(model, &[]), &observations).lines().count(),
+            golden.len()
+        );
+    });
+}
+
+#[test]
 fn bad_arguments_are_one_line() {
     refused(
         &["act", "--model", "m.onnx"],

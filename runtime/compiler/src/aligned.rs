@@ -1,24 +1,50 @@
-//! Bytes of an image at an address as weights want it.
+//! Words of an image at an address as weights want it.
 
-use std::alloc::{Layout, handle_alloc_error};
+use lads_image::format::WEIGHTS_ALIGN;
 
-use crate::pages::Pages;
+/// Words in a line of weights.
+const LINE: usize = WEIGHTS_ALIGN / size_of::<u32>();
 
-/// Bytes whose address is a multiple of a cache line and of a page.
+/// Words whose address is a multiple of [`WEIGHTS_ALIGN`].
 #[derive(Debug)]
-pub struct Aligned(Pages);
+pub(crate) struct Aligned {
+    /// The words start at `start`; they do not move while this is moved.
+    words: Vec<u32>,
+    start: usize,
+    len: usize,
+}
 
 impl Aligned {
-    /// A copy of `bytes`; without memory for it, the program ends as it does where a `Vec` gets none.
-    pub fn new(bytes: &[u8]) -> Self {
-        let mut pages = Pages::zeroed(bytes.len())
-            .unwrap_or_else(|_| handle_alloc_error(Layout::for_value(bytes)));
-        pages.as_mut().copy_from_slice(bytes);
-        Self(pages)
+    /// A copy of `words`.
+    pub fn new(words: &[u32]) -> Self {
+        let len = words.len();
+        let mut room = vec![0; len + LINE];
+        let start = room.as_ptr().align_offset(WEIGHTS_ALIGN).min(LINE);
+        room[start..start + len].copy_from_slice(words);
+        Self {
+            words: room,
+            start,
+            len,
+        }
     }
 
-    /// The bytes.
+    /// The words as bytes.
     pub fn as_bytes(&self) -> &[u8] {
-        self.0.as_bytes()
+        bytemuck::cast_slice(&self.words[self.start..self.start + self.len])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn words_start_where_weights_may() {
+        for len in [0, 1, 100, 1 << 20] {
+            let words: Vec<u32> = (0..len).collect();
+            let aligned = Aligned::new(&words);
+            assert_eq!(aligned.as_bytes().as_ptr().addr() % WEIGHTS_ALIGN, 0);
+            assert_eq!(aligned.as_bytes(), bytemuck::cast_slice::<u32, u8>(&words));
+        }
     }
 }

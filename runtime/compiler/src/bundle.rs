@@ -28,10 +28,22 @@ pub struct Bundle {
     pub(crate) model: ModelProto,
 }
 
+/// Reads a regular file; a device or a FIFO has no end that could be waited for.
+fn read_regular(path: &Path) -> std::io::Result<Vec<u8>> {
+    let kind = std::fs::metadata(path)?.file_type();
+    if kind.is_file() || kind.is_dir() {
+        return std::fs::read(path);
+    }
+    Err(std::io::Error::new(
+        std::io::ErrorKind::InvalidInput,
+        "it is a device or a pipe, not a regular file",
+    ))
+}
+
 impl Bundle {
     /// Reads a file. Errors name it.
     pub fn open(path: &Path) -> Result<Self, BundleError> {
-        let read = || Self::from_owned(&std::fs::read(path)?.into());
+        let read = || Self::from_owned(&read_regular(path)?.into());
         read().map_err(|source| BundleError::File {
             path: path.into(),
             source: Box::new(source),

@@ -15,7 +15,6 @@ use crate::graph::Dim;
 use crate::image::{self, Image, Parts};
 use crate::import::Model;
 use crate::lower::{Cache, Weights, lower};
-use crate::memory::Memory;
 use crate::plan::{Placed, plan};
 use crate::report::{CompileReport, ProgramReport};
 use crate::tensor::Tensor;
@@ -161,13 +160,23 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
     Ok(image)
 }
 
+/// Refuses memory of more f32 elements than a policy gets.
+fn bounded(elements: usize) -> Result<(), CompileError> {
+    let bytes = elements.saturating_mul(size_of::<f32>());
+    if bytes > Policy::MEMORY_LIMIT {
+        return Err(CompileError::Excessive { bytes });
+    }
+    Ok(())
+}
+
 /// The golden episode, in memory of its own.
 fn gate(policy: &Policy, options: Options, tolerance: f32) -> Result<(), CompileError> {
-    Memory::bytes_of(policy.arena_len().saturating_add(policy.state_len()))?;
+    bounded(policy.arena_len().saturating_add(policy.state_len()))?;
     let mut arena = vec![0.0; policy.arena_len()];
     let mut state = vec![0.0; policy.state_len()];
-    let workspace = Workspace::new(policy, &mut arena, &mut state)
-        .map_err(|error| CompileError::Memory(error.into()))?;
+    let workspace = Workspace::new(policy, &mut arena, &mut state).map_err(|small| CompileError::Excessive {
+        bytes: small.needed.saturating_mul(size_of::<f32>()),
+    })?;
     let replayed = Controller::new(*policy, workspace).self_test();
     replayed.map(|_| ()).map_err(|error| CompileError::Gate {
         stored: options.to_string().into(),
@@ -191,7 +200,7 @@ fn caches(
     };
     let rows = blueprint.rows(bundle.contract(), tokens);
     let mut caches = HashMap::new();
-    let mut bytes = 0_usize;
+    let mut elements = 0_usize;
     for (state, rows) in blueprint.states.iter().zip(rows) {
         let Keep::Kv(network) = state.keep else {
             continue;
@@ -201,8 +210,8 @@ fn caches(
             what: "the KV cache".into(),
         })?;
         // Before the compiler itself takes memory that grows with the context.
-        bytes = bytes.saturating_add(len as usize);
-        Memory::bytes_of(bytes)?;
+        elements = elements.saturating_add(len as usize);
+        bounded(elements)?;
         caches.insert(state.name.clone(), cache);
     }
     Ok(caches)

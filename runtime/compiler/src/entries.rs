@@ -365,14 +365,7 @@ fn shape_of(tensor: &TensorTypeProto) -> Option<Vec<Dim>> {
     let dims = tensor.shape.as_ref()?.dim.iter();
     dims.map(|dim| match (&dim.dim_value, &dim.dim_param) {
         (Some(len), _) => usize::try_from(*len).ok().map(Dim::of),
-        (None, Some(text)) => {
-            let rest = text.strip_prefix('P')?;
-            let added = rest
-                .trim()
-                .strip_prefix('+')
-                .map_or_else(|| rest.is_empty().then_some(0), |n| n.trim().parse().ok());
-            added.map(Dim::past)
-        }
+        (None, Some(text)) => past(text),
         (None, None) => None,
     })
     .collect()
@@ -412,4 +405,14 @@ pub(crate) fn needed<'g>(
         .zip(wanted)
         .filter_map(|(node, wanted)| wanted.then_some(node))
         .collect()
+}
+
+/// The length that a symbolic axis stands for: `P`, the rows of the cache, or `P+n`.
+pub(crate) fn past(name: &str) -> Option<Dim> {
+    let rest = name.strip_prefix('P')?;
+    let added = rest
+        .trim()
+        .strip_prefix('+')
+        .map_or_else(|| rest.is_empty().then_some(0), |n| n.trim().parse().ok());
+    added.map(Dim::past)
 }

@@ -3,9 +3,7 @@
 use std::fmt;
 use std::path::PathBuf;
 
-use lads_core::{PolicyError, SelfTestError};
-
-use crate::memory::MemoryError;
+use lads_core::{Policy, PolicyError, SelfTestError};
 
 /// Text of one line: control characters, which names in a hostile file may hold, are escaped.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -160,9 +158,15 @@ pub enum CompileError {
         /// What is too large.
         what: Line,
     },
-    /// There is no memory for the image's controller.
-    #[error(transparent)]
-    Memory(#[from] MemoryError),
+    /// A controller of the policy would ask for more memory than any policy gets.
+    #[error(
+        "the policy asks for a workspace of {bytes} bytes, and gets at most {most}; do not trust it, or export a bundle with a shorter context",
+        most = Policy::MEMORY_LIMIT
+    )]
+    Excessive {
+        /// What it would ask for.
+        bytes: usize,
+    },
     /// The image that was made does not load: a defect of this compiler.
     #[error(
         "the compiled image does not load ({0}); this is a defect of the compiler, please report it with the bundle"

@@ -40,11 +40,10 @@ impl Image {
     }
 
     fn new(words: &[u32], report: CompileReport) -> Self {
-        let mut bytes: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
-        let crc = format::crc32(&bytes);
-        bytes[CRC_WORD * 4..][..4].copy_from_slice(&crc.to_le_bytes());
+        let mut words: Vec<u32> = words.iter().map(|word| word.to_le()).collect();
+        words[CRC_WORD] = format::crc32(bytemuck::cast_slice(&words)).to_le();
         Self {
-            bytes: Aligned::new(&bytes),
+            bytes: Aligned::new(&words),
             report,
         }
     }

@@ -8,6 +8,7 @@ mod attributes;
 mod operators;
 mod recurrent;
 mod shapes;
+mod trial;
 
 use std::cell::RefCell;
 use std::collections::HashMap;
@@ -20,6 +21,7 @@ use crate::onnx::{GraphProto, ModelProto, NodeProto, TensorProto};
 use crate::tensor::Tensor;
 
 use attributes::Attributes;
+pub(crate) use trial::{Declared, trial};
 
 /// Operator sets that the translations were written for.
 const OPSETS: std::ops::RangeInclusive<i64> = 13..=21;
@@ -62,16 +64,21 @@ impl<'m> Model<'m> {
                 OPSETS.end()
             )));
         }
+        Ok(Self::of(graph))
+    }
+
+    /// A graph of whatever operator set.
+    fn of(graph: &'m GraphProto) -> Self {
         let protos = graph
             .initializer
             .iter()
             .map(|tensor| (tensor.name.as_str(), tensor))
             .collect();
-        Ok(Self {
+        Self {
             graph,
             protos,
             tensors: RefCell::default(),
-        })
+        }
     }
 
     fn initializer(&self, name: &str) -> Result<Option<Arc<Tensor>>, String> {
@@ -164,6 +171,12 @@ fn node_name(node: &NodeProto) -> &str {
     }
 }
 
+/// What is wrong with a node of another domain than ONNX' own.
+fn foreign(node: &NodeProto) -> Option<String> {
+    (!node.domain.is_empty() && node.domain != "ai.onnx")
+        .then(|| format!("of domain {} is not supported", node.domain))
+}
+
 /// The values of an entry that were built so far.
 struct Builder<'b, 'm> {
     model: &'b Model<'m>,
@@ -187,8 +200,8 @@ impl Builder<'_, '_> {
 
     fn node(&mut self, node: &NodeProto) -> Result<(), String> {
         self.graph.set_origin(&node.op_type, node_name(node));
-        if !node.domain.is_empty() && node.domain != "ai.onnx" {
-            return Err(format!("of domain {} is not supported", node.domain));
+        if let Some(problem) = foreign(node) {
+            return Err(problem);
         }
         let mut inputs = vec![];
         for name in &node.input {

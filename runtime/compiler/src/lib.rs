@@ -33,18 +33,16 @@ mod graph;
 mod image;
 mod import;
 mod lower;
-mod memory;
 mod onnx;
-mod pages;
 mod plan;
 mod report;
+mod survey;
 mod tensor;
 mod verify;
 
 #[cfg(test)]
 mod tests;
 
-pub use aligned::Aligned;
 pub use bundle::Bundle;
 pub use compile::{Options, compile, compile_with};
 pub use contract::Contract;
@@ -53,6 +51,6 @@ pub use error::{BundleError, CompileError, Line};
 pub use golden::Golden;
 pub use image::Image;
 pub use lads_image::op::{CacheFormat, WeightFormat};
-pub use memory::{Memory, MemoryError};
 pub use report::{CompileReport, ProgramReport};
+pub use survey::{Field, Missing, Operand, Operator, Survey, Value, survey};
 pub use verify::PlanFault;

@@ -27,7 +27,7 @@ use crate::errors::{EncodeError, FollowError, InputError, InstructionError, RunE
 use crate::inputs::{self, Data};
 use crate::normal::Normals;
 use crate::policy::Policy;
-use crate::run::{Counters, Draws, Rows, Run, due};
+use crate::run::{Counters, Draws, Rows, Run};
 use crate::workspace::Workspace;
 
 /// What a policy is told to do.
@@ -233,7 +233,7 @@ impl<'a, 'm> Controller<'a, 'm> {
             words,
             given_index: None,
         };
-        for call in due(run.tables, Event::Instruct, 0) {
+        for call in run.tables.due(Event::Instruct, 0) {
             run.call(&call)?;
         }
         let counters = run.counters;
@@ -476,7 +476,7 @@ impl<'a, 'm> Controller<'a, 'm> {
             words: 0,
             given_index: None,
         };
-        for call in due(run.tables, event, 0) {
+        for call in run.tables.due(event, 0) {
             run.call(&call)?;
         }
         Ok(run.given_index)
@@ -531,7 +531,7 @@ impl<'a, 'm> Controller<'a, 'm> {
             given_index: None,
         };
         let mut fresh = false;
-        for call in due(run.tables, Event::Step, timestep) {
+        for call in run.tables.due(Event::Step, timestep) {
             run.call(&call)?;
             if call.select != records::NONE {
                 let scores = run.plain(call.select)?;

@@ -59,6 +59,7 @@ mod errors;
 mod golden;
 mod guard;
 mod inputs;
+mod lookup;
 mod normal;
 mod policy;
 mod run;
@@ -81,6 +82,7 @@ pub use guard::{
 pub use inputs::{Data, MAX_OBSERVATIONS};
 pub use lads_image::ExecError;
 pub use lads_kernels::Isa;
+pub use lookup::instructions_called;
 pub use policy::{Policy, PolicyError};
 pub use schedule::ScheduleError;
 pub use self_test::{SelfTest, SelfTestError};

@@ -27,6 +27,10 @@ impl<'a> Policy<'a> {
     /// Multiply-adds that a control step may take unless the caller says otherwise: some seconds on a fast core.
     pub const WORK_LIMIT: u64 = 1 << 35;
 
+    /// Bytes of workspace that a host gives any policy. Real ones take a few megabytes, and an operating system that promises more
+    /// memory than it has would let an image take all of it; where the caller brings the memory, nothing asks for this limit.
+    pub const MEMORY_LIMIT: usize = 1 << 30;
+
     /// Opens an image that starts on a 4-byte boundary (64 is better); bytes after the image's own length are ignored.
     pub fn new_checked(image: &'a [u8]) -> Result<Self, PolicyError> {
         Self::new_within(image, Self::WORK_LIMIT)

@@ -17,7 +17,6 @@ use crate::contract::ChannelId;
 use crate::errors::RunError;
 use crate::inputs::Data;
 use crate::normal::Normals;
-use crate::schedule::Chain;
 use crate::workspace::Workspace;
 
 /// The integers of a program.
@@ -409,19 +408,4 @@ fn wrapped(ring: &StateRecord, start: u32, by: u32) -> u32 {
 fn row_at(ring: &StateRecord, start: u32, by: u32) -> usize {
     let row = wrapped(ring, start, by) as usize;
     (ring.offset as usize).saturating_add(row.saturating_mul(ring.width as usize))
-}
-
-/// The calls of one event that run at a timestep.
-#[inline]
-pub(crate) fn due<'a>(
-    tables: &Tables<'a>,
-    event: Event,
-    timestep: u32,
-) -> impl Iterator<Item = CallRecord> + use<'a> {
-    let mut chain = Chain::default();
-    tables
-        .calls()
-        .skip_while(move |call| call.event != event)
-        .take_while(move |call| call.event == event)
-        .filter(move |call| chain.runs(call, timestep))
 }

@@ -18,7 +18,7 @@ use lads_image::records::{
     self, CallRecord, EntryRecord, Event, Fill, MAX_ROW_STATES, PortRecord, Repeat, Scope, Source,
     SourceKind, StateKind, StateRecord, When,
 };
-use lads_image::{Program, ProgramError, Spaces, Tables};
+use lads_image::{Chain, Program, ProgramError, Spaces, Tables};
 
 use crate::contract::{Contract, DType, Role, same_text};
 
@@ -594,27 +594,6 @@ impl Walk<'_, '_> {
             }
         }
         Ok(())
-    }
-}
-
-/// Which calls of an event run: if, else if, else.
-#[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Chain {
-    taken: bool,
-}
-
-impl Chain {
-    /// Whether the next call of the event runs at a timestep.
-    #[inline]
-    pub fn runs(&mut self, call: &CallRecord, timestep: u32) -> bool {
-        let due = match call.when {
-            When::Always => true,
-            When::First => timestep == 0,
-            When::Every => timestep.is_multiple_of(call.every),
-        };
-        let runs = due && !(call.otherwise && self.taken);
-        self.taken = runs || (call.otherwise && self.taken);
-        runs
     }
 }
 

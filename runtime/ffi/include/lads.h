@@ -1223,12 +1223,6 @@ lads_status lads_resume(struct lads_controller *controller);
  */
 lads_status lads_counters(struct lads_controller *controller, struct lads_counters_t *counters);
 
-/**
- * Does not exist.
- *
- */
-extern void lads_a_panic_is_reachable(void);
-
 #ifdef __cplusplus
 }  // extern "C"
 #endif  // __cplusplus

@@ -10,7 +10,9 @@
  *     if (auto status = controller.allocate(policy); !status) ...
  *     if (auto status = controller.self_test(); !status) ...      // arms
  *     controller.set_instruction("mkbh");
- *     auto status = controller.step(observation, action, tick);   // every control period; `action` may be executed, see lads_step
+ *     auto status = controller.step(observation, action, tick);   // every control period: from a controller that is
+ *                                                                 // set up, into an action of the contract's length, `action`
+ *                                                                 // may be executed, whatever the status
  *
  * Structs that begin with struct_bytes are made with lads::made<lads_options>(), which sets it.
  */

@@ -8,8 +8,6 @@ use core::panic::PanicInfo;
 
 unsafe extern "C" {
     /// Does not exist.
-    ///
-    /// cbindgen:ignore
     fn lads_a_panic_is_reachable() -> !;
 }
 
@@ -20,8 +18,6 @@ fn panic(_: &PanicInfo) -> ! {
 }
 
 /// The precompiled `core` refers to this symbol on hosted targets, where it was built to unwind. Nothing calls it: panics abort.
-///
-/// cbindgen:ignore
 #[cfg(not(target_os = "none"))]
 #[unsafe(no_mangle)]
 pub extern "C" fn rust_eh_personality() {}

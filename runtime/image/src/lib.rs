@@ -24,6 +24,7 @@
 extern crate std;
 
 mod access;
+mod chain;
 mod check;
 pub mod codec;
 pub mod format;
@@ -35,6 +36,7 @@ pub mod records;
 pub mod tables;
 
 pub use access::{Access, AccessKind};
+pub use chain::Chain;
 pub use check::{Checker, Fault, Spaces};
 pub use lads_kernels::Isa;
 pub use machine::{ExecError, Machine};

@@ -17,6 +17,11 @@ use std::path::PathBuf;
 pub use encoder::Encoder;
 pub use error::LanguageError;
 
+/// README's examples compile as typed.
+#[cfg(doctest)]
+#[doc = include_str!("../../../README.md")]
+pub struct Readme;
+
 /// Names the folder that holds what was downloaded or built once for this user.
 pub const CACHE_VARIABLE: &str = "LADS_CACHE";
 

@@ -4,10 +4,8 @@
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::time::Duration;
 
 use clap::{Parser, ValueEnum};
-use indicatif::{ProgressBar, ProgressStyle};
 use lads_sim::assets::vendor_dir;
 use lads_sim::collect::{Settings, Tally, collect};
 use lads_sim::dataset::Dataset;
@@ -124,7 +122,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     let output = arguments.output.clone();
     let output = output.unwrap_or_else(|| order.default_output());
     // Looked at before minutes of work, not after.
-    drop(output::temporary_with_folder(&output).map_err(|error| {
+    drop(output::draft_with_folder(&output).map_err(|error| {
         format!(
             "{}: cannot be written ({error}); name a file in a writable folder with -o",
             output.display()
@@ -142,10 +140,7 @@ fn wander(
     output: &Path,
 ) -> Result<(), Box<dyn std::error::Error>> {
     let scene = lorel::Scene::load(&vendor_dir())?;
-    let bar = ProgressBar::new(settings.episodes as u64).with_style(ProgressStyle::with_template(
-        "{bar:30} {pos}/{len} trajectories [{elapsed} < {eta}]",
-    )?);
-    bar.enable_steady_tick(Duration::from_millis(200));
+    let bar = command::progress(settings.episodes, "trajectories");
     let collected = lorel::collect::collect(&scene, settings, |finished| {
         bar.inc(finished as u64);
     });
@@ -167,11 +162,8 @@ fn wander(
 fn demonstrate(settings: &Settings, output: &Path) -> Result<(), Box<dyn std::error::Error>> {
     let scene = Scene::load(&vendor_dir())?;
     let instructions = Instructions::kitchen().seen;
-    let total = instructions.len() as u64 * settings.episodes_per_instruction as u64;
-    let bar = ProgressBar::new(total).with_style(ProgressStyle::with_template(
-        "{bar:30} {pos}/{len} demonstrations, {msg} discarded [{elapsed} < {eta}]",
-    )?);
-    bar.enable_steady_tick(Duration::from_millis(200));
+    let total = instructions.len() * settings.episodes_per_instruction;
+    let bar = command::progress(total, "episodes");
     let mut discarded = 0;
     let collected = collect(&scene, &instructions, settings, |success| {
         if success {
@@ -179,7 +171,7 @@ fn demonstrate(settings: &Settings, output: &Path) -> Result<(), Box<dyn std::er
         } else {
             discarded += 1;
         }
-        bar.set_message(discarded.to_string());
+        bar.set_message(format!("({discarded} failed)"));
     });
     bar.finish_and_clear();
     let (dataset, tallies) = collected?;

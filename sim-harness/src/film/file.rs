@@ -7,13 +7,13 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use tempfile::{NamedTempFile, TempDir};
+use tempfile::TempDir;
 
 use super::FilmError;
 use super::canvas::Canvas;
 use super::gif::Gif;
 use super::mp4::{self, Mp4};
-use crate::output;
+use crate::output::{self, Draft};
 
 /// No picture is shown for less than this, in seconds: browsers do not show GIFs faster, and eyes see nothing.
 pub const SHORTEST_S: f64 = 0.05;
@@ -70,7 +70,7 @@ impl Form {
                 .and_then(|mut entries| entries.next());
             return first.map_or(Ok(form), |_| Err(PlaceError::NotEmpty));
         }
-        output::temporary_beside(path).map_err(PlaceError::Unwritable)?;
+        output::draft(path).map_err(PlaceError::Unwritable)?;
         if form == Self::Mp4 {
             mp4::check().map_err(PlaceError::NoFfmpeg)?;
         }
@@ -78,7 +78,13 @@ impl Form {
     }
 }
 
+/// The folder behind a symbolic link, where there is one.
+fn behind_link(path: &Path) -> PathBuf {
+    fs::canonicalize(path).unwrap_or_else(|_| path.to_owned())
+}
+
 fn temporary_folder(path: &Path) -> io::Result<TempDir> {
+    let path = &behind_link(path);
     let folder = match path.parent() {
         Some(folder) if !folder.as_os_str().is_empty() => folder,
         _ => Path::new("."),
@@ -106,7 +112,7 @@ enum Kind {
 /// Complete, and still at a temporary place.
 pub enum Finished {
     /// A file.
-    File(NamedTempFile),
+    File(Draft),
     /// A folder.
     Folder(TempDir),
 }
@@ -170,10 +176,10 @@ impl Finished {
     pub fn persist(self, path: &Path) -> Result<(), FilmError> {
         match self {
             Self::File(file) => {
-                file.persist(path).map_err(|error| error.error)?;
+                file.commit()?;
             }
             Self::Folder(folder) => {
-                fs::rename(folder.path(), path)?;
+                fs::rename(folder.path(), behind_link(path))?;
                 let _: PathBuf = folder.keep();
             }
         }

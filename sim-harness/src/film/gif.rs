@@ -6,12 +6,11 @@ use std::path::Path;
 
 use color_quant::NeuQuant;
 use gif::{DisposalMethod, Encoder, Frame, Repeat};
-use tempfile::NamedTempFile;
 
 use super::FilmError;
 use super::canvas::Canvas;
 use super::caption;
-use crate::output;
+use crate::output::{self, Draft};
 
 /// Entries of the palette. The last means "as before"; captions have the ones before it.
 const ENTRIES: usize = 256;
@@ -22,8 +21,8 @@ const CHANNEL_BITS: u32 = 6;
 /// An animated GIF on its way.
 pub(super) struct Gif {
     /// Until the first picture.
-    file: Option<NamedTempFile>,
-    encoder: Option<Encoder<BufWriter<NamedTempFile>>>,
+    file: Option<Draft>,
+    encoder: Option<Encoder<BufWriter<Draft>>>,
     /// Pixels of sample pictures, four bytes each.
     sample: Vec<u8>,
     quantiser: Option<NeuQuant>,
@@ -36,7 +35,7 @@ pub(super) struct Gif {
 impl Gif {
     pub(super) fn new(path: &Path) -> Result<Self, FilmError> {
         Ok(Self {
-            file: Some(output::temporary_beside(path)?),
+            file: Some(output::draft(path)?),
             encoder: None,
             sample: Vec::new(),
             quantiser: None,
@@ -52,7 +51,7 @@ impl Gif {
     }
 
     /// Begins the file, with a palette of the sample's colours and the captions'.
-    fn begin(&mut self, file: NamedTempFile, size: [u16; 2]) -> Result<(), FilmError> {
+    fn begin(&mut self, file: Draft, size: [u16; 2]) -> Result<(), FilmError> {
         let captions: Vec<[u8; 3]> = caption::colors().collect();
         let colors = ENTRIES - 1 - captions.len();
         let quantiser = NeuQuant::new(10, colors, &self.sample);
@@ -118,16 +117,14 @@ impl Gif {
         entry.map_or(0, |entry| *entry.get_or_insert_with(nearest))
     }
 
-    pub(super) fn finish(self) -> Result<NamedTempFile, FilmError> {
+    pub(super) fn finish(self) -> Result<Draft, FilmError> {
         let Some(encoder) = self.encoder else {
             return Err(FilmError::Draw("there is no picture".to_owned()));
         };
         let buffered = encoder.into_inner().map_err(gif_error)?;
-        let file = buffered
+        buffered
             .into_inner()
-            .map_err(|error| FilmError::Write(error.into_error()))?;
-        file.as_file().sync_all()?;
-        Ok(file)
+            .map_err(|error| FilmError::Write(error.into_error()))
     }
 }
 

@@ -1,17 +1,14 @@
 //! An MP4, compressed by the program `ffmpeg`: no encoder in pure Rust makes what every player and browser shows. What can fail: no ffmpeg,
 //! one that cannot make it, no room.
 
-use std::fs::File;
 use std::io::{self, Write as _};
 use std::os::unix::process::CommandExt as _;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-use tempfile::NamedTempFile;
-
 use super::FilmError;
 use super::canvas::Canvas;
-use crate::output;
+use crate::output::{self, Draft};
 
 const FFMPEG: &str = "ffmpeg";
 
@@ -29,7 +26,7 @@ pub(super) fn check() -> io::Result<()> {
 /// An MP4 on its way through ffmpeg.
 pub(super) struct Mp4 {
     ffmpeg: Ffmpeg,
-    file: NamedTempFile,
+    file: Draft,
 }
 
 /// The running program, which ends with us.
@@ -49,7 +46,7 @@ impl Mp4 {
         [width, height]: [u32; 2],
         shown_s: f64,
     ) -> Result<Self, FilmError> {
-        let file = output::temporary_beside(path)?;
+        let file = output::draft(path)?;
         let (rate, size) = (format!("{}", 1.0 / shown_s), format!("{width}x{height}"));
         // Without the protocol's name, a colon in a path would be taken for one.
         let mut output = std::ffi::OsString::from("file:");
@@ -107,12 +104,11 @@ impl Mp4 {
         text.lines().last().unwrap_or("it ended early").to_owned()
     }
 
-    pub(super) fn finish(mut self) -> Result<NamedTempFile, FilmError> {
+    pub(super) fn finish(mut self) -> Result<Draft, FilmError> {
         let said = self.said();
         if !self.ffmpeg.0.wait()?.success() {
             return Err(FilmError::Ffmpeg(said));
         }
-        File::open(self.file.path())?.sync_all()?;
         Ok(self.file)
     }
 }

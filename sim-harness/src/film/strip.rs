@@ -9,8 +9,8 @@ use super::{FilmError, Moment, Scene, play};
 use crate::environment::Environment;
 use crate::report::Still;
 
-/// Width and height of a picture, in pixels; the page shows it in half of that, for sharp screens.
-pub const STILL: [u32; 2] = [360, 270];
+/// Width and height of a picture, in pixels; the page shows it small, and in this size when it is enlarged.
+pub const STILL: [u32; 2] = [640, 480];
 
 /// Quality of the pictures in per cent.
 const QUALITY: u8 = 80;

@@ -4,22 +4,28 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use kuva::plot::scatter3d::Scatter3DPlot;
 use kuva::plot::{BarPlot, ColorMap, Heatmap, Histogram, LegendPosition, LinePlot};
-use kuva::render::annotations::{ReferenceLine, TextAnnotation};
+use kuva::render::annotations::ReferenceLine;
 use kuva::render::layout::Layout;
 use kuva::render::plots::Plot;
 
 use super::Report;
-use crate::metrics::Interval;
 use crate::results::Results;
 use crate::trace::Trace;
+use lads_proof::metrics::Interval;
 
 /// Colours that stay apart for most eyes (Okabe and Ito), darkest first.
 const COLORS: [&str; 6] = [
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9",
 ];
 
-/// Width of a character of a label in a timeline, in pixels, margins of the chart allowed for.
-const LABEL_CHARACTER: f64 = 7.5;
+/// Completions that are nearer than this share of an episode have one label in a timeline.
+const TOGETHER: f64 = 0.04;
+
+/// Room above the plans of a timeline for the numbers of completions.
+const HEADROOM: f64 = 1.12;
+
+/// The colour of what nobody asked for.
+const UNASKED: &str = "#777777";
 
 /// Bars of the latency histogram.
 const BINS: usize = 40;
@@ -33,23 +39,45 @@ const WHOLE: f64 = 900.0;
 /// How much larger than it was laid out a chart may be shown.
 const ENLARGED: f64 = 1.3;
 
+/// How much smaller; a narrower page lets it be pushed aside. Its smallest letters are 11 pixels high as laid out.
+const REDUCED: f64 = 0.85;
+
 /// A picture.
 pub struct Chart {
     /// Its SVG text.
     pub svg: String,
     /// Whether it wants a row to itself.
     pub wide: bool,
+    /// What its marks mean, below it.
+    pub marks: Vec<Mark>,
+    /// A remark below it.
+    pub note: String,
+}
+
+/// A completion that is marked in a timeline.
+pub struct Mark {
+    /// Its number in the chart.
+    pub number: usize,
+    /// The sub-task.
+    pub name: String,
+    /// The control step.
+    pub step: usize,
+    /// Whether the instruction asks for it.
+    pub asked: bool,
 }
 
 fn chart(plots: Vec<Plot>, layout: Layout) -> Chart {
     let (width, height) = (layout.width.unwrap_or(HALF), layout.height.unwrap_or(HALF));
     let svg = kuva::render_to_svg(plots, layout);
     // With it, the page may show the picture in any size, but letters no larger than the page's.
-    let widest = ENLARGED * width;
-    let scalable = format!("<svg viewBox=\"0 0 {width} {height}\" style=\"max-width:{widest}px\" ");
+    let (least, most) = (REDUCED * width, ENLARGED * width);
+    let size = format!("min-width:{least}px;max-width:{most}px");
+    let scalable = format!("<svg viewBox=\"0 0 {width} {height}\" style=\"{size}\" ");
     Chart {
         svg: svg.replacen("<svg ", &scalable, 1),
         wide: width > HALF,
+        marks: Vec::new(),
+        note: String::new(),
     }
 }
 
@@ -123,35 +151,61 @@ fn timeline(report: &Report<'_>, trace: &Trace) -> Chart {
     ];
     let title = super::title(&report.contract, trace);
     let steps = trace.steps.len() as f64;
-    let completions = &trace.outcome.completions;
-    let names: Vec<&str> = completions
-        .iter()
-        .map(|done| report.sub_tasks.get(done.sub_task).copied().unwrap_or("?"))
-        .collect();
-    // Labels have rows of their own above the plans, so that close completions stay readable.
-    let plans = report.contract.codebook_len() as f64;
-    let row = 0.1 * plans;
     let mut layout = sized(&plots, &title, HALF, 300.0)
         .with_x_label("control step")
         .with_y_label("plan")
         .with_x_axis_max(steps)
         .with_y_axis_min(0.0)
-        .with_y_axis_max(plans + row * (names.len() + 1) as f64);
-    for (place, (done, name)) in completions.iter().zip(names).enumerate() {
-        let at = done.step as f64;
-        // A label is centred; it goes to the side of its line where there is room.
-        let half = 0.5 * (name.len() as f64 + 2.0) * steps * LABEL_CHARACTER / HALF;
-        let x = if at + 2.0 * half < steps {
-            at + half
-        } else {
-            at - half
-        };
-        let label = TextAnnotation::new(name, x, plans + row * (place as f64 + 0.2));
-        layout = layout
-            .with_annotation(label.with_font_size(11))
-            .with_reference_line(ReferenceLine::vertical(at).with_color(COLORS[1]));
+        .with_y_axis_max(HEADROOM * report.contract.codebook_len() as f64);
+    let marks = marks(report, trace);
+    // Numbers of completions that are close to each other stand at the first of their lines.
+    let mut together: Vec<(f64, Vec<&Mark>)> = Vec::new();
+    for mark in &marks {
+        let at = mark.step as f64;
+        match together.last_mut() {
+            Some((first, near)) if at - *first < TOGETHER * steps => near.push(mark),
+            _ => together.push((at, vec![mark])),
+        }
     }
-    chart(plots, layout)
+    for (_, near) in together {
+        for (place, mark) in near.iter().enumerate() {
+            let color = if mark.asked { COLORS[1] } else { UNASKED };
+            let dashes = if mark.asked { "6 3" } else { "2 3" };
+            let mut line = ReferenceLine::vertical(mark.step as f64)
+                .with_color(color)
+                .with_dasharray(dashes);
+            if place == 0 {
+                let numbers: Vec<_> = near.iter().map(|it| it.number.to_string()).collect();
+                line = line.with_label(numbers.join(", "));
+            }
+            layout = layout.with_reference_line(line);
+        }
+    }
+    Chart {
+        marks,
+        ..chart(plots, layout)
+    }
+}
+
+/// The completions of an episode in their order, and whether the instruction asks for them.
+fn marks(report: &Report<'_>, trace: &Trace) -> Vec<Mark> {
+    let known = report.contract.instruction(trace.instruction as usize);
+    let asked = |name: &str| {
+        // A sentence outside the table asks for what `--sub-tasks` says, which is not in the contract.
+        known.is_none_or(|known| known.sub_tasks.split(',').any(|asked| asked.trim() == name))
+    };
+    let mut completions: Vec<_> = trace.outcome.completions.iter().collect();
+    completions.sort_by_key(|done| done.step);
+    let mark = |(number, done): (usize, &crate::environment::Completion)| {
+        let name = report.sub_tasks.get(done.sub_task).copied().unwrap_or("?");
+        Mark {
+            number,
+            name: name.to_owned(),
+            step: done.step,
+            asked: asked(name),
+        }
+    };
+    (1..).zip(completions).map(mark).collect()
 }
 
 /// Mean softmax of the first decision's logits, by instruction.
@@ -263,9 +317,12 @@ fn heat_map(title: &str, rows: Vec<(String, Vec<f64>)>, plans: usize) -> Vec<Cha
         200.0 + 20.0 * used.len() as f64,
         130.0 + 20.0 * rows.len() as f64,
     );
+    let names: Vec<String> = rows.into_iter().map(|(name, _)| name).collect();
+    let plan = |plan: &usize| format!("plan {plan}");
     let plots: Vec<Plot> = vec![
         Heatmap::new()
             .with_data(data)
+            .with_labels(names.clone(), used.iter().map(plan).collect())
             .with_color_map(ColorMap::Viridis)
             .with_tooltips()
             .into(),
@@ -273,7 +330,7 @@ fn heat_map(title: &str, rows: Vec<(String, Vec<f64>)>, plans: usize) -> Vec<Cha
     let layout = sized(&plots, title, width.max(420.0), height.max(260.0))
         .with_x_label("plan")
         .with_x_categories(used.iter().map(ToString::to_string).collect())
-        .with_y_categories(rows.into_iter().map(|(name, _)| name).collect());
+        .with_y_categories(names);
     vec![chart(plots, layout)]
 }
 
@@ -405,7 +462,6 @@ pub fn latency(report: &Report<'_>) -> Vec<Chart> {
     // A machine that does other work has steps that are hundreds of times slower; the usual ones are what there is to see.
     let edge = 4.0 * round_up(most.min(8.0 * usual) / 4.0);
     let beyond = all.iter().filter(|&&us| us > edge).count();
-    let title = format!("{beyond} of {} steps lie beyond the right edge", all.len());
     let of_kind = |decided: bool, name: &str, color: &str| -> Plot {
         let of_kind = steps.clone().filter(|step| step.decided == decided);
         let durations = of_kind.map(|step| step.controller_ns as f64 / 1e3);
@@ -421,10 +477,17 @@ pub fn latency(report: &Report<'_>) -> Vec<Chart> {
         of_kind(false, "ordinary step", COLORS[5]),
         of_kind(true, "decision step", COLORS[1]),
     ];
-    let layout = sized(&plots, &title, WHOLE, 340.0)
+    let layout = sized(&plots, "Duration of a control step", WHOLE, 340.0)
         .with_x_label("duration (µs)")
         .with_y_label("control steps");
-    vec![chart(plots, layout)]
+    let note = match beyond {
+        0 => String::new(),
+        _ => format!("{beyond} of {} steps lie beyond the right edge.", all.len()),
+    };
+    vec![Chart {
+        note,
+        ..chart(plots, layout)
+    }]
 }
 
 #[cfg(test)]

@@ -13,9 +13,9 @@ use base64::engine::general_purpose::STANDARD;
 use lads_core::Contract;
 
 use self::charts::Chart;
-use crate::metrics::{Interval, Score};
 use crate::results::Results;
 use crate::trace::Trace;
+use lads_proof::metrics::{Interval, Score};
 
 /// What a report is made of.
 pub struct Report<'r> {
@@ -113,7 +113,19 @@ struct Page<'r> {
     figures: Vec<Figure>,
     films: Vec<Film<'r>>,
     no_films: &'r str,
+    /// Why the intervals of single instructions are wide, where they are.
+    few: Option<Few>,
 }
+
+/// Few episodes of each instruction, and the widest interval that comes of it.
+struct Few {
+    episodes: u32,
+    low: f64,
+    high: f64,
+}
+
+/// With fewer episodes of each instruction than this, their intervals say little.
+const FEW: u32 = 10;
 
 impl Report<'_> {
     /// The page.
@@ -131,6 +143,7 @@ impl Report<'_> {
             figures: self.figures(),
             films: self.films(),
             no_films: self.strips.as_ref().err().map_or("", String::as_str),
+            few: self.few(),
         };
         page.render()
     }
@@ -155,6 +168,24 @@ impl Report<'_> {
         splits.chain(each).collect()
     }
 
+    fn few(&self) -> Option<Few> {
+        let episodes = self.results.episodes_per_instruction;
+        let each = self.results.instructions.iter();
+        let intervals = each.flat_map(|result| {
+            let score = &result.score;
+            let measured = score.k_rate.iter().zip(score.k_rate_interval);
+            measured.filter_map(|(rate, interval)| rate.map(|_| interval))
+        });
+        let width = |Interval(low, high): &Interval| high - low;
+        let widest = intervals.max_by(|a, b| width(a).total_cmp(&width(b)));
+        let Interval(low, high) = widest.filter(|_| episodes < FEW)?;
+        Some(Few {
+            episodes,
+            low,
+            high,
+        })
+    }
+
     fn films(&self) -> Vec<Film<'_>> {
         let strips = self.strips.as_deref().unwrap_or_default().iter();
         strips
@@ -175,17 +206,25 @@ impl Report<'_> {
             about: about.to_owned(),
             charts,
         };
+        // The first shows all instructions, the others composites and their parts.
+        let starts = charts::start_distributions(self);
+        let composites = starts.len() > 1;
         let mut figures = vec![
             figure(
                 "Latent plans over an episode",
-                "The plan in force at every control step; vertical lines are completions. Episodes that failed come first.",
+                "The plan in force at every control step. Vertical lines are completions, by number; those that the instruction does not ask \
+                 for are grey and dotted. Episodes that failed come first.",
                 charts::timelines(self),
             ),
             figure(
                 "Plans at the start of an episode",
-                "Mean probability that the high level gives each plan in the first decision, by instruction. Where a composite instruction has \
-                 atomic ones in the contract, the line is the composite's distribution and the bars are its parts'.",
-                charts::start_distributions(self),
+                if composites {
+                    "Mean probability that the high level gives each plan in the first decision, by instruction. Then, for composite \
+                     instructions: the line is the composite's distribution, the bars are those of its parts."
+                } else {
+                    "Mean probability that the high level gives each plan in the first decision, by instruction."
+                },
+                starts,
             ),
             figure(
                 "Gripper by plan",

@@ -4,11 +4,11 @@
 use std::path::Path;
 use std::process::Command;
 
-use lads_benches::BenchError;
-use lads_benches::clock::now;
-use lads_benches::contender::Episode;
-use lads_benches::stats::{median, quantile};
-use lads_compiler::Memory;
+use lads_pace::BenchError;
+use lads_pace::clock::now;
+use lads_pace::contender::Episode;
+use lads_pace::stats::{median, quantile};
+use lads_host::Memory;
 use lads_core::{Controller, Instruction, Policy};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -94,7 +94,7 @@ pub fn child(image: &Path, warm: bool) -> Result<(), BenchError> {
 /// An instruction and two steps.
 fn begin(controller: &mut Controller<'_, '_>, episode: &Episode) -> Result<[u64; 3], BenchError> {
     let mut action = vec![0.0; episode.limits.len()];
-    let instruction = Instruction::Id(episode.instruction);
+    let instruction = Instruction::Id(episode.instruction.unwrap_or(0));
     let (done, instruct) = timed(|| controller.set_instruction(instruction));
     done.map_err(refused)?;
     let mut step = |step| {

@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use lads_benches::BenchError;
-use lads_benches::contender::Kind;
+use lads_pace::BenchError;
+use lads_pace::contender::Kind;
 use serde_json::{Value, json};
 
 use crate::charts::{Line, lines, tail};
@@ -55,14 +55,11 @@ pub fn write(
     )
 }
 
-/// Beside the target first, then renamed.
 fn save(path: &Path, bytes: &[u8]) -> Result<(), BenchError> {
-    let temporary = path.with_extension("tmp");
-    std::fs::write(&temporary, bytes)
-        .and_then(|()| std::fs::rename(&temporary, path))
-        .map_err(|error| {
-            BenchError::new(path.display(), error, "name a folder that can be written")
-        })
+    let written = lads_host::output::write(path, bytes);
+    written.map_err(|error| {
+        BenchError::new(path.display(), error, "name a folder that can be written")
+    })
 }
 
 fn as_json(measured: &Measured, rows: &[Row]) -> Value {

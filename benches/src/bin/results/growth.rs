@@ -2,12 +2,13 @@
 
 use std::path::Path;
 
-use lads_benches::BenchError;
-use lads_benches::clock::Pace;
-use lads_benches::contender::{Block, Kind, Work};
-use lads_benches::stats::exponent;
-use lads_benches::suite::{Candidate, Peers, with_contenders};
-use lads_benches::turns::take_turns;
+use lads_pace::BenchError;
+use lads_pace::clock::Pace;
+use lads_pace::contender::{Block, Kind, Work};
+use lads_pace::stats::exponent;
+use lads_benches::peers::Peers;
+use lads_pace::suite::{Candidate, with_contenders};
+use lads_pace::turns::take_turns;
 use lads_compiler::{Bundle, compile};
 use lads_core::Policy;
 use serde::{Deserialize, Serialize};
@@ -100,10 +101,11 @@ fn point(bytes: &[u8], value: f64, library: &Path, effort: Effort) -> Result<Poi
         tolerance,
     }];
     let peers = Peers {
+        bundle: bytes.to_vec(),
         onnxruntime: Some(library.to_owned()),
         ..Peers::default()
     };
-    with_contenders(&candidates, bytes, &peers, vec![], |field, contenders| {
+    with_contenders(&candidates, &peers, vec![], |field, contenders| {
         let calls = 20;
         let first = field.episode.first_around(CONTEXT, field.words, calls);
         let block = |work| Block {

@@ -20,16 +20,19 @@ use std::process::{Command, ExitCode};
 use std::time::Instant;
 
 use clap::Parser;
-use lads_benches::clock::now;
-use lads_benches::contender::{Contender, Episode};
+use lads_pace::clock::now;
+use lads_pace::contender::{Contender, Episode};
 use lads_benches::peers::onnxruntime::OnnxRuntime;
 use lads_benches::peers::recompute::Recompute;
 use lads_benches::peers::{cut::Source, tract::Tract};
-use lads_benches::stats::{median, quantile};
-use lads_benches::suite::{Candidate, Peers, options, with_contenders};
-use lads_benches::{BenchError, bundle};
-use lads_compiler::{Bundle, Image, WeightFormat, compile, compile_with};
+use lads_pace::stats::{median, quantile};
+use lads_benches::peers::Peers;
+use lads_pace::suite::{Candidate, options, with_contenders};
+use lads_benches::bundle;
+use lads_pace::BenchError;
+use lads_compiler::{Bundle, WeightFormat, compile, compile_with};
 use lads_core::Policy;
+use lads_host::Aligned;
 use serde_json::{Value, json};
 
 use crate::measure::Bare;
@@ -123,12 +126,12 @@ fn say(text: &str) {
 }
 
 /// The images of the policy that ships, with the weights stored in every way that gives the same plans.
-fn images(bundle: &Bundle) -> Result<Vec<(&'static str, Image)>, BenchError> {
+fn images(bundle: &Bundle) -> Result<Vec<(&'static str, Aligned)>, BenchError> {
     let mut images = vec![];
     for weights in WeightFormat::ALL {
         let full = weights == WeightFormat::F32;
         match compile_with(bundle, options(weights)) {
-            Ok(image) => images.push((weights.name(), image)),
+            Ok(image) => images.push((weights.name(), Aligned::new(image.as_bytes()))),
             Err(error) if full => return Err(about("models/kitchen.onnx", error)),
             Err(error) => say(&format!("without {} weights: {error}", weights.name())),
         }
@@ -158,7 +161,7 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
     let preparation = preparation(&bytes, &opened, &images, effort)?;
     say("first steps of fresh processes");
     let image_file = arguments.scratch.join("kitchen.lads");
-    std::fs::write(&image_file, images[0].1.as_bytes())
+    lads_host::output::write(&image_file, images[0].1.as_bytes())
         .map_err(|error| about(image_file.display(), error))?;
     let cold = cold::measure(&image_file, effort.processes)?;
 
@@ -174,6 +177,7 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
         });
     }
     let main_peers = Peers {
+        bundle: bytes.clone(),
         onnxruntime: Some(arguments.onnxruntime.clone()),
         ..Peers::default()
     };
@@ -195,7 +199,6 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
     guests.extend(recomputes(arguments, &whole));
     let (field, hot, paced_all, contexts) = with_contenders(
         &candidates,
-        &bytes,
         &all_peers,
         guests,
         |field, contenders| {
@@ -214,7 +217,7 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
     let tails = candidates.get(..FOR_TAILS).unwrap_or(&candidates);
     say("beside ONNX Runtime: at 50 Hz, for the tails");
     let (paced, loaded) =
-        with_contenders(tails, &bytes, &main_peers, bare(), |field, contenders| {
+        with_contenders(tails, &main_peers, bare(), |field, contenders| {
             let rounds = effort.paced_rounds;
             let paced = measure::paced(field, contenders, rounds, 0, &mut |_| ())?;
             say("the same beside a thread that thrashes the caches");
@@ -273,7 +276,7 @@ fn low_level_bytes(bundle: &[u8]) -> Result<usize, BenchError> {
 fn preparation(
     bytes: &[u8],
     bundle: &Bundle,
-    images: &[(&'static str, Image)],
+    images: &[(&'static str, Aligned)],
     effort: Effort,
 ) -> Result<Value, BenchError> {
     let spread = |took: &[f64]| json!({ "median": median(took), "low": quantile(took, 0.25), "high": quantile(took, 0.75) });
@@ -332,7 +335,8 @@ fn export_recompute(
     let content = json!({
         "instruction": episode.instruction, "observations": observations, "actions": actions.collect::<Vec<_>>(),
     });
-    std::fs::write(&file, content.to_string()).map_err(|error| about(file.display(), error))?;
+    lads_host::output::write(&file, content.to_string().as_bytes())
+        .map_err(|error| about(file.display(), error))?;
     let model = arguments.scratch.join("recompute.onnx");
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/recompute.py");
     let done = Command::new(&arguments.python)

@@ -2,15 +2,15 @@
 
 use std::time::Duration;
 
-use lads_benches::BenchError;
-use lads_benches::clock::Pace;
-use lads_benches::contender::{Block, Computed, Contender, Episode, Kind, Sample, Work, measure};
-use lads_benches::load::Load;
-use lads_benches::realtime::Realtime;
-use lads_benches::stats::{Ratio, Rounds};
-use lads_benches::suite::Field;
+use lads_pace::BenchError;
+use lads_pace::clock::Pace;
+use lads_pace::contender::{Block, Computed, Contender, Episode, Kind, Sample, Work, measure};
+use lads_pace::load::Load;
+use lads_pace::realtime::Realtime;
+use lads_pace::stats::{Ratio, Rounds};
+use lads_pace::suite::Field;
 use lads_benches::sweep::Sweep;
-use lads_benches::turns::take_turns;
+use lads_pace::turns::take_turns;
 use serde_json::{Value, json};
 
 use crate::Effort;

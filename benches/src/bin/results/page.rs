@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use lads_benches::stats::{Ratio, exponent};
+use lads_pace::stats::{Ratio, exponent};
 use serde_json::Value;
 
 use crate::files::Measured;

@@ -75,7 +75,7 @@ pub fn compare(rows: &[Row], before: Option<&(String, Value)>) -> Changes {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use lads_benches::stats::Ratio;
+    use lads_pace::stats::Ratio;
     use serde_json::json;
 
     fn row(id: &str, median: f64, unit: &'static str) -> Row {

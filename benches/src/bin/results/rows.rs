@@ -1,7 +1,7 @@
 //! The ratios that the runtime is held to, each with its target and what was measured.
 
-use lads_benches::contender::Kind;
-use lads_benches::stats::{Ratio, Rounds, quantile};
+use lads_pace::contender::Kind;
+use lads_pace::stats::{Ratio, Rounds, quantile};
 use serde::Serialize;
 use serde_json::Value;
 

@@ -8,6 +8,10 @@ use super::operators::Outputs;
 use crate::graph::{Dim, Graph, Id, Type, show};
 use crate::tensor::{Data, MAX_ELEMENTS, Tensor};
 
+/// What is said of an operator that is not known.
+pub(super) const UNKNOWN: &str =
+    "is not supported; export the graph with operators that the compiler's documentation lists";
+
 /// Adds a node's operations to the graph.
 pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attributes) -> Outputs {
     let one = |y: Result<Id, String>| y.map(|y| vec![y]);
@@ -17,7 +21,9 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
             // Identity unless training.
             a.int("seed", 0)?;
             let training = x.optional(2).and_then(|id| g.constant(id).cloned());
-            if x.optional(2).is_some() && training.is_none_or(|flag| flag.data != Data::I64(vec![0])) {
+            if x.optional(2).is_some()
+                && training.is_none_or(|flag| flag.data != Data::I64(vec![0]))
+            {
                 return Err("supports inference only".into());
             }
             Ok(vec![x.get(0)?])
@@ -26,19 +32,26 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
         "Constant" => constant(g, a),
         "ConstantOfShape" => filled(g, x, a),
         "Shape" => {
-            let shape = g.known_shape(x.get(0)?).ok_or("supports static shapes only")?;
+            let shape = g
+                .known_shape(x.get(0)?)
+                .ok_or("supports static shapes only")?;
             if a.int("start", 0)? != 0 || a.int("end", i64::MAX)? != i64::MAX {
                 return Err("supports whole shapes only".into());
             }
             let dims: Vec<i64> = shape.iter().map(|&dim| dim as i64).collect();
-            Ok(vec![g.add_const(Arc::new(Tensor::i64(&[dims.len()], dims)))])
+            Ok(vec![
+                g.add_const(Arc::new(Tensor::i64(&[dims.len()], dims))),
+            ])
         }
         "Reshape" => one(reshape(g, x, a)),
         "Flatten" => one(flatten(g, x, a)),
         "Squeeze" => one(squeeze(g, x, a)),
         "Unsqueeze" => one(unsqueeze(g, x, a)),
         "Expand" => {
-            let shape = wanted(g, x.get(1)?)?.into_iter().map(|dim| usize::try_from(dim).map(Dim::of)).collect::<Result<Vec<_>, _>>();
+            let shape = wanted(g, x.get(1)?)?
+                .into_iter()
+                .map(|dim| usize::try_from(dim).map(Dim::of))
+                .collect::<Result<Vec<_>, _>>();
             let shape = shape.map_err(|_| "has a negative length")?;
             one(g.expand(x.get(0)?, &shape))
         }
@@ -46,7 +59,10 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
             let value = x.get(0)?;
             let reversed: Vec<usize> = (0..g.shape(value).len()).rev().collect();
             let perm = match a.ints("perm")? {
-                Some(perm) => perm.iter().map(|&i| axis(g, value, i)).collect::<Result<_, _>>()?,
+                Some(perm) => perm
+                    .iter()
+                    .map(|&i| axis(g, value, i))
+                    .collect::<Result<_, _>>()?,
                 None => reversed,
             };
             one(g.transpose(value, &perm))
@@ -59,7 +75,7 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
         "Split" => split(g, x, a),
         "Slice" => one(slice(g, x)),
         "Gather" => one(gather(g, x, a)),
-        _ => Err("is not supported; export the graph with operators that the compiler's documentation lists".into()),
+        _ => Err(UNKNOWN.into()),
     }
 }
 

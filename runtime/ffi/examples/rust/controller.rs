@@ -6,6 +6,7 @@
 //! The hardware is a stand-in: joints follow their velocity commands exactly.
 
 use std::error::Error;
+use std::process::ExitCode;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -14,7 +15,17 @@ use lads_core::{
     Controller, Fallback, GuardConfig, GuardedController, Instruction, Policy, Tick, Workspace,
 };
 
-fn main() -> Result<(), Box<dyn Error>> {
+fn main() -> ExitCode {
+    match run() {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+fn run() -> Result<(), Box<dyn Error>> {
     let mut arguments = std::env::args().skip(1);
     let (Some(bundle), Some(instruction)) = (arguments.next(), arguments.next()) else {
         return Err("usage: controller BUNDLE INSTRUCTION [CYCLES]".into());

@@ -4,8 +4,6 @@ use std::fmt::Display;
 use std::io::{ErrorKind, Write as _};
 use std::path::Path;
 
-use lads_sim::output;
-
 /// How a run ends early.
 pub enum End {
     /// With a line that names the thing and the remedy.
@@ -24,17 +22,6 @@ pub fn unwritable(option: &str, path: &Path, error: &dyn Display) -> End {
         "{option} {}: cannot be written ({error}); name a file in an existing, writable folder",
         path.display()
     ))
-}
-
-/// Whether an option's file could be written, before any work.
-pub fn check_writable(option: &str, path: Option<&Path>) -> Result<(), End> {
-    let Some(path) = path else {
-        return Ok(());
-    };
-    let there = output::temporary_beside(path);
-    there
-        .map(drop)
-        .map_err(|error| unwritable(option, path, &error))
 }
 
 /// Prints to stdout; a reader that has left is no failure.

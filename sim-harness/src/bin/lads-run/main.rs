@@ -18,22 +18,22 @@ mod verify;
 mod viewer;
 
 use std::fmt::Display;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use arguments::Arguments;
-use end::{End, check_writable, print, refused, unwritable};
-use indicatif::{ProgressBar, ProgressStyle};
+use end::{End, print, refused, unwritable};
+use indicatif::ProgressBar;
 use lads_compiler::{Bundle, Memory};
 use lads_core::{Contract, Decision, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Setup};
 use lads_sim::faults::Faults;
 use lads_sim::plans;
-use lads_sim::results::{self, DecisionUsed, EnvironmentUsed, InstructionResult, Results};
+use lads_sim::results::{self, Results};
 use lads_sim::rollout::Actor;
 use lads_sim::table::Table;
 use lads_sim::verify::reference::Reference;
@@ -136,11 +136,12 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
     };
     if let Some(reference) = reference {
         reference
-            .check(&bundle, environment.as_ref())
+            .check(&lads_sim::verify::subject(&bundle, environment.as_ref()))
             .map_err(refused)?;
         verify::prepare(&mut evaluation, &reference, arguments.episodes)?;
         return verify::run(
             &evaluation,
+            &bundle,
             &reference,
             &open,
             &arguments.certificate,
@@ -242,19 +243,19 @@ impl Bench<'_> {
             .filter(|(_, episodes)| !episodes.is_empty())
             .filter_map(|(assignment, episodes)| {
                 let known = evaluation.instruction(assignment.instruction)?;
-                Some(InstructionResult::new(&known, watched, episodes))
+                Some(results::of_instruction(&known, watched, episodes))
             })
             .collect();
         let threads = evaluation.threads.min(evaluation.len());
         Results {
             format: results::FORMAT,
             format_version: results::FORMAT_VERSION,
-            environment: EnvironmentUsed::new(environment, &splits),
+            environment: results::environment_used(environment, &splits),
             bundle_sha256: contract.bundle_sha256().to_owned(),
             image_sha256: lads_compiler::sha256(evaluation.policy.image()),
             seed: evaluation.seed,
             noise: self.noise.to_owned(),
-            decision: DecisionUsed::of(evaluation.decision, evaluation.actor),
+            decision: results::decision_used(evaluation.decision, evaluation.actor),
             episodes_per_instruction: evaluation.episodes,
             heard_by: self.heard.by.clone(),
             faults: Some(evaluation.setup.faults).filter(|&faults| faults != Faults::default()),
@@ -395,17 +396,43 @@ fn stop_on_interrupt() -> Result<Arc<AtomicBool>, End> {
     Ok(stop)
 }
 
-/// Whether all files could be written, before any work.
+/// Whether all files could be written and none is what is read or another one, before any work.
 fn check_outputs(arguments: &Arguments) -> Result<(), End> {
-    check_writable("--json", arguments.json.as_deref())?;
+    let files = &arguments.recordings;
     report::check(arguments.report.as_deref())?;
-    record::check(&arguments.recordings)?;
-    viewer::check(arguments)?;
-    check_writable("--log", arguments.recordings.log.as_deref())?;
-    for path in &arguments.certificate {
-        check_writable("--certificate", Some(path))?;
-    }
-    Ok(())
+    let reference = arguments.verify.as_ref();
+    let reference = reference.map(|named| verify::file(arguments, named.as_deref()));
+    let inputs = [
+        ("--model", Some(&arguments.model)),
+        ("--image", arguments.image.as_ref()),
+        ("--verify", reference.as_ref()),
+        ("--replay", files.replay.as_ref()),
+        ("--encode", files.encode.as_ref()),
+        ("--plans", files.plans.as_ref()),
+    ];
+    let outputs = [
+        ("--json", arguments.json.as_ref()),
+        ("--report", arguments.report.as_ref()),
+        ("--log", files.log.as_ref()),
+    ];
+    let certificates = arguments.certificate.iter();
+    let certificates = certificates.map(|path| ("--certificate", Some(path)));
+    let outputs = given(outputs.into_iter().chain(certificates));
+    let film = given([("--record", files.record.as_ref())]);
+    output::apart(&given(inputs), &[&outputs[..], &film].concat()).map_err(refused)?;
+    output::check(&[], &outputs).map_err(refused)?;
+    record::check(files)?;
+    viewer::check(arguments)
+}
+
+/// The files that were named.
+fn given<'p>(
+    files: impl IntoIterator<Item = (&'p str, Option<&'p PathBuf>)>,
+) -> Vec<output::Named<'p>> {
+    let files = files.into_iter();
+    files
+        .filter_map(|(option, path)| Some((option, path?.as_path())))
+        .collect()
 }
 
 /// Checks what needs no file; returns the number of threads.
@@ -459,13 +486,7 @@ fn progress(episodes: usize) -> ProgressBar {
 
 /// A progress bar over other things.
 fn progress_over(count: usize, things: &str) -> ProgressBar {
-    let bar = ProgressBar::new(count as u64);
-    let style = ProgressStyle::with_template(&format!(
-        "{{bar:40}} {{pos}}/{{len}} {things}, {{elapsed}} elapsed, {{eta}} left {{msg}}"
-    ));
-    bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
-    bar.enable_steady_tick(Duration::from_millis(200));
-    bar
+    command::progress(count, things)
 }
 
 /// Runs all episodes behind a progress bar, until `stop` is raised.

@@ -25,7 +25,7 @@ impl Program {
             return Ok(Self::Compiled(image));
         };
         let again = "compile it again from the bundle, with lads compile";
-        let bytes = std::fs::read(path)
+        let bytes = lads_host::input::read(path)
             .map_err(|error| about(path, &format_args!("{error}; name a program image (.lads)")))?;
         let image = Aligned::new(&bytes);
         let policy = Policy::new_checked(image.as_bytes())

@@ -108,9 +108,17 @@ pub fn encode(policy: &Policy<'_>, path: &Path, json: Option<&Path>) -> Result<E
         plans,
     };
     let sequences = log.flights.iter().zip(plans).map(sequence);
-    // An episode shorter than a horizon has no plan to follow.
-    let sequences = sequences.filter(|sequence| !sequence.plans.is_empty());
-    let file = PlanFile::new(policy.contract().horizon(), sequences.collect());
+    let (sequences, short): (Vec<_>, Vec<_>) = sequences.partition(|it| !it.plans.is_empty());
+    let file = PlanFile::new(policy.contract().horizon(), sequences);
+    if let Some(first) = short.first() {
+        eprintln!(
+            "--encode: {} of {} episodes, {} among them, are shorter than the horizon of {} and have no plan",
+            short.len(),
+            log.flights.len(),
+            first.instruction,
+            file.horizon
+        );
+    }
     match json {
         Some(path) => {
             output::write_json(&file, path).map_err(|e| unwritable("--json", path, &e))?;
@@ -168,10 +176,7 @@ pub fn log(
             trace: trace.clone(),
         })
     };
-    let mut notes: std::collections::BTreeMap<_, _> = results::versions()
-        .into_iter()
-        .map(|(name, version)| (name.to_owned(), version))
-        .collect();
+    let mut notes = results::versions();
     let faults = serde_json::to_string(&evaluation.setup.faults).unwrap_or_default();
     notes.insert("faults".to_owned(), faults);
     let log = Log {
@@ -190,10 +195,9 @@ pub fn log(
         flights: traces.iter().filter_map(flight).collect(),
     };
     let written = || -> Result<(), Box<dyn std::error::Error>> {
-        let mut file = output::temporary_beside(path)?;
-        recorder::write(&log, file.as_file_mut())?;
-        file.persist(path)?;
-        Ok(())
+        let mut draft = output::draft(path)?;
+        recorder::write(&log, draft.as_file_mut())?;
+        Ok(draft.commit()?)
     };
     written().map_err(|error| unwritable("--log", path, &error))
 }

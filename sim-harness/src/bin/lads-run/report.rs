@@ -11,16 +11,18 @@ mod with {
     use std::sync::atomic::AtomicBool;
 
     use lads_sim::evaluate::Evaluation;
+    use lads_sim::output;
     use lads_sim::registry::Opener;
     use lads_sim::report::{Report, Strip};
     use lads_sim::results::Results;
     use lads_sim::trace::Trace;
 
-    use crate::end::{End, check_writable, unwritable};
+    use crate::end::{End, refused, unwritable};
 
     /// Whether a report could be written, before any work.
     pub fn check(path: Option<&Path>) -> Result<(), End> {
-        check_writable("--report", path)
+        let outputs: Vec<_> = path.iter().map(|&path| ("--report", path)).collect();
+        output::check(&[], &outputs).map_err(refused)
     }
 
     /// The page, film strips included.
@@ -44,7 +46,7 @@ mod with {
 
     /// Writes the page.
     pub fn write(page: &str, path: &Path) -> Result<(), End> {
-        lads_sim::output::write(page.as_bytes(), path)
+        lads_sim::output::write(path, page.as_bytes())
             .map_err(|error| unwritable("--report", path, &error))
     }
 

@@ -2,11 +2,11 @@
 
 use std::ffi::OsStr;
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use askama::Template as _;
-use lads_core::Decision;
+use lads_compiler::Bundle;
 use lads_sim::evaluate::Evaluation;
 use lads_sim::output;
 use lads_sim::registry::Opener;
@@ -24,10 +24,14 @@ pub fn reference(arguments: &Arguments) -> Result<Option<Reference>, End> {
     let Some(named) = &arguments.verify else {
         return Ok(None);
     };
-    let path = named
-        .clone()
-        .unwrap_or_else(|| arguments.model.with_extension("reference.json"));
+    let path = file(arguments, named.as_deref());
     Reference::open(&path).map(Some).map_err(refused)
+}
+
+/// The reference's file: the one that is named, else the one beside the model.
+pub fn file(arguments: &Arguments, named: Option<&Path>) -> PathBuf {
+    let beside = || arguments.model.with_extension("reference.json");
+    named.map_or_else(beside, Path::to_owned)
 }
 
 /// Makes `evaluation` the reference's: seed, decision rule, episodes and traces.
@@ -45,7 +49,8 @@ pub fn prepare(
     }
     evaluation.episodes = episodes;
     evaluation.seed = reference.seed;
-    evaluation.decision = Decision::Argmax;
+    // The contract's own rule, whatever the reference's was: the certificate compares the two.
+    evaluation.decision = evaluation.policy.contract().decision();
     evaluation.setup.traced = reference.traced_episodes.min(episodes);
     Ok(())
 }
@@ -53,21 +58,30 @@ pub fn prepare(
 /// Runs the verification, writes and prints the certificate; gives the exit code.
 pub fn run(
     evaluation: &Evaluation<'_>,
+    bundle: &Bundle,
     reference: &Reference,
     open: &Opener,
     certificates: &[PathBuf],
     stop: &AtomicBool,
 ) -> Result<ExitCode, End> {
     let bar = progress(lads_sim::verify::work(evaluation));
-    let certificate = lads_sim::verify::run(evaluation, reference, open, versions(), stop, &|| {
-        bar.inc(1);
-    });
+    let certificate = lads_sim::verify::run(
+        evaluation,
+        bundle,
+        reference,
+        open,
+        versions(),
+        stop,
+        &|| {
+            bar.inc(1);
+        },
+    );
     bar.finish_and_clear();
     let certificate = certificate.map_err(unfinished)?;
     for path in certificates {
         let written = if path.extension() == Some(OsStr::new("html")) {
             let page = Page::new(&certificate).render().map_err(refused)?;
-            output::write(page.as_bytes(), path)
+            output::write(path, page.as_bytes())
         } else {
             output::write_json(&certificate, path)
         };
@@ -83,16 +97,27 @@ struct Summary<'c>(&'c Certificate);
 impl fmt::Display for Summary<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Certificate {
+            contract,
             policy,
             environment,
             rollouts,
             ..
         } = self.0;
+        let differing = contract.differing.len() + contract.image_differing.len();
         writeln!(
             f,
-            "policy alone       {} of {} replayed episodes differ; actions within {:.1e} (allowed {:.1e}) over {} steps",
+            "contract           {} fields compared, {differing} values differ",
+            contract.fields.len()
+        )?;
+        writeln!(
+            f,
+            "policy alone       {} of {} replayed episodes differ; logits within {:.1e} (allowed {:.1e}) over {} decisions, actions within {:.1e} \
+             (allowed {:.1e}) over {} steps",
             policy.differing_episodes,
             policy.episodes,
+            policy.largest_logit_difference,
+            policy.logit_tolerance,
+            policy.compared_decisions,
             policy.largest_action_difference,
             policy.action_tolerance,
             policy.compared_steps
@@ -153,6 +178,16 @@ impl fmt::Display for Summary<'_> {
         for reason in &self.0.reasons {
             writeln!(f, "- {reason}")?;
         }
+        for note in &self.0.notes {
+            writeln!(f, "- note: {note}")?;
+        }
+        let reference = &self.0.reference;
+        writeln!(
+            f,
+            "- reference: weights from {}, words from {}",
+            reference.weights_from, reference.words_from
+        )?;
+        writeln!(f, "- not covered: {}", self.0.not_covered.join("; "))?;
         match self.0.more_episodes_per_instruction {
             Some(more) => writeln!(
                 f,

@@ -1,0 +1,371 @@
+//! What a file misses to become a policy, all at once: operators that the compiler does not take, and fields of the contract.
+//!
+//! [`survey`] takes any ONNX model. Of one without a contract it lists what a person has to say: nothing is guessed. What can fail: the
+//! bytes are no ONNX model, or a bundle of another version.
+
+use std::collections::HashMap;
+
+use bytes::Bytes;
+use prost::Message;
+
+use crate::contract::Contract;
+use crate::entries;
+use crate::error::{BundleError, Line};
+use crate::golden::Golden;
+use crate::graph::{Dim, Type, show};
+use crate::import::{Declared, Model, trial};
+use crate::onnx::{self, GraphProto, ModelProto, TensorTypeProto, ValueInfoProto, data_type};
+
+/// Top-level fields without which no contract reads.
+const FIELDS: [(&str, &str); 6] = [
+    ("version", "the version of the contract's form, 2"),
+    (
+        "family",
+        "the family of policies and its own fields; {\"kind\": \"plain\"} for one graph from observations to an action",
+    ),
+    ("environment", "`id` and `version` of what it was made for"),
+    (
+        "control_period_s",
+        "the time from one control step to the next, in seconds",
+    ),
+    (
+        "channels",
+        "every observation and the action, with names, units and limits",
+    ),
+    ("provenance", "how the policy was trained: anything, or {}"),
+];
+
+/// What a file holds and what it misses.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Survey {
+    /// ONNX operator set.
+    pub opset: Option<i64>,
+    /// What wrote the file.
+    pub producer: String,
+    /// Operators in the graph.
+    pub nodes: usize,
+    /// What the graph reads.
+    pub inputs: Vec<Value>,
+    /// What the graph gives.
+    pub outputs: Vec<Value>,
+    /// Keys of the metadata.
+    pub metadata: Vec<String>,
+    /// What is missing.
+    pub missing: Missing,
+}
+
+/// A value at the edge of a graph.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Value {
+    /// Name.
+    pub name: String,
+    /// Type of its elements, as ONNX calls it.
+    pub dtype: String,
+    /// Lengths of its axes, or their names.
+    pub shape: Vec<String>,
+}
+
+/// What stands between a file and a policy; both lists are empty for a bundle that compiles.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Missing {
+    /// Nodes that the compiler does not take, in the graph's order.
+    pub operators: Vec<Operator>,
+    /// What a contract has to say and none does.
+    pub contract: Vec<Field>,
+}
+
+/// A node that the compiler does not take.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Operator {
+    /// The ONNX operator.
+    pub operator: String,
+    /// The node's name, or its first output's.
+    pub node: String,
+    /// What it reads.
+    pub inputs: Vec<Operand>,
+    /// What is not supported.
+    pub problem: String,
+}
+
+/// What a node reads.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Operand {
+    /// Name of the value.
+    pub name: String,
+    /// Its shape, `?` where nothing says it.
+    pub shape: String,
+}
+
+/// A field of the contract, or what takes the place of one.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Field {
+    /// Which one.
+    pub field: String,
+    /// What it has to say, or what is wrong with it.
+    pub needed: String,
+}
+
+impl Missing {
+    /// Whether nothing is.
+    pub fn is_empty(&self) -> bool {
+        self.operators.is_empty() && self.contract.is_empty()
+    }
+
+    fn field(&mut self, field: impl Into<String>, needed: impl Into<String>) {
+        self.contract.push(Field {
+            field: line(&field.into()),
+            needed: line(&needed.into()),
+        });
+    }
+}
+
+/// Names in a hostile file hold anything.
+fn line(text: &str) -> String {
+    Line::from(text).to_string()
+}
+
+/// Shapes of values inside a graph, which the compiler works out itself and only a survey reads.
+#[derive(Clone, PartialEq, Message)]
+struct Inner {
+    #[prost(message, optional, tag = "7")]
+    graph: Option<InnerGraph>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct InnerGraph {
+    #[prost(message, repeated, tag = "13")]
+    value_info: Vec<ValueInfoProto>,
+}
+
+/// Lists what a file holds and what it misses to become a policy.
+pub fn survey(bytes: &[u8]) -> Result<Survey, BundleError> {
+    let bytes = Bytes::copy_from_slice(bytes);
+    let model = onnx::decode(&bytes)?;
+    let graph = model.graph.as_ref().ok_or_else(|| BundleError::NotOnnx {
+        problem: "it has no graph".into(),
+    })?;
+    let inner = Inner::decode(bytes).ok().and_then(|inner| inner.graph);
+    let inner = inner.map_or(vec![], |graph| graph.value_info);
+    let initialized = |value: &&ValueInfoProto| {
+        let name = &value.name;
+        graph.initializer.iter().any(|tensor| tensor.name == *name)
+    };
+    let inputs = graph.input.iter().filter(|value| !initialized(value));
+    let inputs: Vec<&ValueInfoProto> = inputs.collect();
+
+    let mut missing = Missing::default();
+    if let Err(error) = Model::new(&model, graph) {
+        missing.operators.push(Operator {
+            operator: "(operator set)".into(),
+            node: String::new(),
+            inputs: vec![],
+            problem: line(&error.to_string()),
+        });
+    }
+    let declared: Declared = (inputs.iter().copied())
+        .chain(&graph.output)
+        .chain(&inner)
+        .filter_map(|value| Some((value.name.as_str(), taken(value)?)))
+        .collect();
+    let refused = trial(graph, &declared);
+    missing.operators.extend(refused.into_iter().map(|node| {
+        Operator {
+            operator: line(&node.operator),
+            node: line(&node.node),
+            inputs: (node.inputs.into_iter())
+                .map(|(name, shape)| Operand {
+                    name: line(&name),
+                    shape,
+                })
+                .collect(),
+            problem: line(&node.problem),
+        }
+    }));
+    match property(&model, "lads.contract") {
+        Some(json) => of_bundle(&model, graph, json, &mut missing)?,
+        None => of_stranger(&inputs, graph, &mut missing),
+    }
+    let default = |domain: &str| domain.is_empty() || domain == "ai.onnx";
+    let sets = &model.opset_import;
+    Ok(Survey {
+        opset: sets
+            .iter()
+            .find(|set| default(&set.domain))
+            .map(|set| set.version),
+        producer: line(&model.producer_name),
+        nodes: graph.node.len(),
+        inputs: inputs.into_iter().map(value).collect(),
+        outputs: graph.output.iter().map(value).collect(),
+        metadata: (model.metadata_props.iter())
+            .map(|pair| line(&pair.key))
+            .collect(),
+        missing,
+    })
+}
+
+fn property<'m>(model: &'m ModelProto, key: &str) -> Option<&'m str> {
+    let found = model.metadata_props.iter().find(|pair| pair.key == key);
+    found.map(|pair| pair.value.as_str())
+}
+
+fn tensor(value: &ValueInfoProto) -> Option<&TensorTypeProto> {
+    value.r#type.as_ref()?.tensor_type.as_ref()
+}
+
+/// A value's type and shape as the compiler takes them; a named axis that is not the context's length counts as 1.
+fn taken(value: &ValueInfoProto) -> Option<(Type, Vec<Dim>)> {
+    let tensor = tensor(value)?;
+    let ty = match tensor.elem_type {
+        data_type::FLOAT | data_type::UINT8 => Type::F32,
+        data_type::INT64 | data_type::INT32 => Type::I64,
+        _ => return None,
+    };
+    let dims = tensor.shape.as_ref()?.dim.iter();
+    let dims = dims.map(|dim| match (dim.dim_value, &dim.dim_param) {
+        (Some(len), _) => usize::try_from(len)
+            .ok()
+            .filter(|&len| len > 0)
+            .map(Dim::of),
+        (None, Some(name)) => Some(entries::past(name).unwrap_or(Dim::of(1))),
+        (None, None) => Some(Dim::of(1)),
+    });
+    Some((ty, dims.collect::<Option<_>>()?))
+}
+
+/// A value as the file declares it.
+fn value(value: &ValueInfoProto) -> Value {
+    let tensor = tensor(value);
+    let shape = tensor.and_then(|tensor| tensor.shape.as_ref());
+    let dims = shape.into_iter().flat_map(|shape| &shape.dim);
+    let dims = dims.map(|dim| match (dim.dim_value, &dim.dim_param) {
+        (Some(len), _) => len.to_string(),
+        (None, Some(name)) => line(name),
+        (None, None) => "?".into(),
+    });
+    Value {
+        name: line(&value.name),
+        dtype: tensor.map_or("no tensor".into(), |tensor| {
+            data_type::name(tensor.elem_type)
+        }),
+        shape: dims.collect(),
+    }
+}
+
+/// What is wrong with a contract that is there. One of another version is refused: its remedy is another program.
+fn of_bundle(
+    model: &ModelProto,
+    graph: &GraphProto,
+    json: &str,
+    missing: &mut Missing,
+) -> Result<(), BundleError> {
+    let before = missing.contract.len();
+    if let Ok(serde_json::Value::Object(fields)) = serde_json::from_str(json) {
+        for (name, needed) in FIELDS {
+            if !fields.contains_key(name) {
+                missing.field(name, needed);
+            }
+        }
+    }
+    let contract = match Contract::parse(json) {
+        Ok(contract) => Some(contract),
+        Err(error @ (BundleError::ContractV1 | BundleError::ContractVersion { .. })) => {
+            return Err(error);
+        }
+        Err(BundleError::Contract { problem }) if missing.contract.len() == before => {
+            missing.field("lads.contract", problem.to_string());
+            None
+        }
+        Err(_) => None,
+    };
+    let golden = property(model, "lads.golden");
+    if golden.is_none() {
+        missing.field("lads.golden", GOLDEN);
+    }
+    let Some(contract) = contract else {
+        return Ok(());
+    };
+    if let Some(Err(error)) = golden.map(|golden| Golden::parse(golden, &contract)) {
+        missing.field("lads.golden", error.to_string());
+    }
+    let blueprint = contract.family.kind().blueprint(&contract);
+    if let Err(error) = entries::signatures(graph, &contract, &blueprint) {
+        missing.field("entries", error.to_string());
+    }
+    Ok(())
+}
+
+const GOLDEN: &str = "a recorded episode, with which every target tests itself: what was observed, the actions, and how far an action may be from them";
+
+/// What has to be said of a graph that comes without a contract.
+fn of_stranger(inputs: &[&ValueInfoProto], graph: &GraphProto, missing: &mut Missing) {
+    for (name, needed) in FIELDS {
+        if name != "channels" {
+            missing.field(name, needed);
+        }
+    }
+    let shape = |value: &ValueInfoProto| {
+        let taken = taken(value).map(|(_, shape)| show(&shape));
+        taken.unwrap_or_else(|| "of a type that no channel has".into())
+    };
+    let len = |value: &ValueInfoProto| {
+        let shape = taken(value)?.1;
+        let mut lens = shape.iter().map(|dim| dim.known());
+        lens.try_fold(1_usize, |len, dim| len.checked_mul(dim?))
+    };
+    let shapes: HashMap<&str, _> = (graph.output.iter())
+        .filter_map(|output| Some((output.name.as_str(), taken(output)?)))
+        .collect();
+    for input in inputs {
+        let elements = len(input).map_or("its".into(), |len| len.to_string());
+        let own = taken(input);
+        let mut fed: Vec<&str> = (shapes.iter())
+            .filter(|(_, of_output)| own.as_ref() == Some(of_output))
+            .map(|(name, _)| *name)
+            .collect();
+        fed.sort_unstable();
+        let state = if fed.is_empty() {
+            String::new()
+        } else {
+            let fed = fed.join(", ");
+            format!("; or a state that an output feeds ({fed}) and what clears it")
+        };
+        missing.field(
+            format!("channels[{}]", input.name),
+            format!(
+                "what the input {} is: an observation, with name, unit and limits of {elements} elements{state}",
+                shape(input)
+            ),
+        );
+        for (axis, dim) in
+            (value(input).shape.iter().enumerate()).filter(|(_, dim)| dim.parse::<i64>().is_err())
+        {
+            missing.field(
+                format!("channels[{}].shape[{axis}]", input.name),
+                format!("a fixed length in place of `{dim}`, which was taken as 1"),
+            );
+        }
+    }
+    for output in &graph.output {
+        let elements = len(output).map_or("its".into(), |len| len.to_string());
+        missing.field(
+            format!("channels[{}]", output.name),
+            format!(
+                "what the output {} is: the action, with name, unit, limits, scale and offset of {elements} elements and what they are relative to; or a state; or nothing that is needed",
+                shape(output)
+            ),
+        );
+    }
+    if let Some(value) = (inputs.iter().copied())
+        .chain(&graph.output)
+        .find(|value| entries::entry_of(&value.name).is_none())
+    {
+        missing.field(
+            "entries",
+            format!(
+                "values named after their entry; of a plain policy, `policy/act/{0}` in place of `{0}`",
+                value.name
+            ),
+        );
+    }
+    missing.field("lads.golden", GOLDEN);
+}

@@ -1,0 +1,24 @@
+//! Bytes of an image at an address as weights want it.
+
+use std::alloc::{Layout, handle_alloc_error};
+
+use crate::pages::Pages;
+
+/// Bytes whose address is a multiple of a cache line and of a page.
+#[derive(Debug)]
+pub struct Aligned(Pages);
+
+impl Aligned {
+    /// A copy of `bytes`; without memory for it, the program ends as it does where a `Vec` gets none.
+    pub fn new(bytes: &[u8]) -> Self {
+        let mut pages = Pages::zeroed(bytes.len())
+            .unwrap_or_else(|_| handle_alloc_error(Layout::for_value(bytes)));
+        pages.as_mut().copy_from_slice(bytes);
+        Self(pages)
+    }
+
+    /// The bytes.
+    pub fn as_bytes(&self) -> &[u8] {
+        self.0.as_bytes()
+    }
+}

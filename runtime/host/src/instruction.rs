@@ -1,0 +1,93 @@
+//! Finding a known instruction by what a person wrote.
+//!
+//! The rule is [`Contract::instructions_called`], the same everywhere; here is what to say where it finds none ([`UnknownInstruction`]).
+
+use lads_core::Contract;
+
+/// How many known instructions are shown to one who asked for an unknown one.
+const SUGGESTIONS: usize = 3;
+
+/// The number of the first known instruction with this id, or with this text up to case and white space.
+pub fn find(contract: &Contract, wanted: &str) -> Result<u32, UnknownInstruction> {
+    let found = contract.instructions_called(wanted.as_bytes()).next();
+    found.ok_or_else(|| {
+        let known = contract.instructions().map(|known| (known.id, known.text));
+        let nearest = nearest(known, wanted).into_iter().take(SUGGESTIONS);
+        UnknownInstruction {
+            wanted: wanted.to_owned(),
+            nearest: nearest
+                .map(|(id, text)| (id.to_owned(), text.to_owned()))
+                .collect(),
+        }
+    })
+}
+
+/// Known instructions (id and text), those first whose id or text is most like what a person wrote.
+pub fn nearest<'a>(
+    known: impl Iterator<Item = (&'a str, &'a str)>,
+    wanted: &str,
+) -> Vec<(&'a str, &'a str)> {
+    let wanted = plain(wanted);
+    let like = |known: &str| strsim::normalized_damerau_levenshtein(&wanted, &plain(known));
+    let mut scored: Vec<_> = known
+        .map(|(id, text)| (like(text).max(like(id)), (id, text)))
+        .collect();
+    scored.sort_by(|(a, _), (b, _)| b.total_cmp(a));
+    scored.into_iter().map(|(_, known)| known).collect()
+}
+
+/// Lower case, single spaces.
+fn plain(text: &str) -> String {
+    text.to_lowercase()
+        .split_whitespace()
+        .collect::<Vec<_>>()
+        .join(" ")
+}
+
+/// A policy does not know what it was told to do.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "instruction '{wanted}': the policy does not know it; {}",
+    remedy(nearest)
+)]
+pub struct UnknownInstruction {
+    /// What it was told.
+    pub wanted: String,
+    /// Ids and texts of the known ones that are most like it, the best first; none where the policy takes no instruction.
+    pub nearest: Vec<(String, String)>,
+}
+
+fn remedy(nearest: &[(String, String)]) -> String {
+    if nearest.is_empty() {
+        return "it knows no instructions, so give none".into();
+    }
+    let shown: Vec<_> = nearest
+        .iter()
+        .map(|(id, text)| format!("'{text}' ({id})"))
+        .collect();
+    format!("the nearest that it knows: {}", shown.join(", "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_most_alike_comes_first() {
+        let known = [("k", "move the kettle"), ("d", "open the drawer")];
+        let best = |wanted| nearest(known.into_iter(), wanted)[0].0;
+        assert_eq!(best("open the drower"), "d");
+        assert_eq!(best("K"), "k");
+    }
+
+    #[test]
+    fn a_refusal_says_what_is_known() {
+        let nearest = vec![("d".to_owned(), "open the drawer".to_owned())];
+        let wanted = "sing".to_owned();
+        let said = UnknownInstruction { wanted, nearest }.to_string();
+        assert_eq!(
+            said,
+            "instruction 'sing': the policy does not know it; the nearest that it knows: 'open the drawer' (d)"
+        );
+    }
+}

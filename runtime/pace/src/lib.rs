@@ -1,0 +1,28 @@
+//! Measures a policy: hot, at a robot's pace, and beside what its users would pick instead.
+//!
+//! ```text
+//! Contender (lads, or who else runs the policy)
+//!     │ block by block, in turns                      turns
+//!     ▼
+//! Sample (kind of call, lateness, duration)           contender, clock, realtime, load
+//!     │
+//!     ▼
+//! Summary, Ratio (per round, then the median)         stats
+//! ```
+//!
+//! [`paced`] is the protocol of a whole run with its report. What can fail is a [`BenchError`], one line; a contender that computes
+//! something else than the others is never timed.
+#![forbid(unsafe_code)]
+
+pub mod clock;
+pub mod contender;
+pub mod error;
+pub mod lads;
+pub mod load;
+pub mod paced;
+pub mod realtime;
+pub mod stats;
+pub mod suite;
+pub mod turns;
+
+pub use error::BenchError;

@@ -1,0 +1,191 @@
+//! Brings all contenders to the start: opens what they need and compares what they compute, before anything is timed.
+
+use lads_compiler::{CacheFormat, Options, WeightFormat};
+use lads_core::{Controller, Policy};
+use lads_host::Memory;
+
+use crate::clock::now;
+use crate::contender::{Contender, Episode, compare};
+use crate::error::BenchError;
+use crate::lads::Lads;
+
+/// Control steps that are compared.
+const COMPARED: usize = 60;
+
+/// An action that is further from the recorded one than this is not rounding.
+const BROKEN: f32 = 0.1;
+
+/// How a policy is compiled to be measured: with fewer bits for the weights, the cache has half of them too, and the tolerance, which
+/// is otherwise the machine's, only has to tell a sound policy from a broken one.
+pub fn options(weights: WeightFormat) -> Options {
+    if weights == WeightFormat::F32 {
+        return Options::default();
+    }
+    Options {
+        weights,
+        cache: CacheFormat::F16,
+        tolerance: Some(BROKEN),
+        ..Options::default()
+    }
+}
+
+/// An image to measure.
+#[derive(Debug, Clone, Copy)]
+pub struct Candidate<'i> {
+    /// How its weights are stored, such as `f32`.
+    pub weights: &'i str,
+    /// The compiled program image, aligned to four bytes.
+    pub image: &'i [u8],
+    /// Largest difference of an action from the recorded one that is accepted.
+    pub tolerance: f32,
+}
+
+/// Whoever runs the same policy by other means.
+pub trait Others {
+    /// Opens them; who was asked for and cannot be run is told to `absent`, with the reason.
+    fn open<'e>(
+        &self,
+        episode: &'e Episode,
+        absent: &mut Vec<String>,
+    ) -> Vec<Box<dyn Contender + 'e>>;
+}
+
+/// Nobody else.
+#[derive(Debug, Clone, Copy)]
+pub struct Nobody;
+
+impl Others for Nobody {
+    fn open<'e>(&self, _: &'e Episode, _: &mut Vec<String>) -> Vec<Box<dyn Contender + 'e>> {
+        vec![]
+    }
+}
+
+/// A contender at the start.
+#[derive(Debug, Clone, serde::Serialize)]
+pub struct Entrant {
+    /// Its name.
+    pub name: String,
+    /// Version and settings.
+    pub detail: String,
+    /// Largest difference of an action from the recorded episode.
+    pub largest_error: f32,
+    /// The first instruction and control step of this process, in nanoseconds.
+    pub first_ns: u64,
+    /// The same again, median, in nanoseconds.
+    pub again_ns: u64,
+}
+
+/// What was measured on.
+#[derive(Debug)]
+pub struct Field<'f> {
+    /// The episode.
+    pub episode: &'f Episode,
+    /// Words of its instruction; 0 without one.
+    pub words: usize,
+    /// Who takes part.
+    pub entrants: Vec<Entrant>,
+    /// Others that were asked for and could not be run, with the reason.
+    pub absent: Vec<String>,
+}
+
+/// Opens all contenders, compares them, and lends them to `body`. Guests come last and are not compared: they run no policy.
+pub fn with_contenders<R>(
+    candidates: &[Candidate<'_>],
+    others: &dyn Others,
+    mut guests: Vec<Box<dyn Contender>>,
+    body: impl FnOnce(&Field<'_>, &mut [&mut dyn Contender]) -> Result<R, BenchError>,
+) -> Result<R, BenchError> {
+    let refused = |error: &dyn std::fmt::Display| {
+        BenchError::new("the policy", error, "compile it again from its bundle")
+    };
+    let policies = candidates
+        .iter()
+        .map(|candidate| Policy::new_checked(candidate.image));
+    let policies: Vec<_> = policies
+        .collect::<Result<_, _>>()
+        .map_err(|error| refused(&error))?;
+    let Some(first) = policies.first() else {
+        return Err(BenchError::new(
+            "the benchmark",
+            "there is no policy",
+            "name one",
+        ));
+    };
+    let episode = Episode::of(first)?;
+    let known = episode
+        .instruction
+        .and_then(|number| first.contract().instruction(number as usize));
+    let words = known.map_or(0, |known| {
+        known.words.len() / first.contract().word_dim().max(1)
+    });
+    let memories = policies.iter().map(Memory::of).collect::<Result<_, _>>();
+    let mut memories: Vec<Memory> = memories.map_err(|error| refused(&error))?;
+    let controllers = memories
+        .iter_mut()
+        .zip(&policies)
+        .map(|(memory, policy)| memory.controller(policy));
+    let mut controllers: Vec<Controller<'_, '_>> = controllers
+        .collect::<Result<_, _>>()
+        .map_err(|error| refused(&error))?;
+    let mut ours: Vec<_> = controllers
+        .iter_mut()
+        .zip(candidates)
+        .map(|(controller, candidate)| Lads::new(candidate.weights, controller, &episode))
+        .collect();
+    let mut absent = vec![];
+    let mut others = others.open(&episode, &mut absent);
+
+    let tolerance = first.golden().map_or(0.0, |golden| golden.tolerance());
+    let tolerances = candidates.iter().map(|candidate| candidate.tolerance);
+    let tolerances = tolerances.chain(std::iter::repeat(tolerance));
+    let ours = ours
+        .iter_mut()
+        .map(|contender| contender as &mut dyn Contender);
+    let others = others
+        .iter_mut()
+        .map(|contender| contender.as_mut() as &mut dyn Contender);
+    let mut contenders: Vec<&mut dyn Contender> = ours.chain(others).collect();
+    let mut entrants = vec![];
+    for (contender, tolerance) in contenders.iter_mut().zip(tolerances) {
+        entrants.push(admit(*contender, &episode, tolerance)?);
+    }
+    let field = Field {
+        episode: &episode,
+        words,
+        entrants,
+        absent,
+    };
+    contenders.extend(
+        guests
+            .iter_mut()
+            .map(|guest| guest.as_mut() as &mut dyn Contender),
+    );
+    body(&field, &mut contenders)
+}
+
+/// Times the first calls, then compares a stretch of the episode.
+fn admit(
+    contender: &mut dyn Contender,
+    episode: &Episode,
+    tolerance: f32,
+) -> Result<Entrant, BenchError> {
+    let mut timed = || -> Result<u64, BenchError> {
+        let start = now();
+        contender.replay(1)?;
+        Ok(now() - start)
+    };
+    let first_ns = timed()?;
+    let mut again = (0..15).map(|_| timed()).collect::<Result<Vec<_>, _>>()?;
+    again.sort_unstable();
+    let compared = COMPARED.min(episode.recorded.len());
+    let computed = contender.replay(compared)?;
+    let wanted = episode.recorded.get(..compared).unwrap_or_default();
+    let largest_error = compare(contender.name(), &computed, wanted, tolerance)?;
+    Ok(Entrant {
+        name: contender.name().to_owned(),
+        detail: contender.detail(),
+        largest_error,
+        first_ns,
+        again_ns: again.get(again.len() / 2).copied().unwrap_or(0),
+    })
+}

@@ -1,0 +1,236 @@
+//! An MCAP file back into episodes.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use mcap::Summary;
+use mcap::read::{MessageStream, metadata};
+use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use serde::de::DeserializeOwned;
+
+use super::schema::{
+    ACTION, COMPLETION, EPISODE, GRIPPER, LOGITS, OBSERVATION, PLAN, TIMING, TOPICS,
+};
+use super::{
+    ActionMessage, CompletionMessage, EpisodeMessage, FORMAT_VERSION, Flight, GripperMessage, Log,
+    LogError, METADATA, Origin, PlanMessage, TimingMessage, Values,
+};
+use crate::environment::Completion;
+use crate::rollout::Episode;
+use crate::trace::{Step, Trace};
+
+/// Reads a log as [`super::write`] writes it; messages of other topics are passed over.
+pub fn read(path: &Path) -> Result<Log, LogError> {
+    let bytes = lads_host::input::read(path)?;
+    whole(&bytes)?;
+    let (origin, episodes) = origin(&bytes)?;
+    let mut flights = Vec::new();
+    for message in MessageStream::new(&bytes)? {
+        let message = message?;
+        let topic = TOPICS
+            .iter()
+            .position(|known| known.name == message.channel.topic);
+        if let Some(topic) = topic {
+            take(topic, &message.data, &mut flights)?;
+        }
+    }
+    if flights.len() != episodes {
+        let got = flights.len();
+        return Err(foreign(format!("it has {got} of its {episodes} episodes")));
+    }
+    for flight in &flights {
+        check(flight, &origin)?;
+    }
+    Ok(Log { origin, flights })
+}
+
+/// Compares all checksums: of chunks, of the data and of the summary.
+fn whole(bytes: &[u8]) -> Result<(), LogError> {
+    let options = LinearReaderOptions::default()
+        .with_prevalidate_chunk_crcs(true)
+        .with_validate_data_section_crc(true)
+        .with_validate_summary_section_crc(true)
+        // No record is longer than the file, whatever a damaged length says.
+        .with_record_length_limit(bytes.len());
+    let mut reader = LinearReader::new_with_options(options);
+    let mut left = bytes;
+    while let Some(event) = reader.next_event() {
+        if let LinearReadEvent::ReadRequest(wanted) = event? {
+            let (now, later) = left.split_at(wanted.min(left.len()));
+            reader.insert(wanted)[..now.len()].copy_from_slice(now);
+            reader.notify_read(now.len());
+            left = later;
+        }
+    }
+    Ok(())
+}
+
+fn foreign(what: impl Into<String>) -> LogError {
+    LogError::Foreign(what.into())
+}
+
+/// The origin, and the number of episodes that follow.
+fn origin(bytes: &[u8]) -> Result<(Origin, usize), LogError> {
+    // The summary stands at the end of the file: a file that is cut off has none.
+    let summary = Summary::read(bytes)?.ok_or_else(|| foreign("it has no summary"))?;
+    let index = summary
+        .metadata_indexes
+        .iter()
+        .find(|index| index.name == METADATA)
+        .ok_or_else(|| foreign(format!("it has no metadata called {METADATA}")))?;
+    let end = index.offset.checked_add(index.length);
+    if end.is_none_or(|end| end > bytes.len() as u64) {
+        return Err(LogError::Mcap(mcap::McapError::BadIndex));
+    }
+    let entries = metadata(bytes, index)?.metadata;
+    let text = |key: &str| {
+        entries
+            .get(key)
+            .cloned()
+            .ok_or_else(|| foreign(format!("its metadata lack {key}")))
+    };
+    let version: u32 = number(&entries, "format_version")?;
+    if version != FORMAT_VERSION {
+        return Err(foreign(format!(
+            "its messages are of version {version}, known is {FORMAT_VERSION}"
+        )));
+    }
+    let names = |key: &str| -> Result<Vec<String>, LogError> {
+        Ok(text(key)?.split_whitespace().map(str::to_owned).collect())
+    };
+    let notes = entries.iter().filter_map(|(key, value)| {
+        let key = key.strip_prefix("note.")?;
+        Some((key.to_owned(), value.clone()))
+    });
+    let origin = Origin {
+        bundle_sha256: text("bundle_sha256")?,
+        environment: text("environment")?,
+        environment_version: text("environment_version")?,
+        seed: number(&entries, "seed")?,
+        noise: text("noise")?,
+        control_period_s: number(&entries, "control_period_s")?,
+        horizon: number(&entries, "horizon")?,
+        observation_names: names("observation_names")?,
+        action_names: names("action_names")?,
+        notes: notes.collect(),
+    };
+    Ok((origin, number(&entries, "episodes")?))
+}
+
+fn number<N: std::str::FromStr>(
+    entries: &BTreeMap<String, String>,
+    key: &str,
+) -> Result<N, LogError> {
+    let value = entries.get(key).and_then(|value| value.parse().ok());
+    value.ok_or_else(|| foreign(format!("its metadata lack a sound {key}")))
+}
+
+fn take(topic: usize, data: &[u8], flights: &mut Vec<Flight>) -> Result<(), LogError> {
+    if topic == EPISODE {
+        let start: EpisodeMessage = message(topic, data)?;
+        flights.push(begun(start)?);
+        return Ok(());
+    }
+    let flight = flights
+        .last_mut()
+        .ok_or_else(|| foreign("a message comes before the first episode"))?;
+    if topic == OBSERVATION {
+        flight.trace.steps.push(Step {
+            observation: message::<Values>(topic, data)?.values,
+            action: Vec::new(),
+            executed: Vec::new(),
+            plan: 0,
+            decided: false,
+            margin: None,
+            logits: Vec::new(),
+            controller_ns: 0,
+            gripper: None,
+        });
+        return Ok(());
+    }
+    let step = flight
+        .trace
+        .steps
+        .last_mut()
+        .ok_or_else(|| foreign("a message comes before the first observation"))?;
+    match topic {
+        ACTION => {
+            let action: ActionMessage = message(topic, data)?;
+            (step.action, step.executed) = (action.policy, action.executed);
+        }
+        PLAN => {
+            let plan: PlanMessage = message(topic, data)?;
+            (step.plan, step.decided, step.margin) = (plan.index, plan.decided, plan.margin);
+            if plan.decided {
+                flight.trace.outcome.plans.push(plan.index);
+            }
+        }
+        LOGITS => step.logits = message::<Values>(topic, data)?.values,
+        TIMING => step.controller_ns = message::<TimingMessage>(topic, data)?.controller_ns,
+        GRIPPER => {
+            let at: GripperMessage = message(topic, data)?;
+            step.gripper = Some([at.x, at.y, at.z]);
+        }
+        COMPLETION => {
+            let done: CompletionMessage = message(topic, data)?;
+            flight.trace.outcome.completions.push(Completion {
+                sub_task: flight.completed.len(),
+                step: done.step,
+            });
+            flight.completed.push(done.sub_task);
+        }
+        _ => {}
+    }
+    Ok(())
+}
+
+fn begun(start: EpisodeMessage) -> Result<Flight, LogError> {
+    let seed = start.sampling_seed.as_deref().map(str::parse).transpose();
+    let sampling_seed = seed.map_err(|_| foreign("a sampling seed is no number"))?;
+    Ok(Flight {
+        instruction_id: start.instruction_id,
+        instruction_text: start.instruction_text,
+        words: start.words,
+        completed: Vec::new(),
+        trace: Trace {
+            instruction: start.instruction,
+            episode: start.episode,
+            sampling_seed,
+            commanded: start.commanded,
+            outcome: Episode {
+                steps: start.steps,
+                success: start.success,
+                completions: Vec::new(),
+                plans: Vec::new(),
+                final_state: Vec::new(),
+            },
+            steps: Vec::new(),
+        },
+    })
+}
+
+fn message<M: DeserializeOwned>(topic: usize, data: &[u8]) -> Result<M, LogError> {
+    serde_json::from_slice(data).map_err(|error| {
+        let topic = TOPICS.get(topic).map_or("?", |known| known.name);
+        foreign(format!("a message of {topic}: {error}"))
+    })
+}
+
+/// All steps there, all of the lengths that the metadata say.
+fn check(flight: &Flight, origin: &Origin) -> Result<(), LogError> {
+    let trace = &flight.trace;
+    let of = format!("{} episode {}", flight.instruction_id, trace.episode);
+    if trace.steps.len() != trace.outcome.steps {
+        let (got, said) = (trace.steps.len(), trace.outcome.steps);
+        return Err(foreign(format!("{of} has {got} of its {said} steps")));
+    }
+    let wrong = trace.steps.iter().position(|step| {
+        step.observation.len() != origin.observation_names.len()
+            || step.action.len() != origin.action_names.len()
+            || step.executed.len() != origin.action_names.len()
+    });
+    match wrong {
+        Some(step) => Err(foreign(format!("{of}: step {step} has other lengths"))),
+        None => Ok(()),
+    }
+}

@@ -1,0 +1,186 @@
+//! The project's documents, read as Markdown: blocks of code, what is set in the font of code, and the commands among them.
+//!
+//! The first word of a block's info string is its language; of a block of commands (`sh`) the second one says when a test runs it, see
+//! [`When`]. A block of commands without it is no block of commands to [`Block::when`], and a test refuses that.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use pulldown_cmark::{CodeBlockKind, Event, Parser, Tag, TagEnd};
+
+use crate::project_path;
+
+/// When the commands of a block are run by a test.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum When {
+    /// `short`: with every run of the tests.
+    Always,
+    /// `long`: with the full suite, `make test-full`.
+    Full,
+    /// `manual`, and then the reason: hours, a screen or a quiet machine are needed; only what they would run is looked at.
+    Never,
+}
+
+/// A block of code.
+#[derive(Debug, Clone)]
+pub struct Block {
+    /// The document, from the project's root.
+    pub document: String,
+    /// The line that it begins in, from 1.
+    pub line: usize,
+    /// The words behind the opening fence.
+    pub info: String,
+    /// What is in it.
+    pub text: String,
+}
+
+impl Block {
+    /// The language.
+    pub fn language(&self) -> &str {
+        self.info.split([' ', ',']).next().unwrap_or_default()
+    }
+
+    /// When its commands are run; `None` where nothing or nonsense is said.
+    pub fn when(&self) -> Option<When> {
+        let mut words = self.info.split_whitespace();
+        let kind = (words.next()?, words.next()?, words.next());
+        match kind {
+            ("sh", "short", None) => Some(When::Always),
+            ("sh", "long", None) => Some(When::Full),
+            ("sh", "manual", Some(_)) => Some(When::Never),
+            _ => None,
+        }
+    }
+
+    /// Its commands: lines that end in a backslash joined, comments and empty lines left out.
+    pub fn commands(&self) -> Vec<String> {
+        let joined = self.text.replace("\\\n", " ");
+        let lines = joined.lines().map(|line| {
+            let end = line.find("  #").unwrap_or(line.len());
+            line.get(..end).unwrap_or(line).trim()
+        });
+        lines
+            .filter(|line| !line.is_empty() && !line.starts_with('#'))
+            .map(str::to_owned)
+            .collect()
+    }
+
+    /// Where it is, for messages.
+    pub fn place(&self) -> String {
+        format!("{}:{}", self.document, self.line)
+    }
+}
+
+/// A document with its blocks.
+#[derive(Debug, Clone)]
+pub struct Document {
+    /// From the project's root.
+    pub name: String,
+    /// Its blocks of code.
+    pub blocks: Vec<Block>,
+    /// Everything else that is set in the font of code.
+    pub inline: Vec<String>,
+}
+
+/// All documents of the project, in the order of their names.
+///
+/// # Panics
+///
+/// When one cannot be read.
+pub fn documents() -> Vec<Document> {
+    files(&["md"]).iter().map(|path| read(path)).collect()
+}
+
+fn read(path: &Path) -> Document {
+    let text = fs::read_to_string(project_path(".").join(path)).expect("a document can be read");
+    let name = path.display().to_string();
+    let mut document = Document {
+        name: name.clone(),
+        blocks: vec![],
+        inline: vec![],
+    };
+    let mut open: Option<Block> = None;
+    for (event, range) in Parser::new(&text).into_offset_iter() {
+        match (event, &mut open) {
+            (Event::Start(Tag::CodeBlock(kind)), _) => {
+                let info = match kind {
+                    CodeBlockKind::Fenced(info) => info.into_string(),
+                    CodeBlockKind::Indented => String::new(),
+                };
+                open = Some(Block {
+                    document: name.clone(),
+                    line: 1 + text[..range.start].matches('\n').count(),
+                    info,
+                    text: String::new(),
+                });
+            }
+            (Event::Text(more), Some(block)) => block.text.push_str(&more),
+            (Event::End(TagEnd::CodeBlock), _) => document.blocks.extend(open.take()),
+            (Event::Code(code), _) => document.inline.push(code.into_string()),
+            _ => {}
+        }
+    }
+    document
+}
+
+/// Folders that hold nothing of the project's own.
+const FOREIGN: [&str; 6] = ["target", "vendor", "data", "runs", "out", "__pycache__"];
+
+/// The project's files whose names end so, from its root, in order.
+///
+/// # Panics
+///
+/// When a folder cannot be read.
+pub fn files(endings: &[&str]) -> Vec<PathBuf> {
+    let (root, mut found) = (project_path("."), vec![]);
+    let mut folders = vec![PathBuf::new()];
+    while let Some(folder) = folders.pop() {
+        let entries = fs::read_dir(root.join(&folder)).expect("a folder can be read");
+        for entry in entries.map(|entry| entry.expect("it can be read")) {
+            let (name, kind) = (entry.file_name(), entry.file_type().expect("it has one"));
+            let path = folder.join(&name);
+            let name = name.to_string_lossy();
+            if kind.is_dir() && !name.starts_with('.') && !FOREIGN.contains(&&*name) {
+                folders.push(path);
+            } else if kind.is_file() {
+                let ending = name.rsplit('.').next().unwrap_or_default();
+                found.extend(endings.contains(&ending).then_some(path));
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn block(info: &str, text: &str) -> Block {
+        Block {
+            document: "A.md".into(),
+            line: 3,
+            info: info.into(),
+            text: text.into(),
+        }
+    }
+
+    #[test]
+    fn commands_are_what_a_shell_would_run() {
+        let block = block(
+            "sh short",
+            "# a\nmake run   # does it\n\ncc a.c \\\n   -o a\n",
+        );
+        assert_eq!(block.commands(), ["make run", "cc a.c     -o a"]);
+        assert_eq!(block.when(), Some(When::Always));
+    }
+
+    #[test]
+    fn a_block_of_commands_says_when_and_why_not() {
+        assert_eq!(block("sh", "").when(), None);
+        assert_eq!(block("sh soon", "").when(), None);
+        assert_eq!(block("sh manual", "").when(), None, "without a reason");
+        assert_eq!(block("sh manual needs hours", "").when(), Some(When::Never));
+        assert_eq!(block("rust,no_run", "").language(), "rust");
+    }
+}
