@@ -41,7 +41,14 @@ impl<'a> Program<'a> {
             let at = Some(i as u32);
             let op = Op::decode(words).ok_or_else(|| {
                 let left_out = Op::is_left_out(words);
-                error(at, if left_out { Fault::LeftOut } else { Fault::Encoding })
+                error(
+                    at,
+                    if left_out {
+                        Fault::LeftOut
+                    } else {
+                        Fault::Encoding
+                    },
+                )
             })?;
             op.check(&checker).map_err(|fault| error(at, fault))?;
         }
