@@ -1,6 +1,9 @@
 #!/bin/sh
 # Builds liblads.a: one object that exports lads_* and nothing else, and that cannot panic.
 # usage: runtime/ffi/archive.sh <output file> [<target>]
+# LADS_OPS says which groups of operations a policy needs; without it all are in, and every image runs. It is a list of features of
+# the crate lads-ffi, separated by commas (Cargo.toml names them); an image that needs what was left out is refused when it is opened:
+#     LADS_OPS=attention,layer-norm,softmax runtime/ffi/archive.sh build/liblads.a
 # Needs cargo and binutils; for another target set LD, OBJCOPY, AR and NM to its tools, and CARGO_FLAGS to what cargo needs for it.
 set -eu
 output=$1
@@ -13,9 +16,10 @@ trap 'rm -rf "$work"' EXIT INT TERM
 case $output in /*) ;; *) output=$PWD/$output ;; esac
 mkdir -p "$(dirname "$output")"
 
+features=static-library${LADS_OPS:+,$LADS_OPS}
 build=${CARGO_TARGET_DIR:-$root/target}/archive-build
 # shellcheck disable=SC2086
-(cd "$root" && "$CARGO" rustc --quiet --locked ${CARGO_FLAGS:-} -p lads-ffi --profile archive --features static-library \
+(cd "$root" && "$CARGO" rustc --quiet --locked ${CARGO_FLAGS:-} -p lads-ffi --profile archive ${LADS_OPS+--no-default-features} --features "$features" \
     --crate-type staticlib --target-dir "$build" ${target:+--target "$target"})
 
 # Some targets' objects carry their bitcode too; binutils with a plugin for it would read that instead.

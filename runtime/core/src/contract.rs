@@ -297,7 +297,8 @@ impl<'a> Contract<'a> {
 
     /// A channel by its name.
     pub fn find(&self, name: &str) -> Option<Channel<'a>> {
-        self.channels().find(|channel| channel.name() == name)
+        self.channels()
+            .find(|channel| same_text(channel.name(), name))
     }
 
     /// The channels that the caller gives in every control step.
@@ -457,6 +458,11 @@ impl<'a> Contract<'a> {
     }
 }
 
+/// Whether two texts are the same. Byte by byte: comparing slices would call `bcmp`, which not every target has.
+pub(crate) fn same_text(a: &str, b: &str) -> bool {
+    a.bytes().eq(b.bytes())
+}
+
 /// Stands for a channel that is not there, which no checked contract asks for.
 const EMPTY: ChannelRecord = ChannelRecord {
     name: records::Text { offset: 0, len: 0 },
@@ -472,7 +478,44 @@ const EMPTY: ChannelRecord = ChannelRecord {
     max: 0.0,
 };
 
+impl Element<'_> {
+    /// Whether another element means the same, limits included.
+    pub(crate) fn is_like(&self, other: &Element) -> bool {
+        fn texts<'e>(element: &Element<'e>) -> [&'e str; 4] {
+            [element.name, element.unit, element.joint, element.interface]
+        }
+        fn numbers(element: &Element) -> [u32; 4] {
+            let Interval { min, max } = element.limits;
+            [element.scale, element.offset, min, max].map(f32::to_bits)
+        }
+        let mut both = texts(self).into_iter().zip(texts(other));
+        both.all(|(a, b)| same_text(a, b)) && numbers(self).iter().eq(&numbers(other))
+    }
+}
+
 impl<'a> Channel<'a> {
+    /// Whether another channel means the same to those who give observations and execute actions.
+    pub(crate) fn is_like(&self, other: &Channel) -> bool {
+        let (mut mine, mut theirs) = (self.elements(), other.elements());
+        let elements = loop {
+            match (mine.next(), theirs.next()) {
+                (None, None) => break true,
+                (Some(a), Some(b)) if a.is_like(&b) => {}
+                _ => break false,
+            }
+        };
+        let alike = |channel: &Channel| [channel.record.min, channel.record.max].map(f32::to_bits);
+        let ([min, max], [their_min, their_max]) = (alike(self), alike(other));
+        elements
+            && self.role() == other.role()
+            && self.dtype() == other.dtype()
+            && self.quaternion_order() == other.quaternion_order()
+            && self.shape().iter().eq(other.shape())
+            && same_text(self.name(), other.name())
+            && same_text(self.reference(), other.reference())
+            && (min == their_min && max == their_max)
+    }
+
     /// `elements` is the number of element records of the channels before this one.
     fn check(&self, elements: u32) -> Result<(), ContractError> {
         let c = &self.record;
@@ -502,7 +545,7 @@ impl<'a> Channel<'a> {
         let twice = (0..others).any(|i| {
             self.tables
                 .channel(i)
-                .is_some_and(|other| self.tables.text(other.name) == self.name())
+                .is_some_and(|other| same_text(self.tables.text(other.name), self.name()))
         });
         if !limits || !exact {
             return Err(ContractError::Limits { channel: self.id });

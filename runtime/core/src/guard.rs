@@ -15,6 +15,7 @@ mod limiter;
 use core::error::Error;
 use core::fmt;
 
+use crate::contract::Contract;
 use crate::controller::StepReport;
 use crate::errors::{InputError, StepError};
 
@@ -53,6 +54,28 @@ pub struct GuardConfig<'c> {
     pub stop_after: u32,
     /// Limits, rates and the safe action.
     pub limits: Limits<'c>,
+}
+
+impl GuardConfig<'_> {
+    /// Says what of it contradicts a contract, before a controller with its memory is made.
+    pub fn check(&self, contract: &Contract) -> Result<(), GuardError> {
+        self.share(contract)?;
+        limiter::check(contract, &self.limits)
+    }
+
+    /// The part of what is left to the safe action that a decay takes away in a period.
+    fn share(&self, contract: &Contract) -> Result<f32, GuardError> {
+        match self.fallback {
+            Fallback::Decay { time_constant_s } => {
+                if !time_constant_s.is_finite() || time_constant_s <= 0.0 {
+                    return Err(GuardError::TimeConstant);
+                }
+                let period = contract.control_period_s();
+                Ok(period / (period + time_constant_s))
+            }
+            Fallback::Stop | Fallback::Hold => Ok(1.0),
+        }
+    }
 }
 
 /// The clock of one control period.

@@ -20,7 +20,7 @@ use lads_image::records::{
 };
 use lads_image::{Chain, Program, ProgramError, Spaces, Tables};
 
-use crate::contract::{Contract, DType, Role};
+use crate::contract::{Contract, DType, Role, same_text};
 
 /// The most states of an image: one bit each in a word.
 const MAX_STATES: usize = 64;
@@ -119,7 +119,7 @@ fn states(tables: &Tables, sizes: &mut Sizes) -> Checked {
         let twice = (0..i).any(|j| {
             tables
                 .state(j)
-                .is_some_and(|other| tables.text(other.name) == tables.text(state.name))
+                .is_some_and(|other| same_text(tables.text(other.name), tables.text(state.name)))
         });
         let (end, words, sound) = match state.kind {
             StateKind::Plain => {

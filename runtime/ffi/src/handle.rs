@@ -4,7 +4,6 @@
 //! instead of used.
 
 use core::ffi::c_void;
-use core::ops::Range;
 use core::ptr;
 
 use lads_core::{
@@ -12,12 +11,13 @@ use lads_core::{
 };
 
 use crate::layout::{LADS_WORKSPACE_ALIGN, Layout, at};
-use crate::memory::{addresses, apart, check, get, read, read_optional, zeroed};
+use crate::memory::{Area, apart, check, read, read_optional, zeroed};
 use crate::status::Status;
 use crate::types::{
     LADS_ARM_WITHOUT_SELF_TEST, LADS_FALLBACK_DECAY, LADS_FALLBACK_HOLD, LADS_FALLBACK_STOP,
-    LADS_PORTABLE_INSTRUCTIONS, LadsController, LadsOptions, LadsPolicy,
+    LADS_PORTABLE_INSTRUCTIONS, LadsController, LadsOptions, LadsPolicy, Refusal,
 };
+use crate::versioned;
 
 /// A policy in a [`LadsPolicy`]. It borrows the image for as long as it is used, which C promises and Rust calls `'static`.
 #[repr(C)]
@@ -50,9 +50,11 @@ fn seal(address: usize) -> usize {
 pub unsafe fn open(
     image: *const u8,
     image_bytes: usize,
+    work_limit: u64,
     to: *mut LadsPolicy,
 ) -> Result<(), Status> {
     check(to, 1)?;
+    apart(&[Area::read(image, image_bytes), Area::written(to, 1)])?;
     let to = to.cast::<Opened>();
     // SAFETY: not null and aligned (`Opened` asks for no more than `LadsPolicy`, see above); the caller guarantees the memory.
     unsafe { (&raw mut (*to).seal).write(0) };
@@ -60,7 +62,7 @@ pub unsafe fn open(
         return Err(Status::Null);
     }
     // SAFETY: the caller guarantees the image.
-    let policy = Policy::new_checked(unsafe { read(image, image_bytes) }?)?;
+    let policy = Policy::new_within(unsafe { read(image, image_bytes) }?, work_limit)?;
     if !policy.checksum_matches() {
         return Err(Status::ImageChecksum);
     }
@@ -88,57 +90,63 @@ pub unsafe fn policy<'a>(from: *const LadsPolicy) -> Result<&'a Policy<'static>,
     Ok(unsafe { &(*from).policy })
 }
 
+/// The areas of an open policy: itself, and its image.
+pub fn areas_of(policy_at: *const LadsPolicy, policy: &Policy) -> [Area; 2] {
+    let image = policy.image();
+    [
+        Area::read(policy_at, 1),
+        Area::read(image.as_ptr(), image.len()),
+    ]
+}
+
 /// How the workspace of a policy is divided.
 pub fn layout(policy: &Policy) -> Result<Layout, Status> {
     Layout::of(policy, size_of::<Handle>()).ok_or(Status::TooLong)
 }
 
-/// Sets a controller up in a workspace.
+/// Where a controller is to be set up, and what for.
+#[derive(Clone, Copy)]
+pub struct Setup {
+    pub policy: *const LadsPolicy,
+    pub workspace: *mut c_void,
+    pub workspace_bytes: usize,
+    pub options: *const LadsOptions,
+}
+
+/// Everything about a controller to be, checked.
+struct Checked<'o> {
+    policy: &'static Policy<'static>,
+    layout: Layout,
+    config: GuardConfig<'o>,
+    flags: u32,
+}
+
+/// Sets a controller up in a workspace. Nothing of the workspace is touched before everything has been checked; `others` are what else the
+/// call writes.
 ///
 /// # Safety
-/// `workspace` points to `bytes` writable bytes that nobody else uses as long as the controller is used; `options` is null or
-/// points to options whose lists have as many elements as an action; [`policy`]'s condition holds for `policy`.
-pub unsafe fn set_up(
-    policy_at: *const LadsPolicy,
-    workspace: *mut c_void,
-    bytes: usize,
-    options: *const LadsOptions,
-) -> Result<*mut LadsController, Status> {
-    // SAFETY: the caller guarantees the policy.
-    let policy = unsafe { policy(policy_at) }?;
-    if workspace.is_null() {
-        return Err(Status::Null);
-    }
-    if !workspace.addr().is_multiple_of(LADS_WORKSPACE_ALIGN) {
-        return Err(Status::Misaligned);
-    }
-    check(workspace.cast::<u8>(), bytes)?;
-    let layout = layout(policy)?;
-    if bytes < layout.total {
-        return Err(Status::WorkspaceTooSmall);
-    }
-    let used = addresses(workspace.cast::<u8>(), layout.total);
-    let image = addresses(policy.image().as_ptr(), policy.image_bytes());
-    if !apart(&used, &image) || !apart(&used, &addresses(policy_at, 1)) {
-        return Err(Status::Overlap);
-    }
-    let default = LadsOptions::default();
-    let options = if options.is_null() {
-        &default
-    } else {
-        // SAFETY: the caller guarantees the options.
-        unsafe { get(options) }?
-    };
-    // SAFETY: the caller guarantees the lists.
-    let config = unsafe { config(options, policy) }?;
-    let isa = if options.flags & LADS_PORTABLE_INSTRUCTIONS == 0 {
+/// `workspace` points to `workspace_bytes` writable bytes that nobody else uses as long as the controller is used; `options` is null
+/// or points to options whose lists have as many elements as an action; [`policy`]'s condition holds for `policy`.
+pub unsafe fn set_up(setup: Setup, others: &[Area; 2]) -> Result<*mut LadsController, Refusal> {
+    // SAFETY: the caller guarantees all of it.
+    let Checked {
+        policy,
+        layout,
+        config,
+        flags,
+    } = unsafe { checked(setup, others) }?;
+    let action = policy.contract().action().id().0;
+    config
+        .check(policy.contract())
+        .map_err(|error| Refusal::of_guard(error, action))?;
+    let isa = if flags & LADS_PORTABLE_INSTRUCTIONS == 0 {
         Isa::detect()
     } else {
         Isa::portable()
     };
+    let workspace = setup.workspace;
     let handle = workspace.cast::<Handle>();
-    // SAFETY: aligned and large enough, as checked above; the caller guarantees the memory. The parts do not overlap, by the
-    // layout.
+    // SAFETY: aligned and large enough, as was checked; the caller guarantees the memory. The parts do not overlap, by the layout.
     let (arena, state, guard) = unsafe {
         (&raw mut (*handle).seal).write(0);
         (
@@ -152,8 +160,9 @@ pub unsafe fn set_up(
     };
     let parts = Workspace::new(policy, arena, state).map_err(|_| Status::WorkspaceTooSmall)?;
     let controller = Controller::with_isa(*policy, parts, isa);
-    let mut guarded = GuardedController::new(controller, &config, guard)?;
-    if options.flags & LADS_ARM_WITHOUT_SELF_TEST != 0 {
+    let mut guarded = GuardedController::new(controller, &config, guard)
+        .map_err(|error| Refusal::of_guard(error, action))?;
+    if flags & LADS_ARM_WITHOUT_SELF_TEST != 0 {
         guarded.arm_untested();
     }
     let made = Handle {
@@ -166,9 +175,64 @@ pub unsafe fn set_up(
     Ok(handle.cast())
 }
 
+/// Checks pointers, sizes, options and areas.
+///
 /// # Safety
-/// The lists of the options are null or have as many elements as an action.
-unsafe fn config<'a>(options: &LadsOptions, policy: &Policy) -> Result<GuardConfig<'a>, Status> {
+/// As [`set_up`].
+unsafe fn checked<'o>(setup: Setup, others: &[Area; 2]) -> Result<Checked<'o>, Status> {
+    let Setup {
+        policy: policy_at,
+        workspace,
+        workspace_bytes,
+        options: options_at,
+    } = setup;
+    // SAFETY: the caller guarantees the policy.
+    let policy = unsafe { policy(policy_at) }?;
+    if workspace.is_null() {
+        return Err(Status::Null);
+    }
+    if !workspace.addr().is_multiple_of(LADS_WORKSPACE_ALIGN) {
+        return Err(Status::Misaligned);
+    }
+    check(workspace.cast::<u8>(), workspace_bytes)?;
+    let layout = layout(policy)?;
+    if workspace_bytes < layout.total {
+        return Err(Status::WorkspaceTooSmall);
+    }
+    let mut options = LadsOptions::default();
+    // SAFETY: the caller guarantees the options.
+    let options_area = unsafe { versioned::read_area(options_at) }?;
+    if !options_at.is_null() {
+        // SAFETY: as above.
+        options = unsafe { versioned::read(options_at) }?;
+    }
+    let len = policy.contract().action_len();
+    let [policy_area, image] = areas_of(policy_at, policy);
+    let [first, second] = *others;
+    apart(&[
+        Area::written(workspace.cast::<u8>(), layout.total),
+        first,
+        second,
+        policy_area,
+        image,
+        options_area,
+        Area::read(options.min, len),
+        Area::read(options.max, len),
+        Area::read(options.max_rate, len),
+        Area::read(options.safe_action, len),
+    ])?;
+    Ok(Checked {
+        policy,
+        layout,
+        // SAFETY: the caller guarantees the lists.
+        config: unsafe { config(&options, len) }?,
+        flags: options.flags,
+    })
+}
+
+/// # Safety
+/// The lists of the options are null or have `len` elements.
+unsafe fn config<'o>(options: &LadsOptions, len: usize) -> Result<GuardConfig<'o>, Status> {
     if options.flags & !(LADS_ARM_WITHOUT_SELF_TEST | LADS_PORTABLE_INSTRUCTIONS) != 0 {
         return Err(Status::UnknownOption);
     }
@@ -180,7 +244,6 @@ unsafe fn config<'a>(options: &LadsOptions, policy: &Policy) -> Result<GuardConf
         },
         _ => return Err(Status::UnknownOption),
     };
-    let len = policy.contract().action_len();
     // SAFETY: the caller guarantees the lists.
     let limits = unsafe {
         Limits {
@@ -193,6 +256,8 @@ unsafe fn config<'a>(options: &LadsOptions, policy: &Policy) -> Result<GuardConf
     Ok(GuardConfig {
         fallback,
         late_after: options.late_after,
+        coast: options.coast,
+        max_jump: options.max_jump,
         stop_after: options.stop_after,
         limits,
     })
@@ -219,8 +284,18 @@ pub unsafe fn handle<'c>(controller: *mut LadsController) -> Result<&'c mut Hand
 }
 
 impl Handle {
-    /// The addresses of the whole workspace.
-    pub fn addresses(&self) -> Range<usize> {
-        addresses(ptr::from_ref(self).cast::<u8>(), self.workspace_bytes)
+    /// The areas that a controller uses: its workspace and the image.
+    pub fn areas(&self) -> [Area; 2] {
+        let image = self.guarded.controller().policy().image();
+        let workspace = ptr::from_ref(self).cast_mut().cast::<u8>();
+        [
+            Area::written(workspace, self.workspace_bytes),
+            Area::read(image.as_ptr(), image.len()),
+        ]
+    }
+
+    /// Ends the controller: from now on its pointer is refused, and its workspace is the caller's again.
+    pub fn end(&mut self) {
+        self.seal = 0;
     }
 }

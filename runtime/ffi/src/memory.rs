@@ -1,7 +1,7 @@
-//! From C's pointer and length to a slice: what can be checked is checked here, what cannot is the caller's promise.
+//! From C's pointer and length to a slice, and from memory areas that overlap to a refusal: what can be checked is checked here, what
+//! cannot is the caller's promise.
 
-use core::ops::Range;
-use core::{ptr, slice};
+use core::slice;
 
 use crate::status::Status;
 
@@ -48,16 +48,6 @@ pub unsafe fn read_optional<'a, T>(
     unsafe { read(pointer, len) }.map(Some)
 }
 
-/// The value behind a pointer.
-///
-/// # Safety
-/// If the pointer is not null, there is an initialised `T` that nobody writes during `'a`.
-pub unsafe fn get<'a, T>(pointer: *const T) -> Result<&'a T, Status> {
-    check(pointer, 1)?;
-    // SAFETY: checked above to be non-null and aligned; the caller guarantees the memory.
-    Ok(unsafe { &*pointer })
-}
-
 /// `len` elements of memory that need not be initialised; they become zero.
 ///
 /// # Safety
@@ -75,24 +65,60 @@ pub unsafe fn zeroed<'a>(pointer: *mut f32, len: usize) -> Result<&'a mut [f32],
     }
 }
 
-/// Writes a result of the call.
-///
-/// # Safety
-/// If the pointer is not null, a `T` may be written there.
-pub unsafe fn give<T>(to: *mut T, value: T) -> Result<(), Status> {
-    check(to, 1)?;
-    // SAFETY: not null and aligned; the caller guarantees that it may be written.
-    unsafe { ptr::write(to, value) };
+/// The addresses of one thing that a call reads or writes. That of a null pointer is empty.
+#[derive(Debug, Clone, Copy)]
+pub struct Area {
+    start: usize,
+    end: usize,
+    written: bool,
+}
+
+impl Area {
+    /// Elements that are read.
+    pub fn read<T>(pointer: *const T, len: usize) -> Self {
+        let start = pointer.addr();
+        let bytes = if pointer.is_null() {
+            0
+        } else {
+            len.saturating_mul(size_of::<T>())
+        };
+        Self {
+            start,
+            end: start.saturating_add(bytes),
+            written: false,
+        }
+    }
+
+    /// Elements that are written, or read and written.
+    pub fn written<T>(pointer: *mut T, len: usize) -> Self {
+        Self {
+            written: true,
+            ..Self::read(pointer, len)
+        }
+    }
+
+    /// Whether both hold an address, and one of them is written.
+    pub fn clashes(&self, other: &Self) -> bool {
+        let apart = self.end <= other.start || other.end <= self.start;
+        let empty = self.start == self.end || other.start == other.end;
+        !apart && !empty && (self.written || other.written)
+    }
+}
+
+/// Refuses an area that clashes with one of the others.
+pub fn apart_from(area: &Area, others: &[Area]) -> Result<(), Status> {
+    if others.iter().any(|other| area.clashes(other)) {
+        return Err(Status::Overlap);
+    }
     Ok(())
 }
 
-/// The addresses of `len` elements.
-pub fn addresses<T>(pointer: *const T, len: usize) -> Range<usize> {
-    let start = pointer.addr();
-    start..start.saturating_add(len.saturating_mul(size_of::<T>()))
-}
-
-/// True when the ranges share no address.
-pub fn apart(a: &Range<usize>, b: &Range<usize>) -> bool {
-    a.end <= b.start || b.end <= a.start
+/// Refuses the areas of a call of which two clash: one rule for every pointer of every function.
+pub fn apart(areas: &[Area]) -> Result<(), Status> {
+    let mut rest = areas;
+    while let [first, others @ ..] = rest {
+        apart_from(first, others)?;
+        rest = others;
+    }
+    Ok(())
 }

@@ -25,6 +25,8 @@ pub struct Spaces {
 pub enum Fault {
     /// Words that mean no op.
     Encoding,
+    /// An op, or a format of its numbers, that this build was made without.
+    LeftOut,
     /// A span is empty or reaches beyond its space, or an integer slot does not exist.
     Bounds,
     /// A span is not as long as the shape says, or a dimension is zero.
@@ -43,6 +45,7 @@ impl fmt::Display for Fault {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         f.write_str(match self {
             Self::Encoding => "unknown operation",
+            Self::LeftOut => "an operation that this build was made without",
             Self::Bounds => "a span is empty or reaches beyond its space",
             Self::Shape => "a span is not as long as its shape",
             Self::Overlap => "the result overlaps an operand",

@@ -11,7 +11,7 @@
 //!
 //! One file per operation, behind the trait [`Operation`]; the table at the end of this file says their opcodes and dispatches to
 //! them. An op is [`OP_WORDS`] words: the opcode, the fields in the order of declaration, zeros. [`Op::decode`] refuses everything
-//! that [`Op::encode`] would not write.
+//! that [`Op::encode`] would not write, and what the crate's features leave out.
 
 mod arg;
 mod attention;
@@ -135,7 +135,7 @@ impl Work {
 
 /// The table's enum, and every dispatch to the operations.
 macro_rules! ops {
-    ($($name:ident = $code:literal,)*) => {
+    ($($name:ident = $code:literal $(if $feature:literal)?,)*) => {
         /// One operation of a program.
         #[derive(Debug, Clone, core::marker::Copy, PartialEq)]
         #[expect(missing_docs, reason = "each variant holds the record of the same name, which is documented")]
@@ -170,9 +170,15 @@ macro_rules! ops {
             #[inline(always)]
             pub(crate) fn take(from: &mut Reader) -> Option<Self> {
                 Some(match from.word()? {
-                    $($code => Self::$name($name::take(from)?),)*
+                    $($(#[cfg(feature = $feature)])? $code => Self::$name($name::take(from)?),)*
                     _ => return None,
                 })
+            }
+
+            /// Whether words mean an op that this build was made without: see the crate's features.
+            pub fn is_left_out(words: &[u32; OP_WORDS]) -> bool {
+                let [code, ..] = *words;
+                [$($((!cfg!(feature = $feature)).then_some($code),)?)*].contains(&Some(code))
             }
 
             /// The op's name.
@@ -182,13 +188,22 @@ macro_rules! ops {
 
             /// Checks the op, see [`Operation::check`].
             pub fn check(&self, checker: &Checker) -> Result<(), Fault> {
-                match self { $(Self::$name(op) => op.check(checker),)* }
+                match self {
+                    $($(#[cfg(feature = $feature)])? Self::$name(op) => op.check(checker),)*
+                    #[allow(unreachable_patterns, reason = "there is something left out or not")]
+                    _ => Err(Fault::LeftOut),
+                }
             }
 
             /// Runs the op, see [`Operation::run`]. Inlined: it belongs to the loop over a program.
             #[inline(always)]
             pub(crate) fn run(&self, weights: &[f32], machine: &mut Machine) -> Result<(), ExecError> {
-                match self { $(Self::$name(op) => op.run(weights, machine),)* }
+                match self {
+                    $($(#[cfg(feature = $feature)])? Self::$name(op) => op.run(weights, machine),)*
+                    // What was left out never decodes.
+                    #[allow(unreachable_patterns, reason = "there is something left out or not")]
+                    _ => Err(ExecError::Span),
+                }
             }
 
             /// Shows what the op reads, then what it writes, see [`Operation::accesses`].
@@ -220,19 +235,20 @@ macro_rules! ops {
     };
 }
 
+// A row with a feature is an op that a build without the feature does not know.
 ops! {
     Linear = 1,
-    LayerNorm = 2,
-    Attention = 3,
+    LayerNorm = 2 if "layer-norm",
+    Attention = 3 if "attention",
     Binary = 4,
     Unary = 5,
-    Softmax = 6,
-    Reduce = 7,
-    MatMul = 8,
+    Softmax = 6 if "softmax",
+    Reduce = 7 if "reduce",
+    MatMul = 8 if "matmul",
     GatherRow = 9,
     Copy = 10,
-    ArgMin = 11,
-    ArgMax = 12,
+    ArgMin = 11 if "arg",
+    ArgMax = 12 if "arg",
 }
 
 #[cfg(test)]

@@ -39,7 +39,10 @@ impl<'a> Program<'a> {
         let checker = Checker::new(spaces, arena_len, tokens);
         for (i, words) in ops.iter().enumerate() {
             let at = Some(i as u32);
-            let op = Op::decode(words).ok_or(error(at, Fault::Encoding))?;
+            let op = Op::decode(words).ok_or_else(|| {
+                let left_out = Op::is_left_out(words);
+                error(at, if left_out { Fault::LeftOut } else { Fault::Encoding })
+            })?;
             op.check(&checker).map_err(|fault| error(at, fault))?;
         }
         for port in ports {

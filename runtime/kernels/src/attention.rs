@@ -55,7 +55,11 @@ impl Attention<'_> {
         }
         match self.cache {
             Cache::F32 { keys, values } => self.over::<F32>(isa, keys, values, q, y, scratch),
-            Cache::F16 { keys, values } => self.over::<F16>(isa, keys, values, q, y, scratch),
+            Cache::F16 { keys, values } => {
+                if cfg!(feature = "half-cache") {
+                    self.over::<F16>(isa, keys, values, q, y, scratch);
+                }
+            }
         }
     }
 

@@ -164,11 +164,15 @@ impl Append<'_> {
         match cache {
             // A mere copy.
             CacheMut::F32 { keys, values } => self.write::<F32, _>(Portable, keys, values),
-            CacheMut::F16 { keys, values } => isa.run(Rounded {
-                append: self,
-                keys,
-                values,
-            }),
+            CacheMut::F16 { keys, values } => {
+                if cfg!(feature = "half-cache") {
+                    isa.run(Rounded {
+                        append: self,
+                        keys,
+                        values,
+                    });
+                }
+            }
         }
     }
 

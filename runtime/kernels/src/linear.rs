@@ -67,6 +67,12 @@ pub fn pack<T: Copy + Default>(format: WeightFormat, w: &[T], [k, n]: [usize; 2]
     }
 }
 
+/// Whether the kernels of integer weights are in this build; without them such a layer computes nothing.
+const INTEGERS: bool = cfg!(feature = "integer-weights");
+
+/// Whether the kernels of 16-bit floats are in this build; without them such a layer computes nothing.
+const HALVES: bool = cfg!(feature = "half-weights");
+
 /// The non-linearity of a dense layer.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Activation {
@@ -147,14 +153,22 @@ impl Linear<'_> {
         };
         match self.w {
             Panels::F32(_) => self.wide(isa, activation, x, y, &mut []),
-            Panels::Int8 { .. } | Panels::Int16 { .. } => self.integers(isa, activation, x, y),
-            Panels::F16(_) | Panels::Bf16(_) => isa.run(Rows::<true> {
-                layer: self,
-                activation,
-                parts: &mut [],
-                x,
-                y,
-            }),
+            Panels::Int8 { .. } | Panels::Int16 { .. } => {
+                if INTEGERS {
+                    self.integers(isa, activation, x, y);
+                }
+            }
+            Panels::F16(_) | Panels::Bf16(_) => {
+                if HALVES {
+                    isa.run(Rows::<true> {
+                        layer: self,
+                        activation,
+                        parts: &mut [],
+                        x,
+                        y,
+                    });
+                }
+            }
         }
         if let Some(kind) = at_the_end {
             let rows = |len: usize, of: usize| len.checked_div(of).unwrap_or(0);
@@ -184,7 +198,7 @@ impl Linear<'_> {
     /// Whether the weights are integers.
     #[inline(always)]
     fn is_scaled(&self) -> bool {
-        matches!(self.w, Panels::Int8 { .. } | Panels::Int16 { .. })
+        INTEGERS && matches!(self.w, Panels::Int8 { .. } | Panels::Int16 { .. })
     }
 
     /// The sums of `R` rows with the panel of so many blocks that is weights `at`; with integers those of part `i`, added to those
@@ -205,10 +219,10 @@ impl Linear<'_> {
             Panels::F32(w) if !NARROW => {
                 floats::panel::<S, F32, R>(simd, part(w, at), blocks, x, sums);
             }
-            Panels::Int8 { panels: w, .. } if !NARROW => {
+            Panels::Int8 { panels: w, .. } if INTEGERS && !NARROW => {
                 integers::panel::<S, i8, R>(simd, part(w, at), blocks, parts, i, sums);
             }
-            Panels::Int16 { panels: w, .. } if !NARROW => {
+            Panels::Int16 { panels: w, .. } if INTEGERS && !NARROW => {
                 integers::panel::<S, i16, R>(simd, part(w, at), blocks, parts, i, sums);
             }
             Panels::F16(w) if NARROW => {

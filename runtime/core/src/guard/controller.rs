@@ -68,15 +68,7 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         memory: &'m mut [f32],
     ) -> Result<Self, GuardError> {
         let contract = controller.policy().contract();
-        let share = match config.fallback {
-            Fallback::Decay { time_constant_s } => {
-                if !time_constant_s.is_finite() || time_constant_s <= 0.0 {
-                    return Err(GuardError::TimeConstant);
-                }
-                contract.control_period_s() / (contract.control_period_s() + time_constant_s)
-            }
-            Fallback::Stop | Fallback::Hold => 1.0,
-        };
+        let share = config.share(contract)?;
         let limiter = Limiter::new(contract, &config.limits, memory)?;
         Ok(Self {
             limiter,
@@ -173,22 +165,33 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         &mut self,
         controller: Controller<'a, 'm>,
     ) -> Result<Controller<'a, 'm>, (SwapError, Controller<'a, 'm>)> {
-        let (old, new) = (
-            self.controller.policy().contract(),
-            controller.policy().contract(),
-        );
-        if old.control_period_s().to_bits() != new.control_period_s().to_bits() {
-            return Err((SwapError::ControlPeriod, controller));
-        }
-        if let Some(channel) = difference(old, new) {
-            return Err((SwapError::Channels { channel }, controller));
-        }
-        let instructed = self.controller.is_instructed();
-        if instructed && !controller.is_instructed() {
-            return Err((SwapError::NoInstruction, controller));
+        if let Err(error) = replaceable(&self.controller, &controller) {
+            return Err((error, controller));
         }
         self.armed &= controller.is_tested();
         Ok(core::mem::replace(&mut self.controller, controller))
+    }
+
+    /// Takes the place of another guarded controller, between two steps, with a policy and memory of its own; the other is idle
+    /// afterwards. The other's limits, rates, fallback, counters, clock and last executed action go on here, so the first action
+    /// is no further from that one than the rate allows. It is armed if both were. Refused, nothing changes on either side, for the
+    /// reasons of [`swap`](Self::swap).
+    pub fn take_over(&mut self, running: &GuardedController) -> Result<(), SwapError> {
+        replaceable(&running.controller, &self.controller)?;
+        self.limiter.copy_from(&running.limiter);
+        self.fallback = running.fallback;
+        self.share = running.share;
+        self.late_after = running.late_after;
+        self.coast = running.coast;
+        self.max_jump = running.max_jump;
+        self.stop_after = running.stop_after;
+        self.armed &= running.armed;
+        self.stopped = running.stopped;
+        self.in_a_row = running.in_a_row;
+        self.coasted = running.coasted;
+        self.timestamp = running.timestamp;
+        self.counters = running.counters;
+        Ok(())
     }
 
     /// As [`Controller::warm`].
@@ -236,7 +239,17 @@ impl<'a, 'm> GuardedController<'a, 'm> {
 
     /// One control period without an observation.
     pub fn step_blind(&mut self, action: &mut [f32]) -> Result<GuardReport, ActionLength> {
+        self.step_blind_after(0, action)
+    }
+
+    /// One control period without an observation, after periods that have passed without a step.
+    pub fn step_blind_after(
+        &mut self,
+        missed: u32,
+        action: &mut [f32],
+    ) -> Result<GuardReport, ActionLength> {
         self.fits(action)?;
+        self.counters.missed = self.counters.missed.saturating_add(u64::from(missed));
         let outcome = self.watch(None).and(Err(Intervention::NoObservation));
         Ok(self.conclude(outcome, action))
     }
@@ -354,6 +367,21 @@ impl<'a, 'm> GuardedController<'a, 'm> {
     }
 }
 
+/// Whether a controller may take the place of another one between two steps.
+fn replaceable(old: &Controller, new: &Controller) -> Result<(), SwapError> {
+    let (before, after) = (old.policy().contract(), new.policy().contract());
+    if before.control_period_s().to_bits() != after.control_period_s().to_bits() {
+        return Err(SwapError::ControlPeriod);
+    }
+    if let Some(channel) = difference(before, after) {
+        return Err(SwapError::Channels { channel });
+    }
+    if old.is_instructed() && !new.is_instructed() {
+        return Err(SwapError::NoInstruction);
+    }
+    Ok(())
+}
+
 /// The first channel in which two contracts differ for those who give observations and execute actions.
 fn difference(old: &Contract, new: &Contract) -> Option<u32> {
     let count = old.channels().count().max(new.channels().count());
@@ -361,16 +389,7 @@ fn difference(old: &Contract, new: &Contract) -> Option<u32> {
         .take(count)
         .map(|i| (i, old.channel(ChannelId(i)), new.channel(ChannelId(i))))
         .find(|(_, old, new)| match (old, new) {
-            (Some(old), Some(new)) => {
-                old.role() != new.role()
-                    || old.dtype() != new.dtype()
-                    || old.name() != new.name()
-                    || old.shape() != new.shape()
-                    || old.reference() != new.reference()
-                    || old.quaternion_order() != new.quaternion_order()
-                    || !old.elements().eq(new.elements())
-                    || !old.limits().eq(new.limits())
-            }
+            (Some(old), Some(new)) => !old.is_like(new),
             _ => true,
         })
         .map(|(i, ..)| i)

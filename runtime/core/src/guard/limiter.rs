@@ -83,47 +83,31 @@ impl<'m> Limiter<'m> {
     }
 
     fn configure(&mut self, contract: &Contract, limits: &Limits) -> Result<(), GuardError> {
-        let needed = contract.action_len();
-        for list in [limits.min, limits.max, limits.max_rate, limits.safe_action] {
-            let got = list.map_or(needed, <[f32]>::len);
-            if got != needed {
-                return Err(GuardError::Length { got, needed });
-            }
-        }
-        let at = |list: Option<&[f32]>, index: usize| list.and_then(|l| l.get(index).copied());
-        let period = f64::from(contract.control_period_s());
+        check(contract, limits)?;
         let places = self
             .min
             .iter_mut()
             .zip(self.max.iter_mut())
             .zip(self.max_step.iter_mut())
             .zip(self.safe.iter_mut());
-        for ((index, allowed), (((to_min, to_max), to_step), to_safe)) in
-            contract.action_limits().enumerate().zip(places)
-        {
-            let [min, max] = [at(limits.min, index), at(limits.max, index)];
-            let given = [min, max].into_iter().flatten().all(f32::is_finite);
-            let min = min.map_or(allowed.min, |min| min.max(allowed.min));
-            let max = max.map_or(allowed.max, |max| max.min(allowed.max));
-            if !given || min > max {
-                return Err(GuardError::Limits { index });
-            }
-            let rate = at(limits.max_rate, index);
-            if rate.is_some_and(|rate| !rate.is_finite() || rate <= 0.0) {
-                return Err(GuardError::Rate { index });
-            }
-            let inside = Interval { min, max };
-            let safe = at(limits.safe_action, index).unwrap_or_else(|| inside.clamp(0.0));
-            if !safe.is_finite() || inside.clamp(safe) != safe {
-                return Err(GuardError::SafeAction { index });
-            }
-            *to_min = min;
-            *to_max = max;
-            *to_step = rate.map_or(f32::INFINITY, |rate| down(f64::from(rate) * period));
-            *to_safe = safe;
+        for (row, (((to_min, to_max), to_step), to_safe)) in rows(contract, limits).zip(places) {
+            let row = row?;
+            *to_min = row.min;
+            *to_max = row.max;
+            *to_step = row.max_step;
+            *to_safe = row.safe;
         }
         assign(self.last, self.safe);
         Ok(())
+    }
+
+    /// Takes over another limiter's values, the last action included; both are as long.
+    pub fn copy_from(&mut self, other: &Limiter) {
+        assign(self.min, other.min);
+        assign(self.max, other.max);
+        assign(self.max_step, other.max_step);
+        assign(self.safe, other.safe);
+        assign(self.last, other.last);
     }
 
     /// The last action that was written.
@@ -189,6 +173,62 @@ impl<'m> Limiter<'m> {
                 last,
             })
     }
+}
+
+/// What an element of the action is kept inside of.
+struct Row {
+    min: f32,
+    max: f32,
+    max_step: f32,
+    safe: f32,
+}
+
+/// Whether limits can be those of a policy.
+pub(super) fn check(contract: &Contract, limits: &Limits) -> Result<(), GuardError> {
+    let needed = contract.action_len();
+    for list in [limits.min, limits.max, limits.max_rate, limits.safe_action] {
+        let got = list.map_or(needed, <[f32]>::len);
+        if got != needed {
+            return Err(GuardError::Length { got, needed });
+        }
+    }
+    rows(contract, limits).try_for_each(|row| row.map(|_| ()))
+}
+
+/// The elements of the action, as limits that are long enough leave them.
+fn rows<'l>(
+    contract: &Contract<'l>,
+    limits: &'l Limits,
+) -> impl Iterator<Item = Result<Row, GuardError>> + use<'l> {
+    let period = f64::from(contract.control_period_s());
+    let allowed = contract.action_limits().enumerate();
+    allowed.map(move |(index, allowed)| row(index, allowed, limits, period))
+}
+
+fn row(index: usize, allowed: Interval, limits: &Limits, period: f64) -> Result<Row, GuardError> {
+    let at = |list: Option<&[f32]>| list.and_then(|list| list.get(index).copied());
+    let [min, max] = [at(limits.min), at(limits.max)];
+    let given = [min, max].into_iter().flatten().all(f32::is_finite);
+    let min = min.map_or(allowed.min, |min| min.max(allowed.min));
+    let max = max.map_or(allowed.max, |max| max.min(allowed.max));
+    if !given || min > max {
+        return Err(GuardError::Limits { index });
+    }
+    let rate = at(limits.max_rate);
+    if rate.is_some_and(|rate| !rate.is_finite() || rate <= 0.0) {
+        return Err(GuardError::Rate { index });
+    }
+    let inside = Interval { min, max };
+    let safe = at(limits.safe_action).unwrap_or_else(|| inside.clamp(0.0));
+    if !safe.is_finite() || inside.clamp(safe) != safe {
+        return Err(GuardError::SafeAction { index });
+    }
+    Ok(Row {
+        min,
+        max,
+        max_step: rate.map_or(f32::INFINITY, |rate| down(f64::from(rate) * period)),
+        safe,
+    })
 }
 
 fn within(value: f32, min: f32, max: f32) -> f32 {

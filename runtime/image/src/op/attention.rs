@@ -71,6 +71,8 @@ impl Operation for Attention {
             checker.arena(span)?;
             rows(span, self.tokens, stride, width)?;
         }
+        let built = self.format == CacheFormat::F32 || cfg!(feature = "half-cache");
+        require(built, Fault::LeftOut)?;
         checker.cache(self.cache_k)?;
         checker.cache(self.cache_v)?;
         let caches = [self.cache_k, self.cache_v].map(|span| [span.offset, span.len]);
@@ -112,13 +114,17 @@ impl Operation for Attention {
             .get_disjoint_mut([self.cache_k.range(), self.cache_v.range()])
             .map_err(|_| ExecError::Span)?;
         // Casts of whole words to smaller numbers: they fail on no span.
+        #[cfg(feature = "half-cache")]
         let cast = |_| ExecError::Span;
         let mut cache = match self.format {
             CacheFormat::F32 => kernels::CacheMut::F32 { keys, values },
+            #[cfg(feature = "half-cache")]
             CacheFormat::F16 => kernels::CacheMut::F16 {
                 keys: bytemuck::try_cast_slice_mut(keys).map_err(cast)?,
                 values: bytemuck::try_cast_slice_mut(values).map_err(cast)?,
             },
+            #[allow(unreachable_patterns, reason = "it is left out or not")]
+            _ => return Err(ExecError::Span),
         };
         let row = |span: Span| machine.arena.get(span.range()).ok_or(ExecError::Span);
         let append = kernels::Append {

@@ -40,6 +40,15 @@ impl Field for Activation {
     }
 }
 
+/// Whether this build has the kernels of a format.
+const fn is_built(format: WeightFormat) -> bool {
+    match format {
+        WeightFormat::F32 => true,
+        WeightFormat::F16 | WeightFormat::Bf16 => cfg!(feature = "half-weights"),
+        WeightFormat::Int8 | WeightFormat::Int16 => cfg!(feature = "integer-weights"),
+    }
+}
+
 word_enum_for!(WeightFormat { F32 = 0, F16 = 1, Bf16 = 2, Int8 = 3, Int16 = 4, });
 
 record! {
@@ -76,6 +85,7 @@ impl Operation for Linear {
         exactly(self.x.len, [self.m, self.k])?;
         exactly(self.y.len, [self.m, self.n])?;
         checker.weights(self.w)?;
+        require(is_built(self.format), Fault::LeftOut)?;
         let scaled = self.format.is_scaled();
         require(self.scales.is_some() == scaled, Fault::Shape)?;
         // Blocks of sixteen outputs, and of integers of sixteen inputs, four bytes to a word.
@@ -101,25 +111,33 @@ impl Operation for Linear {
             Some(bias) => read.get(bias.into())?,
             None => &[],
         };
+        #[cfg(feature = "integer-weights")]
         let scales = match self.scales {
             Some(scales) => read.get(scales.into())?,
             None => &[],
         };
         let w = read.get(self.w.into())?;
         // Casts of whole words to smaller numbers: they fail on no span.
+        #[cfg(any(feature = "half-weights", feature = "integer-weights"))]
         let cast = |_| ExecError::Span;
         let w = match self.format {
             WeightFormat::F32 => kernels::Panels::F32(w),
+            #[cfg(feature = "half-weights")]
             WeightFormat::F16 => kernels::Panels::F16(bytemuck::try_cast_slice(w).map_err(cast)?),
+            #[cfg(feature = "half-weights")]
             WeightFormat::Bf16 => kernels::Panels::Bf16(bytemuck::try_cast_slice(w).map_err(cast)?),
+            #[cfg(feature = "integer-weights")]
             WeightFormat::Int8 => kernels::Panels::Int8 {
                 panels: bytemuck::try_cast_slice(w).map_err(cast)?,
                 scales,
             },
+            #[cfg(feature = "integer-weights")]
             WeightFormat::Int16 => kernels::Panels::Int16 {
                 panels: bytemuck::try_cast_slice(w).map_err(cast)?,
                 scales,
             },
+            #[allow(unreachable_patterns, reason = "there is something left out or not")]
+            _ => return Err(ExecError::Span),
         };
         let layer = kernels::Linear {
             k: self.k as usize,
