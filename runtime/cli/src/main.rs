@@ -11,6 +11,7 @@ mod inspect;
 mod line;
 mod model;
 mod refusal;
+mod seen;
 mod self_test;
 
 use std::io::{self, ErrorKind, Write};
@@ -21,6 +22,7 @@ use clap::{Parser, Subcommand};
 use lads_compiler::{CacheFormat, Options, WeightFormat};
 use lads_host::output;
 
+use crate::inspect::foreign::Foreign;
 use crate::model::Model;
 use crate::refusal::Refusal;
 
@@ -37,9 +39,9 @@ struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Prints contract, programs, and the sizes of image, workspace and weights
+    /// Prints channels, schedule, programs, states and memory of a policy; of another ONNX file, all that it misses to be one
     Inspect {
-        /// Bundle (.onnx) or compiled image (.lads)
+        /// Bundle (.onnx), compiled image (.lads), or any ONNX file
         model: PathBuf,
         /// As one JSON object
         #[arg(long)]
@@ -81,25 +83,26 @@ enum Command {
         #[arg(long)]
         force: bool,
     },
-    /// Replays the policy's golden episode on this machine and compares plans and actions
+    /// Replays the policy's golden episode on this machine and compares the indices in force and the actions
     SelfTest {
         /// Bundle (.onnx) or compiled image (.lads)
         model: PathBuf,
     },
     /// Answers each observation (a line of stdin: CSV or JSON array) with an action (a line of stdout)
     ///
-    /// An empty line starts a new episode of the same instruction.
+    /// A line holds the elements of all observation channels, in the policy's order. An empty line starts a new episode of the same
+    /// instruction.
     Act {
         /// Bundle (.onnx) or compiled image (.lads)
         #[arg(long)]
         model: PathBuf,
-        /// What to do: the text or the id of an instruction that the policy knows
+        /// What to do: the text or the id of an instruction that the policy knows; none for a policy that takes none
         #[arg(long)]
-        instruction: String,
-        /// Append the index of the latent plan in force to every action
+        instruction: Option<String>,
+        /// Append the index in force, such as that of a latent plan, to every action
         #[arg(long)]
         plans: bool,
-        /// Sample plans from the policy's distribution instead of taking the likeliest
+        /// Sample indices from the policy's distribution instead of taking the likeliest
         #[arg(long)]
         sample: bool,
         /// Seed of the sampling
@@ -150,7 +153,17 @@ fn run(command: Command) -> Result<(), Refusal> {
             json,
             observations,
         } => {
-            let model = Model::open(&model)?;
+            let path = model;
+            let model = match Model::open(&path) {
+                Ok(model) => model,
+                Err(refusal) => {
+                    let foreign = Foreign::look(&path).filter(|_| !observations);
+                    return match foreign.ok_or(refusal)? {
+                        foreign if json => print(&format!("{:#}\n", foreign.json())),
+                        foreign => print(&foreign.to_string()),
+                    };
+                }
+            };
             if observations {
                 return print(&inspect::observations(&model)?);
             }
@@ -197,7 +210,6 @@ fn run(command: Command) -> Result<(), Refusal> {
                     "give the bundle (.onnx)",
                 ));
             }
-            model.policy()?;
             let image = model.image();
             // Everything that can be refused is, before the first file is written.
             let c = emit_c.map(|path| emit::c(image, &path).map(|text| (path, text)));
@@ -239,7 +251,7 @@ fn run(command: Command) -> Result<(), Refusal> {
         } => {
             let sample = sample.then_some(seed);
             let request = act::Request {
-                instruction: &instruction,
+                instruction: instruction.as_deref(),
                 plans,
                 sample,
             };
