@@ -13,11 +13,11 @@ COLLECT_lorel   := --episodes 50000
 # What lints and tests cover; one selection, because each is a build of its own, of tract too: the oracle and the language encoder's engine.
 FEATURES := lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language
 ALL      := --workspace --features $(FEATURES)
-RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-host -p lads-pace -p lads-ffi -p lads-cli
+RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-host -p lads-pace -p lads-ffi -p lads-cli -p lads-proof
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report record viewer say language verify test test-full setup lint test-rust test-runtime test-exporter sanitize collect train export reference install bench clean help
+.PHONY: run report record viewer say language verify mutate test test-full setup lint test-rust test-runtime test-exporter sanitize collect train export reference install bench clean help
 
 # Says before a build that takes long what it takes, where nothing of it is there yet: $(call first-build,a crate of it,what,minutes)
 first-build = @ls target/release/deps/lib$(1)-*.rlib >/dev/null 2>&1 || echo "The first build of $(2) takes some $(3) minutes of one core; later ones take seconds."
@@ -127,6 +127,10 @@ reference: $(VENV)/stamp
 ## verify: is the compiled policy the reference's? Fails unless EQUIVALENT; `lads-run --verify` itself exits with 0, 1 DIFFERENT or 3 INCONCLUSIVE
 verify: setup
 	cargo run --release -p lads-sim --bin lads-run -- --model $(MODEL) --verify $(ARGS)
+
+## mutate: changes of every kind to $(MODEL), what each moves and what its verification says; minutes
+mutate: setup
+	cargo run --release -p lads-sim --example mutate -- $(MODEL)
 
 # OpenVINO is a peer of the benchmarks only; where it does not install, the page says so.
 $(VENV)/bench-stamp: $(VENV)/stamp

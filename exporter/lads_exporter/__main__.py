@@ -18,7 +18,8 @@ def _encode(setting):
 def _random(arguments):
     from . import bundle, config, kinds, random_policy
 
-    output.check_apart([] if arguments.kind else [arguments.config], [arguments.output])
+    read = [] if arguments.kind else [arguments.config]
+    output.check_apart(read, [arguments.output])
     if arguments.kind:
         _, model = kinds.export(arguments.kind, arguments.seed)
     else:
@@ -134,6 +135,12 @@ def _reference(arguments):
     from . import reference
 
     output.check_apart([arguments.model], [arguments.output, f"{arguments.output}.progress"])
+    if arguments.complete:
+        from . import questions
+
+        questions.complete(arguments.model, arguments.output, arguments.run)
+        print(f"{arguments.output}: completed; next: lads-run --model {arguments.model} --verify {arguments.output}")
+        return
     chosen = {key: getattr(arguments, key) for key in ("run", "episodes", "traced", "seed", "noise")}
     reference.write(arguments.model, arguments.output, **chosen)
     print(f"{arguments.output}: written; next: lads-run --model {arguments.model} --verify {arguments.output}")
@@ -213,6 +220,7 @@ def _parser():
     rollouts.add_argument("--episodes", type=int, default=20, help="of each instruction (20)")
     rollouts.add_argument("--traced", type=int, default=2, help="of these, so many with all actions and the first states (2)")
     rollouts.add_argument("--seed", type=int, default=0)
+    rollouts.add_argument("--complete", action="store_true", help="add to the reference that is there what an earlier version did not record")
     rollouts.add_argument("--noise", default="v0", help="observation noise: v0, v1 or none")
     rollouts.set_defaults(run_command=_reference)
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from . import language
-from .bundle import write_atomically
+from .output import write_atomically
 from .config import UserError
 
 FORMAT, FORMAT_VERSION = "lads-acceptance", 1

@@ -25,6 +25,7 @@ from safetensors.numpy import save as save_safetensors
 
 from . import bundle, contract as contracts, random_policy, twin
 from .config import UserError
+from .output import write_atomically
 
 NOTHING, RESET = -1, -2
 MARGIN = 1e-3  # of the selections, so that rounding cannot change one
@@ -84,5 +85,5 @@ def write(path, output, steps=200, seed=0):
     found, margin = tensors(model, steps, seed)
     kind = contracts.of(model)["family"]["kind"]
     metadata = {"kind": kind, "seed": str(seed), "margin": f"{margin:.6f}", "sha256": hashlib.sha256(data).hexdigest()}
-    bundle.write_atomically(output, save_safetensors(found, metadata=metadata))
+    write_atomically(output, save_safetensors(found, metadata=metadata))
     return margin

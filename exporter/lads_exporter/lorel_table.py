@@ -12,7 +12,7 @@ import numpy as np
 from .config import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
-SCENE = ROOT / "sim-harness/src/lorel/scene.xml"
+SCENE = ROOT / "sim-harness/src/environments/lorel/scene.xml"
 ASSETS = ROOT / "vendor/assets/metaworld"
 
 HOME = np.array([1.93333534, -0.499194428, -0.705384607, 0.801938933, -2.58353956, -1.46084202, 0.0536478328, 0.04, -0.03])

@@ -24,10 +24,10 @@ import onnx
 import torch
 from tqdm import tqdm
 
-from . import __version__, config, contract as contracts, language, official, weights
+from . import __version__, config, contract as contracts, language, official, questions, weights
 from .output import write_atomically
 
-FORMAT, FORMAT_VERSION = "lads-reference", 1
+FORMAT, FORMAT_VERSION = "lads-reference", 2
 TRACED_STATES = 50
 # What a policy is for; the rest of a contract says how it is built, which is what a verification compares. Of the channels, those that
 # the environment gives and takes; of the language, what makes words of a sentence, and not which sentences are refused.
@@ -84,6 +84,7 @@ class FullSequencePolicy:
         self.instruction = instruction
         self.observations, self.actions = [], []
         self.plans, self.margins = [], []
+        self.logits, self.decided_at, self.steps = [], [], 0
 
     @torch.no_grad()
     def act(self, observation):
@@ -99,10 +100,13 @@ class FullSequencePolicy:
             best = logits.topk(2).values
             self.plans.append(int(logits.argmax()))
             self.margins.append(float(best[0] - best[1]))
+            self.logits.append(logits)
+            self.decided_at.append(self.steps)
         plan = acting.codes[self.plans[-1]]
         action = acting.low_level(self.observations[-1][None], plan[None])[0]
         action = torch.clamp(action, self.low, self.high)
         self.actions.append(action)
+        self.steps += 1
         return action.numpy()
 
     def _logits(self):
@@ -133,6 +137,7 @@ def episode(policy, environment, entropy, instruction, known, traced):
         "completions": [{"sub_task": task, "step": step} for task, step in order],
         "plans": policy.plans,
         "margins": [round(margin, 6) for margin in policy.margins],
+        "decided_at": policy.decided_at,
         "final_state": environment.state().tolist(),
     }
     if traced:
@@ -282,6 +287,7 @@ def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0"):
         {key: row[key] for key in ("id", "text", "split", "sub_tasks")} | {"episodes": [progress.done[index, n] for n in range(episodes)]}
         for index, row in enumerate(known)
     ]
+    questions.add(head, rows, model, contract, policy)
     text = _text(head, rows)
     write_atomically(output, text.encode())
     progress.finish()

@@ -18,6 +18,7 @@ from safetensors.numpy import load as load_safetensors, save as save_safetensors
 
 from . import bundle, config, contract as contracts, reference
 from .config import UserError
+from .output import write_atomically
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 
@@ -127,7 +128,7 @@ def rebind(path, before, after, purpose):
         text = text.replace(before, after)
         if suffix == ".reference.json":
             text = _line(text, "purpose_sha256", purpose)
-        bundle.write_atomically(beside, text.encode())
+        write_atomically(beside, text.encode())
         changed.append(beside.name)
     return changed
 

@@ -8,7 +8,11 @@ import pytest
 import torch
 from safetensors.numpy import load
 
-from lads_exporter import config, contract as contracts, reference, training, weights
+from lads_exporter import config, contract as contracts, questions, reference, training, weights
+
+
+def contract_of(model):
+    return json.loads({row.key: row.value for row in model.metadata_props}["lads.contract"])
 
 
 def words(encoded):
@@ -146,3 +150,41 @@ def test_refusals(bundle, tmp_path):
         reference.write(bundle, tmp_path / "r.json", episodes=1, traced=2)
     with pytest.raises(config.UserError, match="not a bundle"):
         reference.write(__file__, tmp_path / "r.json")
+
+
+def test_a_completed_reference_is_the_one_that_is_made_whole(bundle, tmp_path):
+    whole, old = tmp_path / "whole.json", tmp_path / "old.json"
+    reference.write(bundle, whole, episodes=2, traced=1)
+    made = json.loads(whole.read_text())
+    assert made["float_noise"]["logit"] > 0 and made["contract"]["decision"]["rule"] == "argmax"
+    stripped = {key: value for key, value in made.items() if key not in ("contract", "float_noise")} | {"format_version": 1}
+    traces = [row["trace"] for instruction in stripped["instructions"] for row in instruction["episodes"] if "trace" in row]
+    kept = [(trace.pop("logits"), trace.pop("encoded"), trace.pop("encoded_margins")) for trace in traces]
+    assert all(logits for logits, _, _ in kept) and any(encoded for _, encoded, _ in kept)
+    old.write_text(json.dumps(stripped))
+    questions.complete(bundle, old)
+    completed = json.loads(old.read_text())
+    assert completed.pop("logits_from") == "the bundle's initializers"
+    again = [row["trace"] for instruction in completed["instructions"] for row in instruction["episodes"] if "trace" in row]
+    for trace, (logits, encoded, _) in zip(again, kept, strict=True):
+        numbers = [np.frombuffer(base64.b64decode(text), "<f4") for text in (trace.pop("logits"), logits)]
+        assert np.abs(numbers[0] - numbers[1]).max() < 1e-5 and trace.pop("encoded") == encoded
+        trace.pop("encoded_margins")
+    assert completed["contract"] == made["contract"] and completed["format_version"] == made["format_version"]
+    assert completed["instructions"] == stripped["instructions"]
+
+
+def test_a_reference_of_another_policy_is_not_completed(bundle, tmp_path):
+    file = tmp_path / "r.json"
+    reference.write(bundle, file, episodes=1, traced=1)
+    made = json.loads(file.read_text())
+    trace = made["instructions"][0]["episodes"][0]["trace"]
+    actions = np.frombuffer(base64.b64decode(trace["actions"]), "<f4") + np.float32(0.01)
+    trace["actions"] = base64.b64encode(actions.tobytes()).decode()
+    file.write_text(json.dumps(made))
+    with pytest.raises(config.UserError, match="not this policy's"):
+        questions.complete(bundle, file)
+    made["instructions"][0]["text"] = "something else"
+    file.write_text(json.dumps(made))
+    with pytest.raises(config.UserError, match="instructions are not those"):
+        questions.complete(bundle, file)

@@ -1,36 +1,25 @@
-//! MuJoCo environments, scripted experts and datasets, rollouts and metrics.
+//! MuJoCo environments, scripted experts and datasets, rollouts and recordings.
 //!
-//! Everything that needs a simulator is here; the runtime crates know nothing of it.
+//! Everything that needs a simulator is here; the runtime crates know nothing of it, and [`lads_proof`] judges the numbers that come of it.
 #![forbid(unsafe_code)]
 
-pub mod assets;
-pub mod collect;
 pub mod command;
-pub mod dataset;
-pub mod environment;
-pub mod evaluate;
-pub mod expert;
-pub mod faults;
+pub mod demonstrations;
+pub mod environments;
+pub mod evaluation;
 #[cfg(feature = "record")]
 pub mod film;
-pub mod fit;
-pub mod instructions;
-pub mod kitchen;
-pub mod lorel;
-pub mod metrics;
 pub mod output;
-pub mod plans;
 pub mod random;
-pub mod recorder;
-pub mod registry;
-pub mod replay;
+pub mod recordings;
 #[cfg(feature = "report")]
 pub mod report;
-pub mod results;
-pub mod rollout;
-pub mod spoken;
-pub mod table;
-pub mod trace;
 pub mod verify;
 #[cfg(feature = "viewer")]
 pub mod viewer;
+
+// Rooms keep the modules in order; their users name the modules.
+pub use demonstrations::{collect, dataset, expert, instructions};
+pub use environments::{assets, environment, fit, kitchen, lorel, registry};
+pub use evaluation::{evaluate, faults, results, rollout, spoken, table};
+pub use recordings::{plans, recorder, replay, trace};

@@ -90,7 +90,7 @@ fn altered(bundle: &Path, folder: &Path, from: &str, to: &str) -> PathBuf {
 fn every_instruction_runs_and_the_json_has_its_schema() {
     let folder = tempfile::tempdir().unwrap();
     let (table, results) = results(&["--episodes", "1"], &folder.path().join("r.json"));
-    let text = fs::read_to_string(project_file("sim-harness/results.schema.json")).unwrap();
+    let text = fs::read_to_string(project_file("sim-harness/proof/results.schema.json")).unwrap();
     let root: Value = serde_json::from_str(&text).unwrap();
     schema::check(&results, &root, &root, "results");
 
@@ -368,7 +368,7 @@ fn a_log_replays_and_its_plans_run() {
     let recorded = [&first[..], &["--log", log, "--monitor"]].concat();
     let (table, results) = results(&recorded, &json);
     assert!(table.contains("executed segments are encoded as the plan in force"));
-    let text = fs::read_to_string(project_file("sim-harness/results.schema.json")).unwrap();
+    let text = fs::read_to_string(project_file("sim-harness/proof/results.schema.json")).unwrap();
     let root: Value = serde_json::from_str(&text).unwrap();
     schema::check(&results, &root, &root, "results");
     assert!(out(&["--replay", log]).starts_with("EQUAL: 1 episodes"));

@@ -43,7 +43,8 @@ fn certificate(arguments: &[&str], folder: &Path) -> (Option<i32>, Value) {
 #[test]
 fn one_episode_agrees_on_every_instruction_set_and_is_too_few() {
     let folder = tempfile::tempdir().unwrap();
-    let schema = fs::read_to_string(project_file("sim-harness/certificate.schema.json")).unwrap();
+    let schema =
+        fs::read_to_string(project_file("sim-harness/proof/certificate.schema.json")).unwrap();
     let schema: Value = serde_json::from_str(&schema).unwrap();
     let few = ["--episodes", "1", "--instruction", "kbls"];
     let mut certificates = Vec::new();
@@ -55,6 +56,16 @@ fn one_episode_agrees_on_every_instruction_set_and_is_too_few() {
         assert!(found["more_episodes_per_instruction"].as_u64() > Some(0));
         assert_eq!(found["policy"]["differing_episodes"], 0);
         assert!(found["policy"]["largest_action_difference"].as_f64() < Some(1e-4));
+        assert!(found["policy"]["largest_logit_difference"].as_f64() < Some(1e-4));
+        assert!(found["policy"]["compared_decisions"].as_u64() > Some(5));
+        assert!(found["policy"]["compared_segments"].as_u64() > Some(5));
+        assert!(
+            found["contract"]["fields"]
+                .as_array()
+                .unwrap()
+                .contains(&"decision".into())
+        );
+        assert_eq!(found["contract"]["differing"], Value::Array(Vec::new()));
         assert!(found["environment"]["largest_state_difference"].as_f64() <= Some(1e-6));
         assert_eq!(found["rollouts"]["identical_completions"], 1.0);
         assert!(found["rollouts"]["largest_action_difference"].as_f64() < Some(1e-4));
@@ -160,6 +171,69 @@ fn the_page_is_one_file_that_names_the_verdict() {
     );
 }
 
+/// What is printed says where the reference's weights came from, what that leaves open, and what was not looked at.
+#[test]
+fn the_source_of_the_reference_is_printed() {
+    let output = verify(&["--episodes", "1", "--instruction", "kbls"]);
+    let printed = String::from_utf8(output.stdout).unwrap();
+    for part in [
+        "reference: weights from the bundle's initializers",
+        "note: the reference's weights come from the bundle's initializers",
+        "not covered: ",
+        "24 of 25 instructions",
+        "export of the weights",
+    ] {
+        assert!(printed.contains(part), "'{part}' is not in: {printed}");
+    }
+    let folder = tempfile::tempdir().unwrap();
+    // The same from a run's checkpoint has no such note.
+    let source = r#""weights_from": "the bundle's initializers""#;
+    let checkpoint = altered(
+        folder.path(),
+        source,
+        r#""weights_from": "the run's checkpoint", "ignored": 1"#,
+    );
+    let text = fs::read_to_string(&checkpoint).unwrap();
+    let text = text.replacen(
+        r#""logits_from": "the bundle's initializers""#,
+        r#""logits_from": null"#,
+        1,
+    );
+    fs::write(&checkpoint, text).unwrap();
+    let output = verify(&[&checkpoint, "--episodes", "1", "--instruction", "kbls"]);
+    let printed = String::from_utf8(output.stdout).unwrap();
+    assert!(
+        printed.contains("weights from the run's checkpoint") && !printed.contains("note: "),
+        "{printed}"
+    );
+}
+
+/// A reference of the first version records neither contract nor logits: its silence is no agreement.
+#[test]
+fn a_reference_without_a_contract_decides_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = fs::read_to_string(project_file("models/kitchen.reference.json")).unwrap();
+    let mut file: Value = serde_json::from_str(&text).unwrap();
+    file["format_version"] = 1.into();
+    file.as_object_mut().unwrap().remove("contract");
+    let path = folder.path().join("old.json");
+    fs::write(&path, file.to_string()).unwrap();
+    let few = [
+        path.to_str().unwrap(),
+        "--episodes",
+        "1",
+        "--instruction",
+        "kbls",
+    ];
+    let (code, found) = certificate(&few, folder.path());
+    assert_eq!((code, &found["verdict"]), (Some(3), &"INCONCLUSIVE".into()));
+    let reasons = found["reasons"].to_string();
+    assert!(
+        reasons.contains("the contract was not compared") && reasons.contains("--complete"),
+        "{reasons}"
+    );
+}
+
 fn refused(arguments: &[&str], parts: &[&str]) {
     let output = verify(arguments);
     let errors = String::from_utf8_lossy(&output.stderr);
@@ -207,9 +281,9 @@ fn references_of_something_else_are_refused_by_name() {
         &["environment", "'other'"],
     );
     check(
-        "turn on light switch",
-        "turn off light switch",
-        &["instruction list", "turn off"],
+        r#"open sliding cabinet", "split": "seen""#,
+        r#"close sliding cabinet", "split": "seen""#,
+        &["instruction list", "close sliding"],
     );
     check(
         r#""purpose_sha256": ""#,
@@ -217,14 +291,14 @@ fn references_of_something_else_are_refused_by_name() {
         &["contract hash"],
     );
     check(
-        r#""format_version": 1"#,
+        r#""format_version": 2"#,
         r#""format_version": 9"#,
         &["lads-reference 9", "make reference"],
     );
     check(
         r#""plans": [19"#,
         r#""plans": [19, 19"#,
-        &["not one per horizon"],
+        &["not one per decision"],
     );
     check(
         r#""final_state": ["#,

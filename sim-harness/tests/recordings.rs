@@ -286,7 +286,7 @@ fn commanded_plans_are_followed_and_encoded() {
     let steps = evaluated.traces[0].steps.as_slice();
     let parts = [
         &steps[..2 * horizon],
-        &steps[..horizon + 1],
+        &steps[..=horizon],
         &steps[1..=horizon],
         &steps[..horizon - 1],
     ];

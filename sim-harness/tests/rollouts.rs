@@ -306,3 +306,39 @@ fn a_contract_that_does_not_fit_is_refused_by_name() {
         );
     }
 }
+
+/// A thread that panics ends the others after their current episode, not after the whole queue.
+#[test]
+fn a_panic_stops_all_threads() {
+    let image = tiny_image();
+    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let assignments = assignments(&policy);
+    let evaluation = Evaluation {
+        policy,
+        assignments: &assignments,
+        episodes: 200,
+        seed: 0,
+        decision: Decision::Argmax,
+        actor: Actor::Policy,
+        isa: Isa::detect(),
+        threads: 2,
+        setup: Setup::default(),
+    };
+    let finished = AtomicUsize::new(0);
+    let count = || {
+        if finished.fetch_add(1, Ordering::Relaxed) == 0 {
+            // No message and no backtrace, which would give the other thread time.
+            std::panic::resume_unwind(Box::new("lost"));
+        }
+        std::thread::sleep(std::time::Duration::from_millis(1));
+    };
+    let run = || {
+        evaluation
+            .run(&open, &AtomicBool::new(false), &count)
+            .map(drop)
+    };
+    let panic = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run)).unwrap_err();
+    assert_eq!(panic.downcast_ref::<&str>(), Some(&"lost"));
+    let finished = finished.into_inner();
+    assert!(finished < 400, "{finished} of 800 episodes were run");
+}

@@ -8,7 +8,7 @@ use std::sync::atomic::AtomicBool;
 use bench::{Bench, Says, tiny_image};
 use lads_core::{Decision, Isa, Policy};
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, Setup};
-use lads_sim::results::InstructionResult;
+use lads_sim::results;
 use lads_sim::rollout::Actor;
 use lads_sim::spoken::{FREE, Sentence, SubTaskError, WordBook, nearest};
 
@@ -74,7 +74,7 @@ fn a_sentence_that_commands_nothing_lasts_its_full_time_and_has_no_rates() {
     let episodes = run(&policy, &assignments, Some(&book)).episodes;
     assert!(episodes[0].iter().all(|e| e.steps == 40 && !e.success));
     let watched = Says::default().sub_tasks;
-    let result = InstructionResult::new(&silent.known(), watched, &episodes[0]);
+    let result = results::of_instruction(&silent.known(), watched, &episodes[0]);
     assert_eq!((result.id.as_str(), result.text.as_str()), (FREE, "say it"));
     assert_eq!(result.score.episodes, 3);
     assert_eq!(result.score.full_success, None);

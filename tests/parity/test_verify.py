@@ -154,8 +154,22 @@ def test_a_damaged_policy_is_different(damage, tmp_path):
     assert code == DIFFERENT and certificate["verdict"] == "DIFFERENT"
     assert certificate["policy"]["differing_episodes"] == 1
     assert certificate["environment"]["first_difference"] is None
-    assert "the policy answers otherwise" in certificate["reasons"][0]
+    assert any("the policy answers otherwise" in reason for reason in certificate["reasons"])
     assert not certificate["reference"]["same_bundle"]
+
+
+def test_another_rule_is_different_though_the_networks_are_the_same(tmp_path):
+    """What runs samples at temperature 5, and hardly ever succeeds: the contract is compared, and its own rule is what is run."""
+    model = onnx.load(BUNDLE)
+    contract = json.loads(properties(model)["lads.contract"])
+    contract["decision"] |= {"rule": "sample", "temperature": 5.0}
+    set_property(model, "lads.contract", json.dumps(contract))
+    path = tmp_path / "sampled.onnx"
+    path.write_bytes(model.SerializeToString())
+    code, certificate = verify(path, tmp_path)
+    assert code == DIFFERENT and certificate["setting"]["decision"] == "sampling at temperature 5"
+    assert "decision.rule" in certificate["reasons"][0]
+    assert [row["field"] for row in certificate["contract"]["differing"]] == ["decision.rule", "decision.temperature"]
 
 
 def test_the_shipped_policy_is_not(tmp_path):

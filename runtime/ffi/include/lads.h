@@ -659,7 +659,7 @@ lads_status lads_self_test(struct lads_controller *controller,
                            struct lads_self_test_t *result);
 
 /**
- * Follows a known instruction, by its number, from the next step on: a new episode. `LADS_INSTRUCT_FAILED`, which a sound image
+ * Follows a known instruction, by its number, from the next step on: a new episode. `LADS_STATUS_INSTRUCT_FAILED`, which a sound image
  * never causes, leaves the controller without an instruction.
  *
  * # Safety
@@ -685,7 +685,7 @@ lads_status lads_set_words(struct lads_controller *controller, const float *word
 lads_status lads_set_decision(struct lads_controller *controller, float temperature, uint64_t seed);
 
 /**
- * One control period: writes an action that is finite and inside limits and rates, whatever the observation is. `LADS_OK` says
+ * One control period: writes an action that is finite and inside limits and rates, whatever the observation is. `LADS_STATUS_OK` says
  * that it is the policy's; any other status why it is the fallback's. A null `observation` says that there is none. `tick` may
  * be null, then nothing is stale or late; so may `report`.
  *
@@ -755,16 +755,6 @@ lads_status lads_resume(struct lads_controller *controller);
  * As `lads_self_test`; `counters` may be written.
  */
 lads_status lads_counters(struct lads_controller *controller, struct lads_counters_t *counters);
-
-/**
- * Does not exist.
- */
-extern void lads_a_panic_is_reachable(void);
-
-/**
- * The precompiled `core` refers to this symbol on hosted targets, where it was built to unwind. Nothing calls it: panics abort.
- */
-void rust_eh_personality(void);
 
 #ifdef __cplusplus
 }  // extern "C"

@@ -9,9 +9,9 @@ use kuva::render::layout::Layout;
 use kuva::render::plots::Plot;
 
 use super::Report;
-use crate::metrics::Interval;
 use crate::results::Results;
 use crate::trace::Trace;
+use lads_proof::metrics::Interval;
 
 /// Colours that stay apart for most eyes (Okabe and Ito), darkest first.
 const COLORS: [&str; 6] = [
@@ -20,6 +20,9 @@ const COLORS: [&str; 6] = [
 
 /// Completions that are nearer than this share of an episode have one label in a timeline.
 const TOGETHER: f64 = 0.04;
+
+/// Room above the plans of a timeline for the numbers of completions.
+const HEADROOM: f64 = 1.12;
 
 /// The colour of what nobody asked for.
 const UNASKED: &str = "#777777";
@@ -153,7 +156,7 @@ fn timeline(report: &Report<'_>, trace: &Trace) -> Chart {
         .with_y_label("plan")
         .with_x_axis_max(steps)
         .with_y_axis_min(0.0)
-        .with_y_axis_max(report.contract.codebook_len() as f64);
+        .with_y_axis_max(HEADROOM * report.contract.codebook_len() as f64);
     let marks = marks(report, trace);
     // Numbers of completions that are close to each other stand at the first of their lines.
     let mut together: Vec<(f64, Vec<&Mark>)> = Vec::new();

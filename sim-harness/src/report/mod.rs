@@ -13,9 +13,9 @@ use base64::engine::general_purpose::STANDARD;
 use lads_core::Contract;
 
 use self::charts::Chart;
-use crate::metrics::{Interval, Score};
 use crate::results::Results;
 use crate::trace::Trace;
+use lads_proof::metrics::{Interval, Score};
 
 /// What a report is made of.
 pub struct Report<'r> {

@@ -1,23 +1,28 @@
 //! Proof that an exported policy is the policy that was trained: the reference's questions, its actions and its episodes, run again.
 //!
 //! Three comparisons, each of which can fail where the others cannot see: the policy alone ([`policy`]: open loop on the reference's
-//! observations), the environment alone ([`physics`]: open loop on the reference's actions), and both together ([`pairs`]: the reference's
+//! observations), the environment alone ([`physics`]: open loop on the reference's actions), and both together ([`lads_proof::pairs`]: the reference's
 //! episodes in closed loop). [`certificate`] has the rules of the verdict. What can fail: a reference that cannot be read or is of something
 //! else ([`mod@reference`]), an episode that cannot be finished.
 
-pub mod certificate;
-pub mod page;
-pub mod pairs;
+pub mod contract;
 pub mod physics;
 pub mod policy;
-pub mod purpose;
-pub mod reference;
-pub mod statistics;
+
+pub use lads_proof::{certificate, page, reference};
 
 use std::collections::BTreeMap;
 use std::sync::atomic::AtomicBool;
 
-use crate::evaluate::{Evaluation, EvaluationError};
+use lads_compiler::Bundle;
+use lads_proof::answers::Answers;
+use lads_proof::contract::Compared;
+use lads_proof::numbering::Numbering;
+use lads_proof::pairs::{Episodes, Paired, Traced};
+use lads_proof::reference::Subject;
+
+use crate::environment::Environment;
+use crate::evaluate::{Evaluated, Evaluation, EvaluationError};
 use crate::registry::Opener;
 use certificate::{Certificate, ReferenceUsed, Setting};
 use reference::Reference;
@@ -31,15 +36,16 @@ pub fn work(evaluation: &Evaluation<'_>) -> usize {
 /// as many episodes as the reference does; `finished` is called after each episode of each comparison, see [`work`].
 pub fn run(
     evaluation: &Evaluation<'_>,
+    bundle: &Bundle,
     reference: &Reference,
     open: &Opener,
-    versions: BTreeMap<&'static str, String>,
+    versions: BTreeMap<String, String>,
     stop: &AtomicBool,
     finished: &(dyn Fn() + Sync),
 ) -> Result<Certificate, EvaluationError> {
     let contract = evaluation.policy.contract();
     let traced = evaluation.setup.traced;
-    let answers = policy::ask(
+    let replays = policy::ask(
         &evaluation.policy,
         evaluation.isa,
         reference,
@@ -48,6 +54,11 @@ pub fn run(
         stop,
         finished,
     )?;
+    let stated = evaluation
+        .policy
+        .golden()
+        .map(|golden| f64::from(golden.tolerance()));
+    let (answers, numbering) = Answers::judge(reference, &replays, stated);
     let mut environment = open();
     let physics = physics::replay(
         environment.as_mut(),
@@ -58,17 +69,17 @@ pub fn run(
         finished,
     )?;
     let evaluated = evaluation.run(open, stop, finished)?;
-    let rollouts = pairs::Paired::new(
-        reference,
-        evaluation.assignments,
+    let rollouts = compared(
+        (reference, &numbering),
         environment.sub_tasks(),
+        evaluation,
         &evaluated,
-        [contract.observation_len(), contract.action_len()],
     );
     let setting = Setting {
         environment: environment.id().to_owned(),
         bundle_sha256: contract.bundle_sha256().to_owned(),
         image_sha256: lads_compiler::sha256(evaluation.policy.image()),
+        decision: contract::rule(&contract),
         isa: evaluation.isa.name().to_owned(),
         seed: evaluation.seed,
         noise: reference.noise.clone(),
@@ -81,7 +92,85 @@ pub fn run(
         same_bundle: reference.bundle_sha256 == contract.bundle_sha256(),
         weights_from: reference.weights_from.clone(),
         words_from: reference.words_from.clone(),
+        logits_from: reference.logits_from.clone(),
         versions: reference.versions.clone(),
     };
-    Ok(Certificate::new(setting, used, answers, physics, rollouts))
+    let stated = bundle
+        .metadata("lads.contract")
+        .and_then(|text| serde_json::from_str(text).ok());
+    let compared = Compared::new(
+        &stated.unwrap_or_default(),
+        reference.contract.as_ref(),
+        &contract::of_image(&contract),
+    );
+    let not_covered = unseen(evaluation, &answers);
+    Ok(Certificate::new(
+        setting,
+        used,
+        compared,
+        answers,
+        physics,
+        rollouts,
+        not_covered,
+    ))
+}
+
+/// What a bundle is, as far as its reference must be of the same.
+pub fn subject<'s>(bundle: &'s Bundle, environment: &'s dyn Environment) -> Subject<'s> {
+    let known = &bundle.contract().instructions;
+    Subject {
+        contract: bundle.metadata("lads.contract").unwrap_or_default(),
+        instructions: known.iter().map(|row| row.text.as_str()).collect(),
+        environment_id: environment.id(),
+        environment_version: environment.version(),
+        observation_len: environment.observation_len(),
+        action_len: environment.action_len(),
+    }
+}
+
+/// What these episodes could not show.
+fn unseen(evaluation: &Evaluation<'_>, answers: &Answers) -> Vec<String> {
+    let contract = evaluation.policy.contract();
+    let mut unseen = Vec::new();
+    let known = contract.instructions().count();
+    if evaluation.assignments.len() < known {
+        unseen.push(format!(
+            "{} of {known} instructions",
+            known - evaluation.assignments.len()
+        ));
+    }
+    let longest = answers.longest_episode;
+    if longest <= contract.context_steps() {
+        unseen.push(format!(
+            "what happens after {longest} control steps: no replayed episode is longer, and the policy's context holds {}",
+            contract.context_steps()
+        ));
+    }
+    unseen
+}
+
+fn compared(
+    reference: (&Reference, &Numbering),
+    sub_tasks: &[&str],
+    evaluation: &Evaluation<'_>,
+    evaluated: &Evaluated,
+) -> Paired {
+    let contract = evaluation.policy.contract();
+    let episodes = evaluation.assignments.iter().zip(&evaluated.episodes);
+    let episodes = episodes.map(|(assignment, episodes)| Episodes {
+        instruction: assignment.instruction as usize,
+        commanded: &assignment.commanded,
+        episodes,
+    });
+    let traces = evaluated.traces.iter().map(|trace| Traced {
+        instruction: trace.instruction as usize,
+        episode: trace.episode as usize,
+        steps: trace
+            .steps
+            .iter()
+            .map(|step| [step.observation.as_slice(), &step.action])
+            .collect(),
+    });
+    let lens = [contract.observation_len(), contract.action_len()];
+    Paired::new(reference, sub_tasks, episodes, traces, lens)
 }

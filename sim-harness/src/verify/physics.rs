@@ -6,33 +6,12 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use serde::Serialize;
+use lads_proof::answers::Answer;
+use lads_proof::physics::Physics;
+use lads_proof::reference::Reference;
 
-use super::policy::Answer;
-use super::reference::Reference;
 use crate::environment::{Environment, EpisodeSeed};
 use crate::evaluate::{Assignment, EvaluationError};
-
-/// Largest difference of a state element (rad or m) that counts as the same: thousand times the 2e-9 that another libm makes of
-/// the first two seconds, far below what a policy could notice.
-pub const STATE_TOLERANCE: f64 = 1e-6;
-
-/// What came of the recorded actions.
-#[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub struct Physics {
-    /// Episodes replayed.
-    pub episodes: usize,
-    /// States compared.
-    pub states: usize,
-    /// Whether all had the same bits.
-    pub identical_bits: bool,
-    /// Largest difference of an element.
-    pub largest_state_difference: f64,
-    /// What it may be.
-    pub state_tolerance: f64,
-    /// The first state beyond it.
-    pub first_difference: Option<Answer>,
-}
 
 /// Replays the first `episodes` traced episodes of each instruction. `finished` is called after each, `stop` ends the work early.
 pub fn replay(
@@ -43,11 +22,7 @@ pub fn replay(
     stop: &AtomicBool,
     finished: &dyn Fn(),
 ) -> Result<Physics, EvaluationError> {
-    let mut physics = Physics {
-        identical_bits: true,
-        state_tolerance: STATE_TOLERANCE,
-        ..Physics::default()
-    };
+    let mut physics = Physics::new();
     for assignment in assignments {
         let index = assignment.instruction as usize;
         let Some(instruction) = reference.instructions.get(index) else {
@@ -98,20 +73,4 @@ pub fn replay(
         }
     }
     Ok(physics)
-}
-
-impl Physics {
-    fn compare(&mut self, state: &[f64], expected: &[f64], place: impl Fn() -> Answer) {
-        self.states += 1;
-        for (index, (&ours, &theirs)) in state.iter().zip(expected).enumerate() {
-            self.identical_bits &= ours.to_bits() == theirs.to_bits();
-            let difference = (ours - theirs).abs();
-            self.largest_state_difference = self.largest_state_difference.max(difference);
-            if difference > STATE_TOLERANCE || difference.is_nan() {
-                let what = format!("state element {index} is {ours}, the reference's is {theirs}");
-                self.first_difference
-                    .get_or_insert_with(|| Answer { what, ..place() });
-            }
-        }
-    }
 }

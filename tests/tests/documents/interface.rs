@@ -15,7 +15,7 @@ const OTHER: [&str; 4] = [
     "LADS_WRITE_HEADER",
     // The package that a program's CMake asks for.
     "lads_VERSION",
-    // Guards and names of examples' own files.
+    // The package in Python.
     "lads_exporter",
 ];
 
@@ -23,6 +23,7 @@ const OTHER: [&str; 4] = [
 fn names(text: &str) -> BTreeSet<&str> {
     let words = text.split(|c: char| !c.is_ascii_alphanumeric() && c != '_');
     words
+        .filter(|word| word.len() > "lads_".len())
         .filter(|word| word.starts_with("LADS_") || word.starts_with("lads_"))
         .collect()
 }

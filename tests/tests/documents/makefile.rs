@@ -21,21 +21,24 @@ fn rules(text: &str) -> BTreeSet<&str> {
         .collect()
 }
 
-/// The word after every `make ` that stands in the font of code, in quotes, or after "run" or "by".
+/// The rules behind every `make ` that stands in the font of code; and the one where people are told to run it.
 fn spoken_of(text: &str) -> BTreeSet<String> {
     let mut names = BTreeSet::new();
     for (place, _) in text.match_indices("make ") {
         let before = text[..place].trim_end_matches(' ');
-        let told = ["`", "\"", "run", "; \\\"", "(by"];
-        if !told.iter().any(|mark| before.ends_with(mark)) {
+        let in_code = before.ends_with('`');
+        let told = ["run", "run \"", "run \\\"", "(by"];
+        if !in_code && !told.iter().any(|mark| before.ends_with(mark)) {
             continue;
         }
-        let typed = text[place + 5..].split(['`', '"', '\n', '#', ';', ',', ')', '(']);
+        let typed = text[place + 5..].split(['`', '"', '\\', '\n', '#', ';', ',', '.', ')', '(']);
         let words = typed.take(1).flat_map(str::split_whitespace);
         let rules = words.take_while(|word| {
-            !word.contains('=') && word.chars().all(|c| c.is_ascii_lowercase() || c == '-')
+            let mut letters = word.chars();
+            letters.all(|c| c.is_ascii_lowercase() || c == '-')
         });
-        names.extend(rules.map(str::to_owned));
+        let most = if in_code { usize::MAX } else { 1 };
+        names.extend(rules.take(most).map(str::to_owned));
     }
     names
 }
@@ -105,7 +108,7 @@ fn every_rule_that_is_spoken_of_is_there() {
 
 #[test]
 fn names_are_found_where_people_are_told_to_type_them() {
-    let text = "`make collect train export` (`ENV=lorel`), \"make setup\" again; run make verify\nwe make tea, `make run ARGS=\"-x\"`";
+    let text = "`make collect train export` (`ENV=lorel`), run \"make setup\" again; run make verify, or\nmake tea, `make run ARGS=\"-x\"`";
     let found: Vec<_> = spoken_of(text).into_iter().collect();
     assert_eq!(
         found,

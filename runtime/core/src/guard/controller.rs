@@ -17,9 +17,10 @@ use crate::self_test::{SelfTest, SelfTestError};
 /// A [`Controller`] whose inputs are watched and whose output is limited.
 ///
 /// In every control period it writes an action that is finite, inside the limits, and no further from the last one than the rate
-/// allows, whatever the observation, the clock or the policy do; only an action of the wrong length is left alone. When the
-/// policy's action cannot be used (an [`Intervention`]) the [`Fallback`] decides what is written instead. Before the self-test has
-/// passed and an instruction is set there is nothing but the safe action.
+/// allows, whatever the observation, the clock or the policy do. When the policy's action cannot be used (an [`Intervention`]) the
+/// [`Fallback`] decides what is written instead. Before the self-test has passed and an instruction is set there is nothing but the
+/// safe action. What can fail is [`GuardedController::new`], when the configuration contradicts the contract ([`GuardError`]), and a
+/// step only when the caller's action has the wrong length, so that nothing can be written.
 ///
 /// ```no_run
 /// # use lads_core::{Controller, GuardConfig, GuardedController, Instruction, Tick};

@@ -33,7 +33,7 @@ use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Setup};
 use lads_sim::faults::Faults;
 use lads_sim::plans;
-use lads_sim::results::{self, DecisionUsed, EnvironmentUsed, InstructionResult, Results};
+use lads_sim::results::{self, Results};
 use lads_sim::rollout::Actor;
 use lads_sim::table::Table;
 use lads_sim::verify::reference::Reference;
@@ -136,11 +136,12 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
     };
     if let Some(reference) = reference {
         reference
-            .check(&bundle, environment.as_ref())
+            .check(&lads_sim::verify::subject(&bundle, environment.as_ref()))
             .map_err(refused)?;
         verify::prepare(&mut evaluation, &reference, arguments.episodes)?;
         return verify::run(
             &evaluation,
+            &bundle,
             &reference,
             &open,
             &arguments.certificate,
@@ -242,19 +243,19 @@ impl Bench<'_> {
             .filter(|(_, episodes)| !episodes.is_empty())
             .filter_map(|(assignment, episodes)| {
                 let known = evaluation.instruction(assignment.instruction)?;
-                Some(InstructionResult::new(&known, watched, episodes))
+                Some(results::of_instruction(&known, watched, episodes))
             })
             .collect();
         let threads = evaluation.threads.min(evaluation.len());
         Results {
             format: results::FORMAT,
             format_version: results::FORMAT_VERSION,
-            environment: EnvironmentUsed::new(environment, &splits),
+            environment: results::environment_used(environment, &splits),
             bundle_sha256: contract.bundle_sha256().to_owned(),
             image_sha256: lads_compiler::sha256(evaluation.policy.image()),
             seed: evaluation.seed,
             noise: self.noise.to_owned(),
-            decision: DecisionUsed::of(evaluation.decision, evaluation.actor),
+            decision: results::decision_used(evaluation.decision, evaluation.actor),
             episodes_per_instruction: evaluation.episodes,
             heard_by: self.heard.by.clone(),
             faults: Some(evaluation.setup.faults).filter(|&faults| faults != Faults::default()),

@@ -176,10 +176,7 @@ pub fn log(
             trace: trace.clone(),
         })
     };
-    let mut notes: std::collections::BTreeMap<_, _> = results::versions()
-        .into_iter()
-        .map(|(name, version)| (name.to_owned(), version))
-        .collect();
+    let mut notes = results::versions();
     let faults = serde_json::to_string(&evaluation.setup.faults).unwrap_or_default();
     notes.insert("faults".to_owned(), faults);
     let log = Log {

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use askama::Template as _;
-use lads_core::Decision;
+use lads_compiler::Bundle;
 use lads_sim::evaluate::Evaluation;
 use lads_sim::output;
 use lads_sim::registry::Opener;
@@ -49,7 +49,8 @@ pub fn prepare(
     }
     evaluation.episodes = episodes;
     evaluation.seed = reference.seed;
-    evaluation.decision = Decision::Argmax;
+    // The contract's own rule, whatever the reference's was: the certificate compares the two.
+    evaluation.decision = evaluation.policy.contract().decision();
     evaluation.setup.traced = reference.traced_episodes.min(episodes);
     Ok(())
 }
@@ -57,15 +58,24 @@ pub fn prepare(
 /// Runs the verification, writes and prints the certificate; gives the exit code.
 pub fn run(
     evaluation: &Evaluation<'_>,
+    bundle: &Bundle,
     reference: &Reference,
     open: &Opener,
     certificates: &[PathBuf],
     stop: &AtomicBool,
 ) -> Result<ExitCode, End> {
     let bar = progress(lads_sim::verify::work(evaluation));
-    let certificate = lads_sim::verify::run(evaluation, reference, open, versions(), stop, &|| {
-        bar.inc(1);
-    });
+    let certificate = lads_sim::verify::run(
+        evaluation,
+        bundle,
+        reference,
+        open,
+        versions(),
+        stop,
+        &|| {
+            bar.inc(1);
+        },
+    );
     bar.finish_and_clear();
     let certificate = certificate.map_err(unfinished)?;
     for path in certificates {
@@ -87,16 +97,27 @@ struct Summary<'c>(&'c Certificate);
 impl fmt::Display for Summary<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Certificate {
+            contract,
             policy,
             environment,
             rollouts,
             ..
         } = self.0;
+        let differing = contract.differing.len() + contract.image_differing.len();
         writeln!(
             f,
-            "policy alone       {} of {} replayed episodes differ; actions within {:.1e} (allowed {:.1e}) over {} steps",
+            "contract           {} fields compared, {differing} values differ",
+            contract.fields.len()
+        )?;
+        writeln!(
+            f,
+            "policy alone       {} of {} replayed episodes differ; logits within {:.1e} (allowed {:.1e}) over {} decisions, actions within {:.1e} \
+             (allowed {:.1e}) over {} steps",
             policy.differing_episodes,
             policy.episodes,
+            policy.largest_logit_difference,
+            policy.logit_tolerance,
+            policy.compared_decisions,
             policy.largest_action_difference,
             policy.action_tolerance,
             policy.compared_steps
@@ -157,6 +178,16 @@ impl fmt::Display for Summary<'_> {
         for reason in &self.0.reasons {
             writeln!(f, "- {reason}")?;
         }
+        for note in &self.0.notes {
+            writeln!(f, "- note: {note}")?;
+        }
+        let reference = &self.0.reference;
+        writeln!(
+            f,
+            "- reference: weights from {}, words from {}",
+            reference.weights_from, reference.words_from
+        )?;
+        writeln!(f, "- not covered: {}", self.0.not_covered.join("; "))?;
         match self.0.more_episodes_per_instruction {
             Some(more) => writeln!(
                 f,

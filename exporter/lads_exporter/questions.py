@@ -1,0 +1,174 @@
+"""What a reference records beside its rollouts, so that more than actions can be compared: contract, logits, encodings, noise.
+
+All of it is computed from the traces, whose observations and executed actions are asked again: the logits of every decision,
+the plan that the trajectory encoder sees in every whole segment, and what float noise on all weights does to the reference's own
+answers, which is what a verification must allow. So a reference that was made without can be completed, with no environment.
+"""
+
+import base64
+import copy
+import json
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+import torch.nn.functional as F
+from onnx import numpy_helper
+
+from . import config
+from .bundle import write_atomically
+
+# Relative size of the noise: some rounding errors of 32-bit floats, and what another order of sums makes of them.
+NOISE, DRAWS = 1e-6, 3
+# A recorded action or plan that the weights do not give is another policy's.
+SAME_ACTION, SAME_PLAN = 1e-4, 1e-3
+
+
+def _text(rows, kind):
+    return base64.b64encode(np.stack(rows).astype(kind).tobytes()).decode()
+
+
+def _numbers(text, kind, columns):
+    return np.frombuffer(base64.b64decode(text), kind).reshape(-1, columns)
+
+
+def _traced(rows):
+    """(index of the instruction, episode) of every trace."""
+    return [(index, row) for index, instruction in enumerate(rows) for row in instruction["episodes"] if "trace" in row]
+
+
+def _ask(policy, index, episode):
+    """Asks a policy what a trace's policy was asked -> logits per decision, actions [steps, A]."""
+    lens = len(policy.acting.normalizer.mean), len(policy.low)
+    trace = episode["trace"]
+    policy.start(index)
+    actions = []
+    for seen, done in zip(_numbers(trace["observations"], "<f4", lens[0]), _numbers(trace["actions"], "<f4", lens[1]), strict=True):
+        actions.append(policy.act(seen.copy()))
+        policy.actions[-1] = torch.from_numpy(done.copy())
+    return policy.logits, np.stack(actions)
+
+
+def _disturbed(acting, generator):
+    """The same networks, each weight off by noise."""
+    other = copy.deepcopy(acting)
+    for module in (other.normalizer, other.high_level, other.low_level):
+        for value in module.state_dict().values():
+            if value.is_floating_point():
+                value.mul_(1 + NOISE * torch.randn(value.shape, generator=generator))
+    other.codes.mul_(1 + NOISE * torch.randn(other.codes.shape, generator=generator))
+    return other
+
+
+def _half_range(difference):
+    """The largest of differences once the constant is taken off that makes it smallest."""
+    return float(difference.max() - difference.min()) / 2
+
+
+@torch.no_grad()
+def float_noise(policy, rows):
+    """What noise on all weights does to a policy's answers -> the largest differences of an action and of a logit."""
+    generator = torch.Generator().manual_seed(0)
+    largest = {"relative": NOISE, "action": 0.0, "logit": 0.0}
+    answers = {id(episode): _ask(policy, index, episode) for index, episode in _traced(rows)}
+    exact = policy.acting
+    for _ in range(DRAWS):
+        policy.acting = _disturbed(exact, generator)
+        for index, episode in _traced(rows):
+            logits, actions = answers[id(episode)]
+            noisy, others = _ask(policy, index, episode)
+            plans = [int(row.argmax()) for row in logits], [int(row.argmax()) for row in noisy]
+            for a, b in zip(logits, noisy, strict=True):
+                largest["logit"] = max(largest["logit"], _half_range(a - b))
+            # Another plan has other actions; that is the logits' matter.
+            at = np.searchsorted(policy.decided_at, np.arange(len(actions)), side="right") - 1
+            same = np.array([plans[0][n] == plans[1][n] for n in range(len(logits))])[at]
+            if same.any():
+                largest["action"] = max(largest["action"], float(np.abs(actions - others)[same].max()))
+    policy.acting = exact
+    return {key: float(f"{value:.3g}") for key, value in largest.items()}
+
+
+class Encoder:
+    """The trajectory encoder of a bundle, out of its initializers, in PyTorch."""
+
+    def __init__(self, model, acting):
+        named = {row.name.removeprefix("weights/"): torch.from_numpy(numpy_helper.to_array(row).copy()) for row in model.graph.initializer}
+        self.relative = any(name.endswith("encoder.first") for name in named)
+        self.mean, self.codes = named["observation_mean"], acting.codes
+        gates = lambda array: torch.cat([array.chunk(4)[gate] for gate in (0, 2, 3, 1)])  # ONNX: i, o, f, c; PyTorch: i, f, c, o
+        inputs, recurrent = (gates(named[f"encoder.lstm.{part}"][0]) for part in ("input", "recurrent"))
+        biases = [gates(half) for half in named["encoder.lstm.bias"][0].chunk(2)]
+        self.weights = [inputs, recurrent, *biases]
+        self.hidden = recurrent.shape[1]
+        names = sorted({int(name.split(".")[2]) for name in named if name.startswith("encoder.mlp.")})
+        self.mlp = [(named[f"encoder.mlp.{n}.weight"], named[f"encoder.mlp.{n}.bias"]) for n in names]
+        slopes = [row.f for node in model.graph.node if node.op_type == "LeakyRelu" and node.output[0].startswith("trajectory_encoder/") for row in node.attribute if row.name == "alpha"]
+        self.slope = slopes[0] if slopes else 0.01
+
+    @torch.no_grad()
+    def plans(self, observations, actions):
+        """[n, H, O], [n, H, A] -> nearest code [n], and by how much farther the second is, relative to the nearest's squared distance."""
+        observations, actions = torch.from_numpy(observations.copy()), torch.from_numpy(actions.copy())
+        shown = observations - (observations[:, :1] if self.relative else self.mean)
+        start = torch.zeros(1, len(shown), self.hidden)
+        joined = torch.cat([shown, actions], -1)
+        x = torch._VF.lstm(joined, (start, start), self.weights, True, 1, 0.0, False, False, True)[0][:, -1]
+        for number, (weight, bias) in enumerate(self.mlp):
+            x = F.linear(x, weight, bias)
+            if number + 1 < len(self.mlp):
+                x = F.leaky_relu(x, self.slope)
+        distance = (x[:, None] - self.codes[None]).square().sum(-1)
+        near = distance.topk(min(2, distance.shape[1]), largest=False).values
+        margins = (near[:, -1] - near[:, 0]) / near[:, 0].clamp(min=1e-12)
+        return distance.argmin(-1).tolist(), [float(f"{margin:.4g}") for margin in margins.tolist()]
+
+
+@torch.no_grad()
+def add(head, rows, model, contract, policy):
+    """Adds contract and noise to a reference's heading, logits and encodings to its traces; refuses traces of another policy."""
+    lens = len(policy.acting.normalizer.mean), len(policy.low)
+    horizon = head["horizon"]
+    try:
+        encoder = Encoder(model, policy.acting)
+    except KeyError:
+        encoder = None  # a bundle without one
+    for index, episode in _traced(rows):
+        logits, actions = _ask(policy, index, episode)
+        trace, where = episode["trace"], f"{rows[index]['id']}, episode {episode['episode']}"
+        done = _numbers(trace["actions"], "<f4", lens[1])
+        if [int(row.argmax()) for row in logits] != episode["plans"] and min(episode["margins"], default=0) > SAME_PLAN:
+            raise config.UserError(f"{where}: the recorded plans are not this policy's; make the reference again")
+        if policy.plans == episode["plans"] and np.abs(actions - done).max(initial=0) > SAME_ACTION:
+            raise config.UserError(f"{where}: the recorded actions are not this policy's; make the reference again")
+        if logits:
+            trace["logits"] = _text([row.numpy() for row in logits], "<f4")
+        segments = len(done) // horizon
+        if encoder and segments:
+            cut = lambda key, columns: _numbers(trace[key], "<f4", columns)[: segments * horizon].reshape(segments, horizon, columns)
+            trace["encoded"], trace["encoded_margins"] = encoder.plans(cut("observations", lens[0]), cut("actions", lens[1]))
+        elif encoder:
+            trace["encoded"], trace["encoded_margins"] = [], []
+    head["contract"] = contract
+    head["float_noise"] = float_noise(policy, rows)
+
+
+def complete(bundle, path, run=None):
+    """Adds to the reference at `path`, made by an earlier version, what it does not record; its rollouts stay as they are."""
+    from . import reference
+
+    model = onnx.load(bundle)
+    contract = json.loads({row.key: row.value for row in model.metadata_props}["lads.contract"])
+    head = json.loads(Path(path).read_text())
+    rows = head.pop("instructions")
+    if [row["text"] for row in rows] != [row["text"] for row in contract["instructions"]]:
+        raise config.UserError(f"{path}: the instructions are not those of {bundle}; name the bundle that it is of")
+    torch.set_num_threads(1)
+    acting, weights_from = reference._acting(model, contract, run)
+    words, _, _ = reference._words(model, contract)
+    add(head, rows, model, contract, reference.FullSequencePolicy(acting, contract, words))
+    head["purpose_sha256"] = reference.purpose_sha256(contract)
+    head["format_version"] = reference.FORMAT_VERSION
+    head["logits_from"] = weights_from
+    write_atomically(path, reference._text(head, rows).encode())

@@ -1,0 +1,404 @@
+//! The certificate: what was compared, what came out, and the verdict with its reasons. Its JSON form is documented in
+//! certificate.schema.json.
+//!
+//! The rules, in this order:
+//!
+//! 1. **DIFFERENT** if the contract says otherwise than the reference's did, or the image otherwise than the bundle; if the policy answers the
+//!    reference's questions otherwise (a logit or an action beyond its tolerance, another plan although the reference's margin is no close call,
+//!    decisions at other steps, another encoding of a trajectory); if the reference's actions lead through other states; or if a test finds a paired
+//!    difference larger than its margin (1 % over all of them together).
+//! 2. **EQUIVALENT** if none of this holds, contract, actions, logits and states were compared at all, and every paired difference is
+//!    equivalent: two one-sided tests at 5 %, within 0.05 for rates and 0.1 for the N-rate.
+//! 3. **INCONCLUSIVE** otherwise; then it says how many more episodes of each instruction would decide, if it stays as it is.
+//!
+//! A difference that is significant (McNemar's test, 5 % over all rates together) and yet negligible is noted as such: with enough episodes
+//! every difference is significant, and the margin says which ones matter. What was not looked at is listed.
+//!
+//! Paired differences are judged because run and reference are the same episodes; differences as of two independent samples stand beside
+//! them, for comparisons with numbers from elsewhere.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use super::answers::Answers;
+use super::contract::{Compared, FieldDifference};
+use super::pairs::Paired;
+use super::physics::Physics;
+
+/// Value of the JSON's `format`.
+pub const FORMAT: &str = "lads-certificate";
+/// Version of the JSON form; changes when a field changes its meaning or goes.
+pub const FORMAT_VERSION: u32 = 2;
+
+/// Chance of McNemar's tests together to call something different that is not.
+const SIGNIFICANCE: f64 = 0.05;
+/// Chance of all tests of a difference beyond its margin together to find one that is not.
+const DIFFERENCE: f64 = 0.01;
+/// So many of a list of differing fields are named.
+const NAMED: usize = 5;
+
+/// What a verification says in a word.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "UPPERCASE")]
+pub enum Verdict {
+    /// The policy is the reference's, as far as it was looked.
+    Equivalent,
+    /// It is another.
+    Different,
+    /// The episodes were too few to tell.
+    Inconclusive,
+}
+
+impl Verdict {
+    /// Exit code of the program that found it.
+    pub fn exit_code(self) -> u8 {
+        match self {
+            Self::Equivalent => 0,
+            Self::Different => 1,
+            Self::Inconclusive => 3,
+        }
+    }
+
+    /// In capitals.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Equivalent => "EQUIVALENT",
+            Self::Different => "DIFFERENT",
+            Self::Inconclusive => "INCONCLUSIVE",
+        }
+    }
+}
+
+/// Where the reference came from.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ReferenceUsed {
+    /// SHA-256 of the bundle whose weights it ran.
+    pub bundle_sha256: String,
+    /// Whether that is the verified bundle.
+    pub same_bundle: bool,
+    /// Where its weights came from.
+    pub weights_from: String,
+    /// Where its word embeddings came from.
+    pub words_from: String,
+    /// Where the weights came from that made its logits, if those were added later.
+    pub logits_from: Option<String>,
+    /// Versions of everything that took part.
+    pub versions: BTreeMap<String, String>,
+}
+
+impl ReferenceUsed {
+    /// Whether the weights were read back from the bundle that is to be proved, instead of from where they were trained.
+    fn circular(&self) -> bool {
+        let from = |source: &str| source.contains("bundle");
+        from(&self.weights_from) || self.logits_from.as_deref().is_some_and(from)
+    }
+}
+
+/// What was run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Setting {
+    /// Id of the environment.
+    pub environment: String,
+    /// SHA-256 of the verified bundle.
+    pub bundle_sha256: String,
+    /// SHA-256 of the program image that ran: what may be put into the machine.
+    pub image_sha256: String,
+    /// The rule that decided plans, the contract's.
+    pub decision: String,
+    /// The instruction set that the kernels ran on.
+    pub isa: String,
+    /// Seed of the whole run, the reference's.
+    pub seed: u64,
+    /// Noise level, the reference's.
+    pub noise: String,
+    /// Episodes of each instruction.
+    pub episodes_per_instruction: u32,
+    /// Instructions.
+    pub instructions: usize,
+    /// Versions of what ran.
+    pub versions: BTreeMap<String, String>,
+}
+
+/// A whole verification.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Certificate {
+    /// [`FORMAT`].
+    pub format: &'static str,
+    /// [`FORMAT_VERSION`].
+    pub format_version: u32,
+    /// The verdict.
+    pub verdict: Verdict,
+    /// Why, one sentence each.
+    pub reasons: Vec<String>,
+    /// Episodes of each instruction that would decide, beyond those that were run; only where inconclusive, and only if any number would.
+    pub more_episodes_per_instruction: Option<u32>,
+    /// What was run.
+    pub setting: Setting,
+    /// What it was compared with.
+    pub reference: ReferenceUsed,
+    /// What is to be known beside the verdict, one sentence each.
+    pub notes: Vec<String>,
+    /// What nothing of this says anything about.
+    pub not_covered: Vec<String>,
+    /// The contract, field by field.
+    pub contract: Compared,
+    /// Open loop, the policy alone.
+    pub policy: Answers,
+    /// Open loop, the environment alone.
+    pub environment: Physics,
+    /// Closed loop, both together.
+    pub rollouts: Paired,
+}
+
+impl Certificate {
+    /// Judges what was found; `not_covered` is what the program that ran it knows that it did not look at.
+    pub fn new(
+        setting: Setting,
+        reference: ReferenceUsed,
+        contract: Compared,
+        policy: Answers,
+        environment: Physics,
+        rollouts: Paired,
+        mut not_covered: Vec<String>,
+    ) -> Self {
+        let different = differences(&contract, &policy, &environment, &rollouts);
+        let mut undecided = undecided(&rollouts);
+        let uncompared = uncompared(&contract, &policy, &environment);
+        not_covered.extend(unseen(&reference, &policy));
+        let more_would_help = uncompared.is_empty();
+        undecided.extend(uncompared);
+        let (verdict, reasons) = if !different.is_empty() {
+            (Verdict::Different, different)
+        } else if undecided.is_empty() {
+            (
+                Verdict::Equivalent,
+                vec![agreement(&policy, &environment, &rollouts)],
+            )
+        } else {
+            (Verdict::Inconclusive, undecided)
+        };
+        let more = (verdict == Verdict::Inconclusive && more_would_help)
+            .then(|| more_episodes(&rollouts, setting.episodes_per_instruction))
+            .flatten();
+        let notes = notes(&reference, &contract, &policy, &rollouts);
+        Self {
+            format: FORMAT,
+            format_version: FORMAT_VERSION,
+            verdict,
+            reasons,
+            more_episodes_per_instruction: more,
+            setting,
+            reference,
+            notes,
+            not_covered,
+            contract,
+            policy,
+            environment,
+            rollouts,
+        }
+    }
+}
+
+fn differences(
+    contract: &Compared,
+    policy: &Answers,
+    environment: &Physics,
+    rollouts: &Paired,
+) -> Vec<String> {
+    let mut reasons = Vec::new();
+    let fields = [
+        (
+            "the contract differs from the reference's",
+            &contract.differing,
+        ),
+        (
+            "the image that ran differs from the bundle's contract",
+            &contract.image_differing,
+        ),
+    ];
+    for (what, differing) in fields
+        .into_iter()
+        .filter(|(_, differing)| !differing.is_empty())
+    {
+        reasons.push(format!("{what} in {}", list(differing)));
+    }
+    if let Some(answer) = &policy.first_difference {
+        reasons.push(format!(
+            "the policy answers otherwise in {} of {} replayed episodes, first in {answer}",
+            policy.differing_episodes, policy.episodes
+        ));
+    }
+    if let Some(answer) = &environment.first_difference {
+        reasons.push(format!(
+            "the environment moves otherwise under the reference's actions, first in {answer}"
+        ));
+    }
+    // Bonferroni's correction: all tests together have the level.
+    let level = DIFFERENCE / (rollouts.rates.len() + 1) as f64;
+    for rate in rollouts
+        .rates
+        .iter()
+        .filter(|rate| rate.paired.beyond_margin(level))
+    {
+        let [run, reference] = rate.shares();
+        reasons.push(format!(
+            "{}: {run:.3} against {reference:.3}, beyond the margin",
+            rate.name
+        ));
+    }
+    let n_rate = &rollouts.n_rate;
+    if n_rate.paired.beyond_margin(level) {
+        reasons.push(format!(
+            "N-rate: {:.3} against {:.3}, beyond the margin",
+            n_rate.run, n_rate.reference
+        ));
+    }
+    reasons
+}
+
+/// The first of the fields that differ, and how many more there are.
+fn list(differing: &[FieldDifference]) -> String {
+    let named = differing.iter().take(NAMED);
+    let named = named.map(|it| format!("{} ({}, the other {})", it.field, it.run, it.reference));
+    let named = named.collect::<Vec<_>>().join(", ");
+    match differing.len().saturating_sub(NAMED) {
+        0 => named,
+        more => format!("{named} and {more} more"),
+    }
+}
+
+/// What is to be known beside the verdict.
+fn notes(
+    reference: &ReferenceUsed,
+    contract: &Compared,
+    policy: &Answers,
+    rollouts: &Paired,
+) -> Vec<String> {
+    let mut notes = Vec::new();
+    if reference.circular() {
+        notes.push(format!(
+            "the reference's weights come from {}{}: a fault in how they got into the bundle would be in both; a reference from the run's checkpoint proves \
+             that too",
+            reference.weights_from,
+            reference.logits_from.as_ref().map_or(String::new(), |from| format!(", its logits' from {from}"))
+        ));
+    }
+    if !contract.history.is_empty() {
+        notes.push(format!(
+            "not judged, because it says only where the policy is from: {}",
+            list(&contract.history)
+        ));
+    }
+    if policy.renumbered {
+        notes.push(
+            "the plans are the reference's under other numbers, throughout: harmless".to_owned(),
+        );
+    }
+    let level = SIGNIFICANCE / rollouts.rates.len().max(1) as f64;
+    for rate in rollouts
+        .rates
+        .iter()
+        .filter(|rate| rate.mcnemar_p < level && rate.paired.equivalent)
+    {
+        let [run, reference] = rate.shares();
+        notes.push(format!(
+            "{}: {run:.4} against {reference:.4} is significant (McNemar's p = {:.1e}) and negligible: inside the margin of {}",
+            rate.name, rate.mcnemar_p, rate.paired.margin
+        ));
+    }
+    notes
+}
+
+/// What nothing was found about: silence is no agreement.
+fn uncompared(contract: &Compared, policy: &Answers, environment: &Physics) -> Vec<String> {
+    let counts = [
+        ("action", policy.compared_steps),
+        ("logit", policy.compared_decisions),
+        ("state", environment.states),
+    ];
+    let none = counts.iter().filter(|(_, compared)| *compared == 0);
+    let none = none.map(|(what, _)| {
+        format!("no {what} was compared: the reference's traces hold none that could be")
+    });
+    let unrecorded = contract.fields.is_empty().then(|| {
+        "the contract was not compared: the reference records none; complete it: python -m lads_exporter reference --complete".to_owned()
+    });
+    none.chain(unrecorded).collect()
+}
+
+/// What no verification looks at, and what this one could not.
+fn unseen(reference: &ReferenceUsed, policy: &Answers) -> Vec<String> {
+    let mut unseen = vec![
+        "observations other than those of the reference's episodes".to_owned(),
+        "what a machine adds around the policy: guard, fallback, sensors, actuators, timing"
+            .to_owned(),
+        "the golden episode and its tolerance: the self-test replays it before a policy runs"
+            .to_owned(),
+    ];
+    if policy.compared_segments == 0 {
+        unseen.push("the trajectory encoder, which plans are read from executed motion with: the reference records no encodings, or there is none".to_owned());
+    }
+    if reference.circular() {
+        unseen
+            .push("export of the weights: the reference's were read back from a bundle".to_owned());
+    }
+    if reference.words_from.contains("bundle") {
+        unseen.push("the word embeddings: the reference's were read from a bundle too".to_owned());
+    }
+    unseen
+}
+
+fn undecided(rollouts: &Paired) -> Vec<String> {
+    let rates = rollouts
+        .rates
+        .iter()
+        .map(|rate| (rate.name.as_str(), &rate.paired));
+    rates
+        .chain([("N-rate", &rollouts.n_rate.paired)])
+        .filter(|(_, difference)| !difference.equivalent)
+        .map(|(name, difference)| {
+            format!(
+                "{name}: the difference is {:+.3} (90 % interval {:+.3} to {:+.3}), not shown to be inside ±{} (p = {:.3})",
+                difference.estimate,
+                difference.interval_90.0,
+                difference.interval_90.1,
+                difference.margin,
+                difference.p_equivalence.unwrap_or(1.0)
+            )
+        })
+        .collect()
+}
+
+fn agreement(policy: &Answers, environment: &Physics, rollouts: &Paired) -> String {
+    let physics = if environment.identical_bits {
+        "the same bits".to_owned()
+    } else {
+        format!("within {:.1e}", environment.largest_state_difference)
+    };
+    format!(
+        "logits within {:.1e} over {} decisions, actions within {:.1e} over {} steps, states {physics} over {} states, {:.1} % of {} episodes with identical completions",
+        policy.largest_logit_difference,
+        policy.compared_decisions,
+        policy.largest_action_difference,
+        policy.compared_steps,
+        environment.states,
+        100.0 * rollouts.identical_completions,
+        rollouts.episodes
+    )
+}
+
+/// How many more episodes of each instruction narrow every interval into its margin; `None` where some estimate leaves no room.
+fn more_episodes(rollouts: &Paired, episodes: u32) -> Option<u32> {
+    let differences = rollouts.rates.iter().map(|rate| &rate.paired);
+    let growth = differences
+        .chain([&rollouts.n_rate.paired])
+        .filter(|difference| !difference.equivalent)
+        .map(|difference| difference.growth_needed)
+        .try_fold(1.0_f64, |most, growth| Some(most.max(growth?)))?;
+    let more = ((growth - 1.0) * f64::from(episodes)).ceil();
+    Some((more as u32).max(1))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,281 @@
+//! Does it achieve the same? The same episodes, each driven by the policy itself, beside the reference's.
+//!
+//! Closed loop with the reference's seeds: paired, because episode `n` of an instruction starts alike and sees the same noise in both.
+//! Nothing here can fail.
+
+use serde::Serialize;
+
+use super::numbering::Numbering;
+use super::reference::Reference;
+use super::statistics::{Counts, Difference, Pairs};
+use crate::episode::Episode;
+
+/// Largest negligible difference of a success rate.
+pub const RATE_MARGIN: f64 = 0.05;
+/// Largest negligible difference of the N-rate, the mean number of completed sub-tasks.
+pub const N_RATE_MARGIN: f64 = 0.1;
+/// Difference of an observation element up to which two trajectories agree: rounding of observations, before physics has made more of it.
+pub const TRAJECTORY_TOLERANCE: f64 = 1e-6;
+
+/// Difference of a state element (rad or m) up to which two episodes ended alike.
+pub const FINAL_TOLERANCE: f64 = 1e-3;
+
+/// One rate in both.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RatePair {
+    /// Sub-task, or `full success`.
+    pub name: String,
+    /// Pairs of episodes by outcome.
+    pub pairs: Pairs,
+    /// Two-sided p-value of McNemar's exact test.
+    pub mcnemar_p: f64,
+    /// Difference, the pairing used; this one is judged.
+    pub paired: Difference,
+    /// Difference as of two samples.
+    pub unpaired: Difference,
+}
+
+/// The N-rate in both.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct NRatePair {
+    /// The run's.
+    pub run: f64,
+    /// The reference's.
+    pub reference: f64,
+    /// Difference, the pairing used; this one is judged.
+    pub paired: Difference,
+    /// Difference as of two samples.
+    pub unpaired: Difference,
+}
+
+/// All episodes, beside the reference's.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Paired {
+    /// Pairs of episodes.
+    pub episodes: usize,
+    /// Share of them in which the same sub-tasks were completed, in the same order.
+    pub identical_completions: f64,
+    /// Share in which they were also completed at the same control steps.
+    pub identical_steps: f64,
+    /// Share with the same plans from beginning to end.
+    pub identical_plans: f64,
+    /// Share whose noise-free states at the end differ by less than [`FINAL_TOLERANCE`].
+    pub same_final_state: f64,
+    /// First control steps at which plans differ, median over the episodes in which they do; `None` where they never do.
+    pub median_first_plan_difference: Option<usize>,
+    /// The earliest of them.
+    pub earliest_plan_difference: Option<usize>,
+    /// Largest absolute action difference in traced episodes while trajectories agree.
+    pub largest_action_difference: f64,
+    /// Control steps over which trajectories of traced episodes agreed, and all of them.
+    pub agreeing_steps: [usize; 2],
+    /// Number of completed sub-tasks.
+    pub n_rate: NRatePair,
+    /// Each sub-task that is commanded, then full success.
+    pub rates: Vec<RatePair>,
+}
+
+impl Paired {
+    /// Compares the episodes of each instruction with the reference's, whose plans have the run's numbers by `numbering`; `sub_tasks` are the
+    /// environment's, `lens` those of observation and action.
+    pub fn new<'r>(
+        (reference, numbering): (&Reference, &Numbering),
+        sub_tasks: &[&str],
+        episodes: impl IntoIterator<Item = Episodes<'r>>,
+        traces: impl IntoIterator<Item = Traced<'r>>,
+        lens: [usize; 2],
+    ) -> Self {
+        let mut sum = Sum {
+            outcomes: vec![Pairs::default(); sub_tasks.len() + 1],
+            ..Sum::default()
+        };
+        for ours in episodes {
+            let Some(theirs) = reference.instructions.get(ours.instruction) else {
+                continue;
+            };
+            for (run, recorded) in ours.episodes.iter().zip(&theirs.episodes) {
+                let decided = Decided {
+                    plans: recorded
+                        .plans
+                        .iter()
+                        .map(|&plan| numbering.of_run(plan))
+                        .collect(),
+                    at: reference.decided_at(recorded),
+                };
+                sum.add(run, recorded, ours.commanded, sub_tasks, &decided);
+            }
+        }
+        for ours in traces {
+            let instruction = reference.instructions.get(ours.instruction);
+            let recorded = instruction.and_then(|row| row.episodes.get(ours.episode));
+            if let Some(theirs) = recorded.and_then(|episode| episode.trace.as_ref()) {
+                sum.follow(&ours.steps, theirs, lens);
+            }
+        }
+        sum.finish(sub_tasks)
+    }
+}
+
+/// The run's episodes of one instruction.
+#[derive(Debug, Clone, Copy)]
+pub struct Episodes<'r> {
+    /// Index of the instruction.
+    pub instruction: usize,
+    /// The environment's indices of the sub-tasks that it commands.
+    pub commanded: &'r [usize],
+    /// In order of their numbers.
+    pub episodes: &'r [Episode],
+}
+
+/// One of the run's episodes, step by step.
+#[derive(Debug, Clone)]
+pub struct Traced<'r> {
+    /// Index of the instruction.
+    pub instruction: usize,
+    /// Number of the episode.
+    pub episode: usize,
+    /// What was seen and done at each control step.
+    pub steps: Vec<[&'r [f32]; 2]>,
+}
+
+/// The reference's plans in the run's numbers, and the control steps at which they were decided.
+struct Decided {
+    plans: Vec<u32>,
+    at: Vec<usize>,
+}
+
+#[derive(Default)]
+struct Sum {
+    episodes: usize,
+    completions: usize,
+    steps: usize,
+    final_states: usize,
+    first_plan_differences: Vec<usize>,
+    counts: Counts,
+    outcomes: Vec<Pairs>,
+    largest_action_difference: f64,
+    agreeing_steps: [usize; 2],
+}
+
+impl Sum {
+    fn add(
+        &mut self,
+        run: &Episode,
+        recorded: &super::reference::Episode,
+        commanded: &[usize],
+        sub_tasks: &[&str],
+        decided: &Decided,
+    ) {
+        self.episodes += 1;
+        let ours: Vec<_> = run
+            .completions
+            .iter()
+            .map(|c| (sub_tasks[c.sub_task], c.step))
+            .collect();
+        let theirs: Vec<_> = recorded
+            .completions
+            .iter()
+            .map(|c| (c.sub_task.as_str(), c.step))
+            .collect();
+        let names = |list: &[(&str, usize)]| {
+            list.iter()
+                .map(|(name, _)| (*name).to_owned())
+                .collect::<Vec<_>>()
+        };
+        self.completions += usize::from(names(&ours) == names(&theirs));
+        self.steps += usize::from(ours == theirs && run.steps == recorded.steps);
+        let mut ends = run.final_state.iter().zip(&recorded.final_state);
+        self.final_states += usize::from(ends.all(|(a, b)| (a - b).abs() < FINAL_TOLERANCE));
+        if run.plans != decided.plans {
+            let both = run.plans.iter().zip(&decided.plans);
+            let same = both.take_while(|(a, b)| a == b).count();
+            let step = decided.at.get(same).copied();
+            self.first_plan_differences
+                .push(step.unwrap_or(recorded.steps));
+        }
+        let done = |list: &[(&str, usize)], index: usize| {
+            list.iter().any(|(name, _)| *name == sub_tasks[index])
+        };
+        let mut completed = [0, 0];
+        for &index in commanded {
+            let (a, b) = (done(&ours, index), done(&theirs, index));
+            completed[0] += usize::from(a);
+            completed[1] += usize::from(b);
+            self.outcomes[index].add(a, b);
+        }
+        self.counts.add(completed[0], completed[1], commanded.len());
+        if let Some(full) = self.outcomes.last_mut() {
+            full.add(run.success, recorded.success);
+        }
+    }
+
+    /// Compares actions as long as both trajectories are the same.
+    fn follow(
+        &mut self,
+        ours: &[[&[f32]; 2]],
+        theirs: &super::reference::Trace,
+        [observation_len, action_len]: [usize; 2],
+    ) {
+        let seen = theirs.observations.chunks_exact(observation_len);
+        let done = theirs.actions.chunks_exact(action_len);
+        self.agreeing_steps[1] += done.len();
+        let largest = |a: &[f32], b: &[f32]| {
+            a.iter()
+                .zip(b)
+                .map(|(a, b)| f64::from((a - b).abs()))
+                .fold(0.0, f64::max)
+        };
+        for ([observation, action], (seen, done)) in ours.iter().zip(seen.zip(done)) {
+            if largest(observation, seen) > TRAJECTORY_TOLERANCE {
+                return;
+            }
+            self.agreeing_steps[0] += 1;
+            self.largest_action_difference =
+                self.largest_action_difference.max(largest(action, done));
+        }
+    }
+
+    fn finish(mut self, sub_tasks: &[&str]) -> Paired {
+        let share = |count: usize| count as f64 / self.episodes.max(1) as f64;
+        self.first_plan_differences.sort_unstable();
+        let differing = &self.first_plan_differences;
+        let [run, reference] = self.counts.means();
+        let names = sub_tasks.iter().copied().chain(["full success"]);
+        let rates = names
+            .zip(&self.outcomes)
+            .filter(|(_, pairs)| !pairs.is_empty());
+        Paired {
+            episodes: self.episodes,
+            identical_completions: share(self.completions),
+            identical_steps: share(self.steps),
+            identical_plans: share(self.episodes - differing.len()),
+            same_final_state: share(self.final_states),
+            median_first_plan_difference: differing.get(differing.len() / 2).copied(),
+            earliest_plan_difference: differing.first().copied(),
+            largest_action_difference: self.largest_action_difference,
+            agreeing_steps: self.agreeing_steps,
+            n_rate: NRatePair {
+                run,
+                reference,
+                paired: self.counts.paired(N_RATE_MARGIN),
+                unpaired: self.counts.unpaired(N_RATE_MARGIN),
+            },
+            rates: rates
+                .map(|(name, &pairs)| RatePair {
+                    name: name.to_owned(),
+                    pairs,
+                    mcnemar_p: pairs.mcnemar(),
+                    paired: pairs.paired(RATE_MARGIN),
+                    unpaired: pairs.unpaired(RATE_MARGIN),
+                })
+                .collect(),
+        }
+    }
+}
+
+impl RatePair {
+    /// Rates of run and reference with nothing else.
+    pub fn shares(&self) -> [f64; 2] {
+        self.pairs.shares()
+    }
+}

@@ -1,0 +1,387 @@
+//! Reference rollouts: what `lads_exporter reference` wrote, read and checked.
+//!
+//! Invariants of a [`Reference`] that was read: every instruction has the same number of episodes, numbered from 0, at least one of them
+//! traced; every trace holds as many observations, actions and states as its lengths say. What can fail: no such file, another format or
+//! version of it, numbers that contradict each other. Whether it is of *this* policy and environment is [`Reference::check`]'s to say,
+//! by name.
+
+use std::path::{Path, PathBuf};
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use serde::Deserialize;
+use serde_json::Value;
+use thiserror::Error;
+
+use super::purpose;
+
+/// Value of the JSON's `format`.
+const FORMAT: &str = "lads-reference";
+/// Versions of the JSON form that are read. The first records neither contract nor logits, so that less can be proved by it.
+const FORMAT_VERSIONS: [u32; 2] = [1, 2];
+
+/// Why a reference is refused.
+#[derive(Debug, Error)]
+pub enum ReferenceError {
+    /// The file cannot be read.
+    #[error("{path}: cannot be read ({source}); name a reference, or make one: make reference", path = path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The file is no reference, or is damaged.
+    #[error("{path}: {problem}; make it again: make reference", path = path.display())]
+    Content {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        problem: String,
+    },
+    /// The reference is of something else.
+    #[error("{path}: the reference's {field} is {reference}, {whose} is {other}; use the reference that was made for this", path = path.display())]
+    Other {
+        /// The file.
+        path: PathBuf,
+        /// What differs.
+        field: &'static str,
+        /// What the reference says.
+        reference: String,
+        /// Whose value it is compared with.
+        whose: &'static str,
+        /// That value.
+        other: String,
+    },
+}
+
+/// What the exporter's reference rollouts found.
+#[derive(Debug, Deserialize)]
+pub struct Reference {
+    format: String,
+    format_version: u32,
+    /// SHA-256 of the bundle whose weights were rolled out.
+    pub bundle_sha256: String,
+    purpose_sha256: String,
+    environment: EnvironmentUsed,
+    /// Seed of the whole run.
+    pub seed: u64,
+    /// Noise level, as the environment names it.
+    pub noise: String,
+    /// Control steps between two decisions.
+    pub horizon: usize,
+    /// Episodes of each instruction.
+    pub episodes_per_instruction: u32,
+    /// How many of these have a trace.
+    pub traced_episodes: u32,
+    /// Where the weights came from.
+    pub weights_from: String,
+    /// Where the embeddings of the words came from.
+    pub words_from: String,
+    /// The contract that was rolled out; `None` in files of version 1.
+    pub contract: Option<Value>,
+    /// Where the weights behind the recorded logits came from, if they were added later.
+    pub logits_from: Option<String>,
+    /// What float noise does to the reference itself.
+    pub float_noise: Option<FloatNoise>,
+    /// Versions of everything that took part.
+    pub versions: std::collections::BTreeMap<String, String>,
+    /// In the contract's order.
+    pub instructions: Vec<Instruction>,
+    #[serde(skip)]
+    path: PathBuf,
+}
+
+#[derive(Debug, Deserialize)]
+struct EnvironmentUsed {
+    id: String,
+    version: String,
+}
+
+/// What small noise on all weights of the reference does to its own answers to the traced questions: the largest differences.
+#[derive(Debug, Clone, Copy, Default, Deserialize)]
+pub struct FloatNoise {
+    /// Standard deviation of the noise, relative to each weight.
+    pub relative: f64,
+    /// Of an action element.
+    pub action: f64,
+    /// Of a logit, up to a constant.
+    pub logit: f64,
+}
+
+/// All episodes of one instruction.
+#[derive(Debug, Deserialize)]
+pub struct Instruction {
+    /// Id in the contract.
+    pub id: String,
+    /// Its words.
+    pub text: String,
+    /// In order of their numbers.
+    pub episodes: Vec<Episode>,
+}
+
+/// One episode.
+#[derive(Debug, Deserialize)]
+pub struct Episode {
+    #[serde(rename = "episode")]
+    number: u64,
+    /// Control steps executed.
+    pub steps: usize,
+    /// Whether the instruction was carried out.
+    pub success: bool,
+    /// In order of time.
+    pub completions: Vec<Completion>,
+    /// Plan indices in the order in which they were decided.
+    pub plans: Vec<u32>,
+    /// The control steps at which they were decided; left out where there is one in each horizon from the episode's start.
+    pub decided_at: Option<Vec<usize>>,
+    /// Largest logit minus second largest, of each decision.
+    pub margins: Vec<f64>,
+    /// Noise-free state after the last step.
+    pub final_state: Vec<f64>,
+    /// What was seen and done, in the first episodes of each instruction.
+    pub trace: Option<Trace>,
+}
+
+/// A completed sub-task.
+#[derive(Debug, Deserialize)]
+pub struct Completion {
+    /// Its name.
+    pub sub_task: String,
+    /// Control step, from 1, after which it was done.
+    pub step: usize,
+}
+
+/// An episode step by step.
+#[derive(Debug, Deserialize)]
+#[serde(try_from = "Written")]
+pub struct Trace {
+    /// What the policy saw, `[steps, O]`.
+    pub observations: Vec<f32>,
+    /// What it did, `[steps, A]`.
+    pub actions: Vec<f32>,
+    /// Noise-free states before the first steps' actions, `[n, O]`.
+    pub states: Vec<f64>,
+    /// Logits of each decision, `[decisions, M]`; empty where none were recorded.
+    pub logits: Vec<f32>,
+    /// The plan that the trajectory encoder sees in each full horizon.
+    pub encoded: Option<Vec<u32>>,
+    /// How much farther the second nearest code was, relative to the nearest's squared distance.
+    pub encoded_margins: Option<Vec<f64>>,
+}
+
+#[derive(Deserialize)]
+struct Written {
+    observations: String,
+    actions: String,
+    states: String,
+    #[serde(default)]
+    logits: String,
+    encoded: Option<Vec<u32>>,
+    encoded_margins: Option<Vec<f64>>,
+}
+
+impl Trace {
+    /// The logits of one of `decisions` decisions; empty where none were recorded.
+    pub fn logits_of(&self, number: usize, decisions: usize) -> &[f32] {
+        let len = self.logits.len() / decisions.max(1);
+        self.logits
+            .get(number * len..(number + 1) * len)
+            .unwrap_or_default()
+    }
+}
+
+impl TryFrom<Written> for Trace {
+    type Error = String;
+
+    fn try_from(written: Written) -> Result<Self, String> {
+        Ok(Self {
+            observations: numbers(&written.observations, f32::from_le_bytes)?,
+            actions: numbers(&written.actions, f32::from_le_bytes)?,
+            states: numbers(&written.states, f64::from_le_bytes)?,
+            logits: numbers(&written.logits, f32::from_le_bytes)?,
+            encoded: written.encoded,
+            encoded_margins: written.encoded_margins,
+        })
+    }
+}
+
+/// Little-endian numbers in base64.
+fn numbers<T, const N: usize>(text: &str, read: fn([u8; N]) -> T) -> Result<Vec<T>, String> {
+    let bytes = STANDARD.decode(text).map_err(|error| error.to_string())?;
+    match bytes.as_chunks::<N>() {
+        (whole, []) => Ok(whole.iter().map(|&chunk| read(chunk)).collect()),
+        _ => Err(format!(
+            "a trace of {} bytes is no whole number of {N}-byte numbers",
+            bytes.len()
+        )),
+    }
+}
+
+/// What is to be verified, as far as a reference must be of the same.
+#[derive(Debug, Clone)]
+pub struct Subject<'s> {
+    /// The contract as JSON, as it stands in the bundle.
+    pub contract: &'s str,
+    /// Texts of the contract's instructions.
+    pub instructions: Vec<&'s str>,
+    /// Id of the environment.
+    pub environment_id: &'s str,
+    /// The environment's version.
+    pub environment_version: &'s str,
+    /// Elements of its observations.
+    pub observation_len: usize,
+    /// Elements of its actions.
+    pub action_len: usize,
+}
+
+impl Reference {
+    /// Reads and checks a file.
+    pub fn open(path: &Path) -> Result<Self, ReferenceError> {
+        let bytes = lads_host::input::read(path).map_err(|source| ReferenceError::File {
+            path: path.into(),
+            source,
+        })?;
+        Self::read(&bytes, path)
+    }
+
+    /// Reads and checks the bytes of a file; `path` names it where they are refused.
+    pub fn read(bytes: &[u8], path: &Path) -> Result<Self, ReferenceError> {
+        let content = |problem: String| ReferenceError::Content {
+            path: path.into(),
+            problem,
+        };
+        let mut read: Self = serde_json::from_slice(bytes)
+            .map_err(|error| content(format!("not a reference of lads ({error})")))?;
+        path.clone_into(&mut read.path);
+        if read.format != FORMAT || !FORMAT_VERSIONS.contains(&read.format_version) {
+            return Err(content(format!(
+                "its format is {} {}, this program reads {FORMAT} 1 and 2",
+                read.format, read.format_version
+            )));
+        }
+        read.consistent().map_err(content)?;
+        Ok(read)
+    }
+
+    fn consistent(&self) -> Result<(), String> {
+        if self.instructions.is_empty() || self.horizon == 0 || self.traced_episodes == 0 {
+            return Err("it has no instruction, no horizon or no traced episode".to_owned());
+        }
+        for instruction in &self.instructions {
+            let wrong = |what: &str| Err(format!("instruction '{}': {what}", instruction.id));
+            if instruction.episodes.len() != self.episodes_per_instruction as usize {
+                return wrong("its number of episodes is not the heading's");
+            }
+            for (number, episode) in (0..).zip(&instruction.episodes) {
+                let decisions = self.decided_at(episode);
+                let in_order = decisions.is_sorted()
+                    && decisions.last().is_none_or(|&last| last < episode.steps);
+                let logits = episode.trace.as_ref().map_or(0, |trace| trace.logits.len());
+                let traced = number < u64::from(self.traced_episodes);
+                if episode.number != number || episode.trace.is_some() != traced {
+                    return wrong(
+                        "its episodes are not in order, or not traced as the heading says",
+                    );
+                }
+                if episode.plans.len() != decisions.len()
+                    || episode.margins.len() != decisions.len()
+                    || !in_order
+                {
+                    return wrong("its plans are not one per decision");
+                }
+                if !logits.is_multiple_of(decisions.len().max(1)) {
+                    return wrong(
+                        "the logits of a trace are not the same number for each decision",
+                    );
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// The control steps at which the plans of an episode were decided.
+    pub fn decided_at(&self, episode: &Episode) -> Vec<usize> {
+        let grid = || (0..episode.steps).step_by(self.horizon.max(1)).collect();
+        episode.decided_at.clone().unwrap_or_else(grid)
+    }
+
+    /// Refuses a reference of another environment, of other instructions, or of a policy for something else than this bundle's. Where the
+    /// reference records its contract, that is compared field by field by the certificate, and only what would leave nothing to
+    /// compare is refused here.
+    pub fn check(&self, subject: &Subject<'_>) -> Result<(), ReferenceError> {
+        let same = |field, reference: &str, whose, other: &str| {
+            if reference == other {
+                return Ok(());
+            }
+            Err(ReferenceError::Other {
+                path: self.path.clone(),
+                field,
+                reference: format!("'{reference}'"),
+                whose,
+                other: format!("'{other}'"),
+            })
+        };
+        let used = &self.environment;
+        same(
+            "environment",
+            &used.id,
+            "the bundle's",
+            subject.environment_id,
+        )?;
+        let version = subject.environment_version;
+        same(
+            "environment version",
+            &used.version,
+            "the simulator's",
+            version,
+        )?;
+        let known = &subject.instructions;
+        let texts = |list: Vec<&str>| list.join("; ");
+        let ours = texts(
+            self.instructions
+                .iter()
+                .map(|row| row.text.as_str())
+                .collect(),
+        );
+        let theirs = texts(known.clone());
+        if ours != theirs {
+            let place = self.instructions.iter().zip(known);
+            let differ = place.into_iter().find(|(a, b)| a.text != **b);
+            let (a, b) = differ.map_or(
+                (self.instructions.len().to_string(), known.len().to_string()),
+                |(a, b)| (a.text.clone(), (*b).to_owned()),
+            );
+            same("instruction list", &a, "the bundle's", &b)?;
+        }
+        let (whose, contract) = match &self.contract {
+            None => ("the bundle's", subject.contract.to_owned()),
+            Some(recorded) => ("its own contract's", recorded.to_string()),
+        };
+        let purpose = purpose::sha256(&contract).unwrap_or_default();
+        same("contract hash", &self.purpose_sha256, whose, &purpose)?;
+        let lens = (subject.observation_len, subject.action_len);
+        for episode in self.instructions.iter().flat_map(|row| &row.episodes) {
+            if episode.final_state.len() != lens.0 {
+                return Err(ReferenceError::Content {
+                    path: self.path.clone(),
+                    problem: "the length of a final state is not the environment's".to_owned(),
+                });
+            }
+            let Some(trace) = &episode.trace else {
+                continue;
+            };
+            if trace.observations.len() != episode.steps * lens.0
+                || trace.actions.len() != episode.steps * lens.1
+                || !trace.states.len().is_multiple_of(lens.0)
+                || trace.states.is_empty() != (episode.steps == 0)
+            {
+                return Err(ReferenceError::Content {
+                    path: self.path.clone(),
+                    problem: "the lengths of a trace are not those of the environment".to_owned(),
+                });
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,159 @@
+//! What a rollout needs of a simulated environment, and nothing of any particular one.
+//!
+//! Invariants of every implementation: the same [`EpisodeSeed`] and actions give the same observations, bit for bit, on one machine;
+//! completions are latched (a sub-task that is undone later still counts) and chronological; an action that is refused changes nothing.
+
+use std::sync::Arc;
+
+use mujoco_rs::wrappers::{MjData, MjModel};
+use thiserror::Error;
+
+pub use lads_proof::episode::Completion;
+
+/// What there is to look at, for pictures.
+pub struct Stage<'e> {
+    /// The simulator's state; drawing it changes nothing that the next control step depends on.
+    pub data: &'e mut MjData<Arc<MjModel>>,
+    /// From where.
+    pub view: View,
+}
+
+/// Where a camera stands.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum View {
+    /// A camera of the scene, by its name.
+    Camera(&'static str),
+    /// A free camera.
+    Free {
+        /// The point that it looks at, in metres in the world's frame.
+        look_at: [f64; 3],
+        /// Its distance from there, in metres.
+        distance: f64,
+        /// Degrees around the vertical.
+        azimuth: f64,
+        /// Degrees above the horizon.
+        elevation: f64,
+    },
+}
+
+/// Names one episode's random stream: the run's seed, the index of the instruction, the number of the episode.
+///
+/// An environment draws everything random from `numpy.random.default_rng([seed, instruction, episode])`, see [`crate::random`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct EpisodeSeed {
+    /// Seed of the whole run.
+    pub seed: u64,
+    /// Index of the instruction in its list.
+    pub instruction: u64,
+    /// Number of the episode among those of the instruction.
+    pub episode: u64,
+}
+
+impl EpisodeSeed {
+    /// The three numbers, as numpy's `default_rng` takes them.
+    pub fn entropy(self) -> [u64; 3] {
+        [self.seed, self.instruction, self.episode]
+    }
+}
+
+/// An action that cannot be executed. The environment is as it was before.
+#[derive(Clone, Copy, Debug, PartialEq, Error)]
+pub enum ActionError {
+    /// The action has another length than the environment's.
+    #[error("the action has {got} elements, the environment takes {needed}")]
+    WrongLen {
+        /// Elements of the action.
+        got: usize,
+        /// Elements that [`Environment::action_len`] asks for.
+        needed: usize,
+    },
+    /// An element is NaN or infinite.
+    #[error("element {index} of the action is not finite")]
+    NotFinite {
+        /// The first such element.
+        index: usize,
+    },
+}
+
+/// A simulated environment that runs in control steps.
+///
+/// Observations and states are in the simulator's own precision; a policy takes them as `f32`.
+pub trait Environment: Send {
+    /// Name as in a bundle's contract, for example `franka-kitchen`.
+    fn id(&self) -> &'static str;
+    /// Version of the environment's behaviour, as in a bundle's contract.
+    fn version(&self) -> &'static str;
+    /// Name of every element of an observation; its length is the observation's.
+    fn observation_names(&self) -> &'static [&'static str];
+    /// Name of every element of an action; its length is the action's.
+    fn action_names(&self) -> &'static [&'static str];
+    /// Names of the sub-tasks that are watched, in a fixed order.
+    fn sub_tasks(&self) -> &'static [&'static str];
+    /// Time between two control steps, in seconds.
+    fn control_period_s(&self) -> f64;
+    /// Control steps of a full episode of an instruction in `split`. The caller ends the episode; stepping on is allowed.
+    fn max_steps(&self, split: &str) -> usize;
+
+    /// Starts an episode that is to complete the sub-tasks `commanded` (indices in [`Environment::sub_tasks`]) and returns its first
+    /// observation. Benchmarks prepare the objects that an instruction speaks of; with none commanded, the start is any.
+    fn reset(&mut self, seed: EpisodeSeed, commanded: &[usize]) -> &[f64];
+    /// Applies `action` for one control period and returns the observation after it.
+    fn step(&mut self, action: &[f64]) -> Result<&[f64], ActionError>;
+
+    /// The latest observation, as a policy sees it.
+    fn observation(&self) -> &[f64];
+    /// The noise-free quantities that the latest observation shows, in the same order.
+    fn state(&self) -> &[f64];
+    /// Control steps since the reset.
+    fn steps(&self) -> usize;
+    /// Completions since the reset, in the order in which they happened.
+    fn completions(&self) -> &[Completion];
+
+    /// Whether an instruction that commands these sub-tasks is carried out now: each was completed at some time, unless the environment
+    /// asks for more.
+    fn succeeded(&self, commanded: &[usize]) -> bool {
+        commanded
+            .iter()
+            .all(|&sub_task| self.completed_at(sub_task).is_some())
+    }
+
+    /// Where the gripper is, in metres in the world's frame, for pictures; `None` in an environment without one.
+    fn gripper(&self) -> Option<[f64; 3]> {
+        None
+    }
+
+    /// What there is to look at; `None` in an environment without a simulator.
+    fn stage(&mut self) -> Option<Stage<'_>> {
+        None
+    }
+
+    /// Elements of an observation.
+    fn observation_len(&self) -> usize {
+        self.observation_names().len()
+    }
+    /// Elements of an action.
+    fn action_len(&self) -> usize {
+        self.action_names().len()
+    }
+    /// The step at which a sub-task was completed, if it was.
+    fn completed_at(&self, sub_task: usize) -> Option<usize> {
+        self.completions()
+            .iter()
+            .find(|completion| completion.sub_task == sub_task)
+            .map(|completion| completion.step)
+    }
+}
+
+/// Checks an action's length and values, for implementations of [`Environment::step`].
+pub(crate) fn check_action(action: &[f64], needed: usize) -> Result<(), ActionError> {
+    if action.len() != needed {
+        return Err(ActionError::WrongLen {
+            got: action.len(),
+            needed,
+        });
+    }
+    match action.iter().position(|value| !value.is_finite()) {
+        Some(index) => Err(ActionError::NotFinite { index }),
+        None => Ok(()),
+    }
+}

@@ -1,0 +1,341 @@
+//! Many episodes over many threads, with the same result whatever their number.
+//!
+//! Each thread has its own environment and its own controller and takes the next episode from one queue. Every episode draws from streams
+//! of its own (seed, instruction, episode), and results are put in the order of the queue, so scheduling cannot show. What can fail: an
+//! episode that does not finish, or a panic in one; then all threads stop after their current episode.
+
+use std::panic::resume_unwind;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::thread;
+
+use lads_compiler::{Memory, MemoryError};
+use lads_core::{Decision, Isa, KnownInstruction, Policy};
+use thiserror::Error;
+
+use crate::environment::{Environment, EpisodeSeed};
+use crate::faults::Faults;
+use crate::plans::PlanBook;
+use crate::random::Stream;
+use crate::rollout::{Actor, Driver, Episode, Onlooker, RolloutError, Task, Timing};
+use crate::spoken::WordBook;
+use crate::trace::Trace;
+
+/// Fourth number of the entropy of the stream that seeds plan sampling; the environment's noise has only the first three.
+const DECISION_STREAM: u64 = 1;
+
+/// One instruction to run.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Assignment {
+    /// Index of the instruction in the policy's table; beyond it, of a sentence whose words the setup has.
+    pub instruction: u32,
+    /// The environment's indices of the sub-tasks that it commands.
+    pub commanded: Vec<usize>,
+    /// Control steps of its episodes.
+    pub max_steps: usize,
+}
+
+/// How episodes run besides policy, seed and decision; the default is the plain benchmark.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Setup<'e> {
+    /// What is wrong between policy and environment.
+    pub faults: Faults,
+    /// Plans for the low level alone.
+    pub plans: Option<&'e PlanBook>,
+    /// Word embeddings that are heard instead of the table's.
+    pub words: Option<&'e WordBook>,
+    /// Whether an episode in which the controller refuses an observation ends there and counts as it stands, as a machine would stop;
+    /// otherwise it ends everything.
+    pub stop_where_refused: bool,
+    /// How many of each instruction's episodes, from the first, keep every control step.
+    pub traced: u32,
+    /// Who looks on at the policy's episodes.
+    pub onlooker: Option<&'e dyn Onlooker>,
+}
+
+/// What to run, and how.
+pub struct Evaluation<'e> {
+    /// The compiled policy.
+    pub policy: Policy<'e>,
+    /// Its instructions.
+    pub assignments: &'e [Assignment],
+    /// Episodes of each instruction.
+    pub episodes: u32,
+    /// Seed of all random streams.
+    pub seed: u64,
+    /// How plans are chosen; a sampling seed in it is replaced by one per episode.
+    pub decision: Decision,
+    /// Who acts.
+    pub actor: Actor,
+    /// The instructions that the kernels run on.
+    pub isa: Isa,
+    /// Threads, at least one.
+    pub threads: usize,
+    /// Everything else about it.
+    pub setup: Setup<'e>,
+}
+
+/// Why an evaluation gave no result.
+#[derive(Debug, Error)]
+pub enum EvaluationError {
+    /// There is no memory for the policy's controller.
+    #[error(transparent)]
+    Memory(MemoryError),
+    /// An episode could not be finished.
+    #[error("episode {episode} of instruction {instruction}: {source}")]
+    Rollout {
+        /// Index of the instruction.
+        instruction: u32,
+        /// Number of the episode.
+        episode: u32,
+        /// What happened.
+        source: RolloutError,
+    },
+    /// It was told to stop.
+    #[error("interrupted")]
+    Interrupted,
+}
+
+/// Episodes of each assignment in order, and the durations of all.
+#[derive(Debug)]
+pub struct Evaluated {
+    /// One list of episodes per assignment.
+    pub episodes: Vec<Vec<Episode>>,
+    /// Every control step, in the same order, where the setup asked for it; empty otherwise.
+    pub traces: Vec<Trace>,
+    /// The control steps, from 0, at which episodes ended because the controller refused an observation; empty unless the setup lets
+    /// episodes end so.
+    pub refused_at: Vec<usize>,
+    /// Durations, summed over the threads.
+    pub timing: Timing,
+}
+
+/// Raises its flag when a panic unwinds through its scope.
+struct OnPanic<'f>(&'f AtomicBool);
+
+impl Drop for OnPanic<'_> {
+    fn drop(&mut self) {
+        self.0.fetch_or(thread::panicking(), Ordering::Relaxed);
+    }
+}
+
+/// What one thread did: its episodes with their places in the queue.
+struct Share {
+    episodes: Vec<(usize, Episode, Option<Trace>)>,
+    refused_at: Vec<usize>,
+    timing: Timing,
+}
+
+impl Evaluation<'_> {
+    /// Number of episodes in all.
+    pub fn len(&self) -> usize {
+        self.assignments.len() * self.episodes as usize
+    }
+
+    /// What an instruction is, be it of the policy's table or a sentence outside it.
+    pub fn instruction(&self, instruction: u32) -> Option<KnownInstruction<'_>> {
+        let contract = self.policy.contract();
+        let known = contract.instruction(instruction as usize);
+        known.or_else(|| Some(self.setup.words?.sentence.as_ref()?.known()))
+    }
+
+    /// Whether there is nothing to run.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Runs all episodes. `open` makes one environment per thread, `finished` is called after each episode, `stop` ends the work early.
+    pub fn run(
+        &self,
+        open: &(dyn Fn() -> Box<dyn Environment> + Sync),
+        stop: &AtomicBool,
+        finished: &(dyn Fn() + Sync),
+    ) -> Result<Evaluated, EvaluationError> {
+        let evaluated = self.run_until(open, stop, finished)?;
+        let done: usize = evaluated.episodes.iter().map(Vec::len).sum();
+        let whole = done == self.len();
+        whole
+            .then_some(evaluated)
+            .ok_or(EvaluationError::Interrupted)
+    }
+
+    /// The same, but work that ends early, also by who looks on, comes to the episodes that were finished.
+    pub fn run_until(
+        &self,
+        open: &(dyn Fn() -> Box<dyn Environment> + Sync),
+        stop: &AtomicBool,
+        finished: &(dyn Fn() + Sync),
+    ) -> Result<Evaluated, EvaluationError> {
+        let queue = AtomicUsize::new(0);
+        // Raised by a thread that failed, so that the others do not work for nothing.
+        let failed = AtomicBool::new(false);
+        let next = || {
+            let halted = stop.load(Ordering::Relaxed) || failed.load(Ordering::Relaxed);
+            let place = (!halted).then(|| queue.fetch_add(1, Ordering::Relaxed))?;
+            (place < self.len()).then_some(place)
+        };
+        let work = || {
+            let _raised = OnPanic(&failed);
+            let done = self.worker(open, &next, finished);
+            failed.fetch_or(done.is_err(), Ordering::Relaxed);
+            done
+        };
+        let threads = self.threads.clamp(1, self.len().max(1));
+        let outcomes = thread::scope(|scope| {
+            let workers: Vec<_> = (0..threads).map(|_| scope.spawn(work)).collect();
+            workers
+                .into_iter()
+                .map(|worker| worker.join().unwrap_or_else(|panic| resume_unwind(panic)))
+                .collect::<Vec<_>>()
+        });
+
+        let mut timing = Timing::default();
+        let mut all = Vec::with_capacity(self.len());
+        let mut refused_at = Vec::new();
+        for outcome in outcomes {
+            let share = outcome?;
+            all.extend(share.episodes);
+            refused_at.extend(share.refused_at);
+            timing.absorb(share.timing);
+        }
+        refused_at.sort_unstable();
+        all.sort_unstable_by_key(|&(place, ..)| place);
+        let mut traces = Vec::new();
+        let mut episodes = vec![Vec::new(); self.assignments.len()];
+        for (place, episode, trace) in all {
+            traces.extend(trace);
+            if let Some(own) = episodes.get_mut(place / self.episodes as usize) {
+                own.push(episode);
+            }
+        }
+        Ok(Evaluated {
+            episodes,
+            traces,
+            refused_at,
+            timing,
+        })
+    }
+
+    fn worker(
+        &self,
+        open: &dyn Fn() -> Box<dyn Environment>,
+        next: &dyn Fn() -> Option<usize>,
+        finished: &dyn Fn(),
+    ) -> Result<Share, EvaluationError> {
+        let mut environment = open();
+        let mut memory = Memory::of(&self.policy).map_err(EvaluationError::Memory)?;
+        let controller = memory
+            .controller_with(&self.policy, self.isa)
+            .map_err(EvaluationError::Memory)?;
+        let mut driver = Driver::new(controller, environment.as_mut());
+        if self.setup.traced > 0 {
+            driver.record();
+        }
+        driver.show(self.setup.onlooker);
+        let (mut episodes, mut refused_at) = (Vec::new(), Vec::new());
+        while let Some(place) = next() {
+            let episode = (place % self.episodes as usize) as u32;
+            let Some(assignment) = self.assignments.get(place / self.episodes as usize) else {
+                break;
+            };
+            let task = self.task(assignment, episode);
+            let run = match driver.run(&task) {
+                Err(RolloutError::Step { step, .. }) if self.setup.stop_where_refused => {
+                    refused_at.push(step);
+                    driver.outcome(&task)
+                }
+                Err(RolloutError::Stopped) => break,
+                other => other.map_err(|source| EvaluationError::Rollout {
+                    instruction: assignment.instruction,
+                    episode,
+                    source,
+                })?,
+            };
+            let trace = (episode < self.setup.traced).then(|| Trace {
+                instruction: assignment.instruction,
+                episode,
+                sampling_seed: match task.decision {
+                    Decision::Sample { seed, .. } => Some(seed),
+                    Decision::Argmax => None,
+                },
+                commanded: task.plans.is_some(),
+                outcome: run.clone(),
+                steps: driver.take_recording(),
+            });
+            episodes.push((place, run, trace));
+            finished();
+        }
+        Ok(Share {
+            episodes,
+            refused_at,
+            timing: driver.timing,
+        })
+    }
+
+    fn task<'t>(&'t self, assignment: &'t Assignment, episode: u32) -> Task<'t> {
+        let seed = EpisodeSeed {
+            seed: self.seed,
+            instruction: u64::from(assignment.instruction),
+            episode: u64::from(episode),
+        };
+        let decision = match self.decision {
+            Decision::Sample { temperature, .. } => Decision::Sample {
+                temperature,
+                seed: decision_seed(seed),
+            },
+            Decision::Argmax => Decision::Argmax,
+        };
+        Task {
+            instruction: assignment.instruction,
+            words: self
+                .setup
+                .words
+                .and_then(|book| book.of(assignment.instruction)),
+            commanded: &assignment.commanded,
+            max_steps: assignment.max_steps,
+            seed,
+            decision,
+            actor: self.actor,
+            faults: self.setup.faults,
+            plans: self
+                .setup
+                .plans
+                .and_then(|book| book.of(assignment.instruction, episode)),
+        }
+    }
+}
+
+/// Seed of the stream from which one episode's plans are sampled: the first draw of numpy's `default_rng([seed, instruction, episode, 1])`,
+/// 53 bits.
+fn decision_seed(seed: EpisodeSeed) -> u64 {
+    let [run, instruction, episode] = seed.entropy();
+    let unit = Stream::new(&[run, instruction, episode, DECISION_STREAM]).unit();
+    (unit * (1_u64 << 53) as f64) as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_episode_samples_from_another_stream() {
+        let seeds = (0..4).flat_map(|instruction| {
+            (0..4).map(move |episode| EpisodeSeed {
+                seed: 7,
+                instruction,
+                episode,
+            })
+        });
+        let mut drawn: Vec<u64> = seeds.map(decision_seed).collect();
+        assert_eq!(
+            drawn[0],
+            decision_seed(EpisodeSeed {
+                seed: 7,
+                instruction: 0,
+                episode: 0
+            })
+        );
+        drawn.sort_unstable();
+        drawn.dedup();
+        assert_eq!(drawn.len(), 16);
+    }
+}

@@ -1,0 +1,404 @@
+//! One episode: the compiled policy drives an environment until its commanded sub-tasks are done or the episode is full.
+//!
+//! Invariants: what happens depends only on the policy, the environment's seed and the decision rule; the controller is the one that runs
+//! on a robot, with memory allocated once per driver. What can fail: the controller refuses an observation, or the environment an action.
+
+use std::time::{Duration, Instant};
+
+use lads_core::{
+    ActError, Controller, Decision, Instruction, InstructionError, PlanIndex, StepError, StepReport,
+};
+use rustix::time::{ClockId, clock_gettime};
+use thiserror::Error;
+
+pub use lads_proof::episode::Episode;
+pub use lads_proof::timing::Timing;
+
+use crate::environment::{ActionError, Environment, EpisodeSeed};
+use crate::faults::{Faults, Link};
+use crate::random::Stream;
+use crate::trace::Step;
+
+/// Why an episode could not be finished.
+#[derive(Debug, Error)]
+pub enum RolloutError {
+    /// The policy does not know the instruction.
+    #[error("the policy refuses the instruction: {0}")]
+    Instruction(InstructionError),
+    /// The controller refused an observation.
+    #[error("the controller refuses the observation of control step {step}: {error}")]
+    Step {
+        /// Control step, from 0.
+        step: usize,
+        /// The controller's reason.
+        error: StepError,
+    },
+    /// The low level refused a commanded plan.
+    #[error("the low level gives no action in control step {step}: {error}")]
+    Act {
+        /// Control step, from 0.
+        step: usize,
+        /// The low level's reason.
+        error: ActError,
+    },
+    /// The environment refused an action.
+    #[error("the environment refuses the action of control step {step}: {error}")]
+    Action {
+        /// Control step, from 0.
+        step: usize,
+        /// The environment's reason.
+        error: ActionError,
+    },
+    /// Who looks on has seen enough.
+    #[error("stopped while it was looked at")]
+    Stopped,
+}
+
+/// An episode as it stands, for who looks on.
+pub struct Glimpse<'g> {
+    /// Which episode.
+    pub task: &'g Task<'g>,
+    /// How far it is.
+    pub stand: Stand,
+    /// To look at, not to change.
+    pub environment: &'g mut dyn Environment,
+}
+
+/// How far an episode is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stand {
+    /// The next action is about to be executed.
+    Acting {
+        /// The plan in force.
+        plan: u32,
+    },
+    /// The last action was executed.
+    Ended {
+        /// Whether the instruction was carried out.
+        success: bool,
+    },
+}
+
+/// How an episode that is looked at goes on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Go {
+    /// With the next control step.
+    On,
+    /// From its start, as it was.
+    Again,
+    /// Not at all.
+    Stop,
+}
+
+/// Looks on while episodes run, at every control step between decision and action, and once after the last. It may take its time.
+pub trait Onlooker: std::fmt::Debug + Sync {
+    /// One control step.
+    fn look(&self, glimpse: Glimpse<'_>) -> Go;
+}
+
+/// Who acts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Actor {
+    /// The policy.
+    #[default]
+    Policy,
+    /// Nobody: actions are uniform in the contract's limits. The floor that policies are measured against.
+    Uniform,
+}
+
+/// Fourth number of the entropy of the stream that uniform actions are drawn from.
+const UNIFORM_STREAM: u64 = 3;
+
+/// Which episode to run.
+#[derive(Debug, Clone)]
+pub struct Task<'t> {
+    /// Index of the instruction in the policy's table.
+    pub instruction: u32,
+    /// Word embeddings `[n, E]` that are heard instead of that instruction's.
+    pub words: Option<&'t [f32]>,
+    /// Indices, in the environment's list, of the sub-tasks that the instruction commands; with none there is nothing to carry out, and the
+    /// episode lasts its full time.
+    pub commanded: &'t [usize],
+    /// Control steps after which the episode ends.
+    pub max_steps: usize,
+    /// Random streams of the environment.
+    pub seed: EpisodeSeed,
+    /// How plans are chosen, with the seed of this episode where they are sampled.
+    pub decision: Decision,
+    /// Who acts.
+    pub actor: Actor,
+    /// What is wrong between policy and environment.
+    pub faults: Faults,
+    /// Plans for the low level alone, one per horizon; the episode ends with them. `None`: the high level decides.
+    pub plans: Option<&'t [u32]>,
+}
+
+/// CPU time that this thread has used: unlike the wall clock's, its differences do not depend on what else the machine does.
+fn cpu_time() -> Duration {
+    // The clock starts at zero, so it always converts.
+    Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).unwrap_or_default()
+}
+
+/// CPU time that this thread has used since it was `earlier`.
+fn cpu_since(earlier: Duration) -> Duration {
+    cpu_time().saturating_sub(earlier)
+}
+
+/// A controller in an environment, for one episode after the other.
+pub struct Driver<'a, 'm, 'e> {
+    controller: Controller<'a, 'm>,
+    environment: &'e mut dyn Environment,
+    observation: Vec<f32>,
+    action: Vec<f32>,
+    executed: Vec<f32>,
+    command: Vec<f64>,
+    limits: Vec<(f64, f64)>,
+    /// Plans decided in the episode.
+    plans: Vec<u32>,
+    /// Control steps of the episode, where they are kept.
+    recording: Option<Vec<Step>>,
+    onlooker: Option<&'e dyn Onlooker>,
+    /// What was measured so far.
+    pub timing: Timing,
+}
+
+impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
+    /// Joins a controller and an environment that were checked to fit (see [`crate::fit`]).
+    pub fn new(controller: Controller<'a, 'm>, environment: &'e mut dyn Environment) -> Self {
+        let actions = controller.policy().contract().actions();
+        let limits =
+            actions.map(|element| (f64::from(element.limits.min), f64::from(element.limits.max)));
+        let limits = limits.collect();
+        let (observation_len, action_len) =
+            (environment.observation_len(), environment.action_len());
+        Self {
+            controller,
+            environment,
+            observation: vec![0.0; observation_len],
+            action: vec![0.0; action_len],
+            executed: vec![0.0; action_len],
+            command: vec![0.0; action_len],
+            limits,
+            plans: Vec::new(),
+            recording: None,
+            onlooker: None,
+            timing: Timing::default(),
+        }
+    }
+
+    /// Keeps the control steps of the episodes to come, for [`take_recording`](Self::take_recording).
+    pub fn record(&mut self) {
+        self.recording = Some(Vec::new());
+    }
+
+    /// The control steps of the last episode; empty where none were kept.
+    pub fn take_recording(&mut self) -> Vec<Step> {
+        self.recording
+            .as_mut()
+            .map(std::mem::take)
+            .unwrap_or_default()
+    }
+
+    /// What the last episode came to as far as it got, also where [`run`](Self::run) has failed.
+    pub fn outcome(&self, task: &Task<'_>) -> Episode {
+        Episode {
+            steps: self.environment.steps(),
+            success: self.succeeded(task),
+            completions: self.environment.completions().to_vec(),
+            plans: self.plans.clone(),
+            final_state: self.environment.state().to_vec(),
+        }
+    }
+
+    /// Lets someone look on at the policy's episodes to come.
+    pub fn show(&mut self, onlooker: Option<&'e dyn Onlooker>) {
+        self.onlooker = onlooker;
+    }
+
+    /// Runs one episode to its end: the instruction is carried out, or the steps or the commanded plans are used up.
+    pub fn run(&mut self, task: &Task<'_>) -> Result<Episode, RolloutError> {
+        let episode_cpu = cpu_time();
+        let episode = loop {
+            if let Some(episode) = self.attempt(task)? {
+                break episode;
+            }
+        };
+        self.timing.episodes_cpu += cpu_since(episode_cpu);
+        Ok(episode)
+    }
+
+    /// An episode; `None` if who looks on wants it again.
+    fn attempt(&mut self, task: &Task<'_>) -> Result<Option<Episode>, RolloutError> {
+        if let Some(recording) = &mut self.recording {
+            recording.clear();
+        }
+        self.instruct(task)?;
+        let reset_cpu = cpu_time();
+        self.environment.reset(task.seed, task.commanded);
+        let mut link = Link::new(task.faults, task.seed);
+        self.sense(&mut link);
+        self.executed.fill(0.0);
+        self.timing.simulator_cpu += cpu_since(reset_cpu);
+
+        let horizon = self.controller.policy().contract().horizon();
+        let most = task.plans.map_or(task.max_steps, |plans| {
+            task.max_steps.min(plans.len() * horizon)
+        });
+        self.plans.clear();
+        let mut uniform = task.actor.stream(task.seed);
+        let mut step = 0;
+        while step < most && !self.succeeded(task) {
+            match &mut uniform {
+                None => {
+                    let (report, elapsed_ns) = self.decide(step, horizon, task.plans)?;
+                    if report.decided {
+                        self.plans.push(report.plan.0);
+                    }
+                    let plan = report.plan.0;
+                    match self.look(task, Stand::Acting { plan }) {
+                        Go::On => {}
+                        Go::Again => return Ok(None),
+                        Go::Stop => return Err(RolloutError::Stopped),
+                    }
+                    let before_cpu = cpu_time();
+                    link.actuate(&self.action, &mut self.executed);
+                    self.keep(&report, elapsed_ns, task.plans.is_some());
+                    self.execute(step)?;
+                    self.timing.simulator_cpu += cpu_since(before_cpu);
+                }
+                Some(stream) => self.uniform_step(step, stream)?,
+            }
+            self.sense(&mut link);
+            step += 1;
+        }
+        let success = self.succeeded(task);
+        let go = self.look(task, Stand::Ended { success });
+        Ok((go != Go::Again).then(|| self.outcome(task)))
+    }
+
+    /// Shows the episode as it stands to who looks on.
+    fn look(&mut self, task: &Task<'_>, stand: Stand) -> Go {
+        self.onlooker.map_or(Go::On, |onlooker| {
+            onlooker.look(Glimpse {
+                task,
+                stand,
+                environment: &mut *self.environment,
+            })
+        })
+    }
+
+    fn succeeded(&self, task: &Task<'_>) -> bool {
+        !task.commanded.is_empty() && self.environment.succeeded(task.commanded)
+    }
+
+    fn instruct(&mut self, task: &Task<'_>) -> Result<(), RolloutError> {
+        self.controller.set_decision(task.decision);
+        let instruction = task
+            .words
+            .map_or(Instruction::Id(task.instruction), Instruction::Words);
+        let (start, start_cpu) = (Instant::now(), cpu_time());
+        let known = self.controller.set_instruction(instruction);
+        self.timing.controller_cpu += cpu_since(start_cpu);
+        self.timing.instruct_ns.push(nanoseconds(start.elapsed()));
+        known.map_err(RolloutError::Instruction)
+    }
+
+    fn uniform_step(&mut self, step: usize, stream: &mut Stream) -> Result<(), RolloutError> {
+        for (command, &(low, high)) in self.command.iter_mut().zip(&self.limits) {
+            *command = stream.uniform(low, high);
+        }
+        let before_cpu = cpu_time();
+        let done = self.environment.step(&self.command);
+        done.map_err(|error| RolloutError::Action { step, error })?;
+        self.timing.simulator_cpu += cpu_since(before_cpu);
+        Ok(())
+    }
+
+    /// The policy's action for what it sees, and how long that took in nanoseconds.
+    fn decide(
+        &mut self,
+        step: usize,
+        horizon: usize,
+        commanded: Option<&[u32]>,
+    ) -> Result<(StepReport, u64), RolloutError> {
+        let before_cpu = cpu_time();
+        let start = Instant::now();
+        let report = match commanded.and_then(|plans| plans.get(step / horizon)) {
+            None => self
+                .controller
+                .step(&self.observation, &mut self.action)
+                .map_err(|error| RolloutError::Step { step, error }),
+            Some(&plan) => self
+                .controller
+                .act(&self.observation, PlanIndex(plan), &mut self.action)
+                .map_err(|error| RolloutError::Act { step, error })
+                .map(|()| StepReport {
+                    timestep: step as u32,
+                    plan: PlanIndex(plan),
+                    decided: step.is_multiple_of(horizon),
+                    margin: f32::INFINITY,
+                }),
+        };
+        let elapsed_ns = nanoseconds(start.elapsed());
+        self.timing.controller_cpu += cpu_since(before_cpu);
+        let report = report?;
+        if report.decided {
+            self.timing.decision_ns.push(elapsed_ns);
+        } else {
+            self.timing.ordinary_ns.push(elapsed_ns);
+        }
+        Ok((report, elapsed_ns))
+    }
+
+    /// Lets what the policy sees follow the environment, as far as the link lets it through.
+    fn sense(&mut self, link: &mut Link) {
+        let (observation, state) = (self.environment.observation(), self.environment.state());
+        link.sense(observation, state, &mut self.observation);
+    }
+
+    /// Hands the environment the action that the actuators execute.
+    fn execute(&mut self, step: usize) -> Result<(), RolloutError> {
+        for (command, &action) in self.command.iter_mut().zip(&self.executed) {
+            *command = f64::from(action);
+        }
+        self.environment
+            .step(&self.command)
+            .map_err(|error| RolloutError::Action { step, error })?;
+        Ok(())
+    }
+
+    /// Records the step, where steps are kept.
+    fn keep(&mut self, report: &StepReport, controller_ns: u64, commanded: bool) {
+        let Some(recording) = &mut self.recording else {
+            return;
+        };
+        let logits = if report.decided && !commanded {
+            self.controller.logits()
+        } else {
+            &[]
+        };
+        recording.push(Step {
+            observation: self.observation.clone(),
+            action: self.action.clone(),
+            executed: self.executed.clone(),
+            plan: report.plan.0,
+            decided: report.decided,
+            margin: Some(report.margin).filter(|margin| margin.is_finite()),
+            logits: logits.to_vec(),
+            controller_ns,
+            gripper: self.environment.gripper(),
+        });
+    }
+}
+
+impl Actor {
+    fn stream(self, seed: EpisodeSeed) -> Option<Stream> {
+        let [run, instruction, episode] = seed.entropy();
+        let entropy = [run, instruction, episode, UNIFORM_STREAM];
+        (self == Self::Uniform).then(|| Stream::new(&entropy))
+    }
+}
+
+fn nanoseconds(duration: Duration) -> u64 {
+    u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX)
+}

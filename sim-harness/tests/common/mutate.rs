@@ -1,0 +1,383 @@
+//! Changes to a bundle, and what a verification says of them without its closed loop, which could only find more.
+//!
+//! The file is changed as protocol-buffer bytes: values of a tensor in place, the contract as a whole. A changed policy is not run by its
+//! self-test, so that what is seen is what the reference sees.
+
+use std::ops::Range;
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+use lads_compiler::{Bundle, Options, compile_with};
+use lads_core::{Isa, Policy};
+use lads_proof::answers::Answers;
+use lads_proof::contract::Compared;
+use lads_proof::reference::Reference;
+use lads_sim::evaluate::Assignment;
+use lads_sim::verify;
+use serde_json::Value;
+
+// Numbers of the fields of ONNX's messages.
+const GRAPH: u64 = 7;
+const METADATA: u64 = 14;
+const INITIALIZER: u64 = 5;
+const DIMS: u64 = 1;
+const NAME: u64 = 8;
+const RAW_DATA: u64 = 9;
+const KEY: u64 = 1;
+const VALUE: u64 = 2;
+const CONTRACT: &str = "lads.contract";
+
+/// A tensor of 32-bit floats inside the file.
+#[derive(Debug, Clone)]
+pub struct Tensor {
+    /// Its name, without `weights/`.
+    pub name: String,
+    /// Elements of its first dimension.
+    pub rows: usize,
+    bytes: Range<usize>,
+}
+
+/// The bytes of a bundle.
+#[derive(Debug, Clone)]
+pub struct Model {
+    bytes: Vec<u8>,
+    pub tensors: Vec<Tensor>,
+}
+
+fn varint(bytes: &[u8], at: &mut usize) -> u64 {
+    let mut value = 0;
+    for shift in (0..).step_by(7) {
+        let byte = bytes[*at];
+        *at += 1;
+        value |= u64::from(byte & 0x7f) << shift;
+        if byte < 0x80 {
+            break;
+        }
+    }
+    value
+}
+
+/// The fields of a message: number, the whole field, its content. Fields that are no bytes have their value as content.
+fn fields(bytes: &[u8], message: Range<usize>) -> Vec<(u64, Range<usize>, Range<usize>)> {
+    let mut found = Vec::new();
+    let mut at = message.start;
+    while at < message.end {
+        let start = at;
+        let tag = varint(bytes, &mut at);
+        let content = match tag & 7 {
+            0 => {
+                let value = at;
+                varint(bytes, &mut at);
+                value..at
+            }
+            1 => at..at + 8,
+            5 => at..at + 4,
+            _ => {
+                let len = varint(bytes, &mut at) as usize;
+                at..at + len
+            }
+        };
+        at = content.end;
+        found.push((tag >> 3, start..at, content));
+    }
+    found
+}
+
+fn put(number: u64, content: &[u8], into: &mut Vec<u8>) {
+    let mut number_of = |mut value: u64| {
+        while value >= 0x80 {
+            into.push(value as u8 | 0x80);
+            value >>= 7;
+        }
+        into.push(value as u8);
+    };
+    number_of(number << 3 | 2);
+    number_of(content.len() as u64);
+    into.extend_from_slice(content);
+}
+
+impl Model {
+    pub fn open(path: &Path) -> Self {
+        let bytes = std::fs::read(path).unwrap();
+        let mut tensors = Vec::new();
+        let top = fields(&bytes, 0..bytes.len());
+        let graphs = top.into_iter().filter(|field| field.0 == GRAPH);
+        for (.., initializer) in graphs
+            .flat_map(|(.., graph)| fields(&bytes, graph))
+            .filter(|field| field.0 == INITIALIZER)
+        {
+            let parts = fields(&bytes, initializer);
+            let find = |number| {
+                parts
+                    .iter()
+                    .find(|part| part.0 == number)
+                    .map(|part| part.2.clone())
+            };
+            let (Some(name), Some(data), Some(mut dims)) = (find(NAME), find(RAW_DATA), find(DIMS))
+            else {
+                continue;
+            };
+            if let Some(name) = String::from_utf8_lossy(&bytes[name]).strip_prefix("weights/") {
+                tensors.push(Tensor {
+                    name: name.to_owned(),
+                    rows: varint(&bytes, &mut dims.start) as usize,
+                    bytes: data,
+                });
+            }
+        }
+        assert!(!tensors.is_empty(), "no weights in {}", path.display());
+        Self { bytes, tensors }
+    }
+
+    pub fn bytes(&self) -> &[u8] {
+        &self.bytes
+    }
+
+    /// The same with the values of a tensor changed.
+    pub fn edit(&mut self, name: &str, change: impl FnOnce(&mut [f32])) {
+        let tensor = self.tensors.iter().find(|tensor| tensor.name == name);
+        let range = tensor
+            .unwrap_or_else(|| panic!("no tensor {name}"))
+            .bytes
+            .clone();
+        let bytes = &mut self.bytes[range];
+        let mut values: Vec<f32> = bytes
+            .as_chunks::<4>()
+            .0
+            .iter()
+            .map(|&word| f32::from_le_bytes(word))
+            .collect();
+        change(&mut values);
+        for (word, value) in bytes.as_chunks_mut::<4>().0.iter_mut().zip(values) {
+            *word = value.to_le_bytes();
+        }
+    }
+
+    /// Rows of a tensor in another order: row `n` of the result is row `order[n]`.
+    pub fn reorder(&mut self, name: &str, order: &[usize]) {
+        self.edit(name, |values| {
+            let row = values.len() / order.len();
+            let rows: Vec<_> = order
+                .iter()
+                .flat_map(|&from| values[from * row..(from + 1) * row].to_vec())
+                .collect();
+            values.copy_from_slice(&rows);
+        });
+    }
+
+    fn contract_entry(&self) -> (Range<usize>, Range<usize>) {
+        let top = fields(&self.bytes, 0..self.bytes.len());
+        let mut entries = top.into_iter().filter(|field| field.0 == METADATA);
+        let found = entries.find_map(|(_, whole, entry)| {
+            let parts = fields(&self.bytes, entry);
+            let part = |number| {
+                parts
+                    .iter()
+                    .find(|part| part.0 == number)
+                    .map(|part| part.2.clone())
+            };
+            (&self.bytes[part(KEY)?] == CONTRACT.as_bytes()).then_some((whole, part(VALUE)?))
+        });
+        found.expect("a bundle has a contract")
+    }
+
+    pub fn contract(&self) -> Value {
+        serde_json::from_slice(&self.bytes[self.contract_entry().1]).unwrap()
+    }
+
+    /// The same with another contract.
+    pub fn with_contract(&self, contract: &Value) -> Self {
+        let (whole, _) = self.contract_entry();
+        let mut entry = Vec::new();
+        put(KEY, CONTRACT.as_bytes(), &mut entry);
+        put(VALUE, contract.to_string().as_bytes(), &mut entry);
+        let mut bytes = self.bytes.clone();
+        bytes.drain(whole);
+        put(METADATA, &entry, &mut bytes);
+        // Tensors stand before the metadata or after it: their places are looked for anew.
+        let path = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(path.path(), &bytes).unwrap();
+        Self::open(path.path())
+    }
+}
+
+/// What a verification says.
+#[derive(Debug, Clone)]
+pub enum Said {
+    /// The bundle is not even opened or compiled.
+    Refused(String),
+    Judged(Box<Judged>),
+}
+
+#[derive(Debug, Clone)]
+pub struct Judged {
+    pub contract: Compared,
+    pub answers: Answers,
+}
+
+impl Judged {
+    pub fn different(&self) -> bool {
+        !self.contract.differing.is_empty()
+            || !self.contract.image_differing.is_empty()
+            || self.answers.first_difference.is_some()
+    }
+
+    /// What a verdict names first.
+    pub fn reason(&self) -> String {
+        let field = self
+            .contract
+            .differing
+            .first()
+            .map(|it| format!("contract: {}", it.field));
+        field
+            .or_else(|| {
+                self.answers
+                    .first_difference
+                    .as_ref()
+                    .map(|it| it.what.clone())
+            })
+            .unwrap_or_default()
+    }
+}
+
+/// Compares a bundle with its reference: the contract, and the policy's answers to the first traced episode of the instructions whose index
+/// is a multiple of `every`.
+pub fn verify(bytes: &[u8], options: Options, reference: &Reference, every: usize) -> Said {
+    let compiled = Bundle::from_bytes(bytes)
+        .map_err(|error| error.to_string())
+        .and_then(|bundle| {
+            let image = compile_with(&bundle, options).map_err(|error| error.to_string())?;
+            Ok((bundle, image))
+        });
+    let (bundle, image) = match compiled {
+        Ok(compiled) => compiled,
+        Err(refused) => return Said::Refused(refused),
+    };
+    let policy = match Policy::new_checked(image.as_bytes()) {
+        Ok(policy) => policy,
+        Err(refused) => return Said::Refused(refused.to_string()),
+    };
+    let known = (0..reference.instructions.len() as u32).step_by(every);
+    let assignments: Vec<_> = known
+        .map(|instruction| Assignment {
+            instruction,
+            commanded: Vec::new(),
+            max_steps: 0,
+        })
+        .collect();
+    let stop = AtomicBool::new(false);
+    let replays = verify::policy::ask(
+        &policy,
+        Isa::detect(),
+        reference,
+        &assignments,
+        1,
+        &stop,
+        &|| {},
+    )
+    .unwrap();
+    let tolerance = policy.golden().map(|golden| f64::from(golden.tolerance()));
+    let stated = serde_json::from_str(bundle.metadata(CONTRACT).unwrap()).unwrap();
+    Said::Judged(Box::new(Judged {
+        contract: Compared::new(
+            &stated,
+            reference.contract.as_ref(),
+            &verify::contract::of_image(&policy.contract()),
+        ),
+        answers: Answers::judge(reference, &replays, tolerance).0,
+    }))
+}
+
+/// Every value of a contract changed, one at a time: where it stands, and the contract.
+pub fn contracts(contract: &Value) -> Vec<(String, Value)> {
+    fn places(value: &Value, pointer: String, found: &mut Vec<String>) {
+        match value {
+            Value::Object(object) => object
+                .iter()
+                .for_each(|(key, value)| places(value, format!("{pointer}/{key}"), found)),
+            Value::Array(list) => list
+                .iter()
+                .enumerate()
+                .for_each(|(index, value)| places(value, format!("{pointer}/{index}"), found)),
+            _ => found.push(pointer),
+        }
+    }
+    let mut found = Vec::new();
+    places(contract, String::new(), &mut found);
+    let changed = |pointer: String| {
+        let mut changed = contract.clone();
+        let value = changed.pointer_mut(&pointer).unwrap();
+        *value = match value.take() {
+            Value::String(text) => other_word(&text).into(),
+            Value::Number(number) if number.is_u64() => (number.as_u64().unwrap() + 1).into(),
+            Value::Number(number) => (number.as_f64().unwrap() * 1.25 + 0.125).into(),
+            Value::Bool(flag) => (!flag).into(),
+            _ => "something".into(),
+        };
+        (pointer, changed)
+    };
+    found.into_iter().map(changed).collect()
+}
+
+/// Another word where only some are known, so that the bundle still opens.
+fn other_word(word: &str) -> String {
+    match word {
+        "argmax" => "sample".to_owned(),
+        "sample" => "argmax".to_owned(),
+        "restart" => "refuse".to_owned(),
+        "refuse" => "restart".to_owned(),
+        "wxyz" => "xyzw".to_owned(),
+        "none" => "wxyz".to_owned(),
+        other => format!("{other}x"),
+    }
+}
+
+/// A tensor times a factor.
+pub fn scale(values: &mut [f32], factor: f32) {
+    for x in values {
+        *x *= factor;
+    }
+}
+
+/// A stream of normals, the same each time.
+pub struct Normals(lads_sim::random::Stream);
+
+impl Normals {
+    pub fn new(seed: u64) -> Self {
+        Self(lads_sim::random::Stream::new(&[seed]))
+    }
+
+    pub fn next(&mut self) -> f32 {
+        let [a, b] = [self.0.unit(), self.0.unit()];
+        ((-2.0 * (1.0 - a).ln()).sqrt() * (std::f64::consts::TAU * b).cos()) as f32
+    }
+}
+
+/// Every weight off by relative noise.
+pub fn noisy(model: &Model, relative: f32, seed: u64) -> Model {
+    let (mut model, mut normals) = (model.clone(), Normals::new(seed));
+    for tensor in model.tensors.clone() {
+        model.edit(&tensor.name, |values| {
+            for x in values {
+                *x *= 1.0 + relative * normals.next();
+            }
+        });
+    }
+    model
+}
+
+/// The plans under other numbers, throughout.
+pub fn renumbered(model: &Model, step: usize) -> Model {
+    let mut model = model.clone();
+    let codes = model
+        .tensors
+        .iter()
+        .find(|tensor| tensor.name == "codebook")
+        .expect("a codebook")
+        .rows;
+    let order: Vec<_> = (0..codes).map(|plan| (plan + step) % codes).collect();
+    for name in ["codebook", "high_level.head.weight", "high_level.head.bias"] {
+        model.reorder(name, &order);
+    }
+    model
+}
