@@ -35,7 +35,7 @@ pub struct Request {
         value_name = "FORMAT",
         value_delimiter = ',',
         default_value = "f32",
-        value_parser = crate::weight_format
+        value_parser = crate::compile::weight_format
     )]
     weights: Vec<WeightFormat>,
     /// As one JSON object

@@ -32,7 +32,10 @@ enum Held {
 impl Seen {
     /// Zeros for the observation channels of a policy.
     pub fn of(contract: &Contract) -> Self {
-        let channels: Vec<Values> = contract.observations().map(Values::of).collect();
+        let channels: Vec<Values> = contract
+            .observations()
+            .map(|channel| Values::of(&channel))
+            .collect();
         let numbers = vec![0.0; channels.iter().map(|values| values.held.len()).sum()];
         Self { channels, numbers }
     }
@@ -68,11 +71,13 @@ impl Seen {
 
     /// The values, channel by channel.
     pub fn given(&self) -> Vec<(ChannelId, Data<'_>)> {
-        let data = |held| match held {
-            &Held::F32(ref values) => Data::F32(values),
-            &Held::U8(ref values) => Data::U8(values),
-            &Held::I32(ref values) => Data::I32(values),
-        };
+        fn data(held: &Held) -> Data<'_> {
+            match held {
+                Held::F32(values) => Data::F32(values),
+                Held::U8(values) => Data::U8(values),
+                Held::I32(values) => Data::I32(values),
+            }
+        }
         let all = self.channels.iter();
         all.map(|values| (values.id, data(&values.held))).collect()
     }
@@ -105,7 +110,7 @@ impl Seen {
 }
 
 impl Values {
-    fn of(channel: Channel<'_>) -> Self {
+    fn of(channel: &Channel<'_>) -> Self {
         let len = channel.len();
         Self {
             id: channel.id(),

@@ -54,7 +54,7 @@ impl Report<'_> {
             "family": contract.family(),
             "environment": { "id": contract.environment_id(), "version": contract.environment_version() },
             "control_period_s": decimal(contract.control_period_s()),
-            "channels": contract.channels().map(channel_json).collect::<Vec<_>>(),
+            "channels": contract.channels().map(|channel| channel_json(&channel)).collect::<Vec<_>>(),
             "indices": self.policy.index_count(),
             "decision": decision_json(contract.decision()),
             "noise": noise_json(contract.noise()),
@@ -137,7 +137,7 @@ fn call_json(call: &Call) -> Value {
     })
 }
 
-fn channel_json(channel: Channel<'_>) -> Value {
+fn channel_json(channel: &Channel<'_>) -> Value {
     let elements: Vec<_> = channel.elements().map(element_json).collect();
     let alike = channel.limits().next().filter(|_| elements.is_empty());
     json!({
