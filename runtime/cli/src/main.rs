@@ -179,17 +179,14 @@ fn run(command: Command) -> Result<(), Refusal> {
                 tolerance,
                 force,
             };
-            let outputs: Vec<_> = [
-                ("-o", &output),
-                ("--emit-c", &emit_c),
-                ("--emit-rust", &emit_rust),
-            ]
-            .into_iter()
-            .filter_map(|(option, path)| Some((option, path.as_deref()?)))
-            .collect();
-            output::check(&[("", &model)], &outputs).map_err(Refusal::of)?;
+            let files = Files {
+                output,
+                emit_c,
+                emit_rust,
+            };
+            files.check(&model)?;
             let model = Model::compile(&model, options)?;
-            let again = output.is_some() || options != Options::default();
+            let again = files.output.is_some() || options != Options::default();
             if again && !model.is_bundle() {
                 return Err(Refusal::new(
                     model.path.display(),
@@ -198,28 +195,7 @@ fn run(command: Command) -> Result<(), Refusal> {
                 ));
             }
             model.policy()?;
-            let image = model.image();
-            // Everything that can be refused is, before the first file is written.
-            let c = emit_c.map(|path| emit::c(image, &path).map(|text| (path, text)));
-            let rust = emit_rust.map(|path| emit::rust(image, &path).map(|text| (path, text)));
-            let sources = [c.transpose()?, rust.transpose()?];
-            let sources = sources
-                .iter()
-                .flatten()
-                .map(|(path, text)| (path, text.as_bytes()));
-            let mut drafts = vec![];
-            for (path, bytes) in output.iter().map(|path| (path, image)).chain(sources) {
-                let draft = output::draft(path).and_then(|mut draft| {
-                    draft.write_all(bytes)?;
-                    Ok(draft)
-                });
-                let draft = draft.map_err(|error| unwritable(path, &error))?;
-                drafts.push((path, bytes.len(), draft));
-            }
-            for (path, bytes, draft) in drafts {
-                draft.commit().map_err(|error| unwritable(path, &error))?;
-                print(&format!("{}: {bytes} bytes\n", path.display()))?;
-            }
+            files.write(model.image())?;
             if options.is_exact() || force {
                 return Ok(());
             }
@@ -250,6 +226,57 @@ fn run(command: Command) -> Result<(), Refusal> {
                 io::stdout().lock(),
             )
         }
+    }
+}
+
+/// The files that `lads compile` writes.
+struct Files {
+    output: Option<PathBuf>,
+    emit_c: Option<PathBuf>,
+    emit_rust: Option<PathBuf>,
+}
+
+impl Files {
+    /// Whether all can be written, before any work; `model` is read.
+    fn check(&self, model: &Path) -> Result<(), Refusal> {
+        let outputs = [
+            ("-o", &self.output),
+            ("--emit-c", &self.emit_c),
+            ("--emit-rust", &self.emit_rust),
+        ];
+        let outputs = outputs.into_iter();
+        let outputs: Vec<_> = outputs
+            .filter_map(|(option, path)| Some((option, path.as_deref()?)))
+            .collect();
+        output::check(&[("", model)], &outputs).map_err(Refusal::of)
+    }
+
+    /// Writes them; everything that can be refused is, before the first one is in its place.
+    fn write(&self, image: &[u8]) -> Result<(), Refusal> {
+        let mut drafts = vec![];
+        let mut draft = |path: &PathBuf, bytes: &[u8]| {
+            let draft = output::draft(path).and_then(|mut draft| {
+                draft.write_all(bytes)?;
+                Ok(draft)
+            });
+            let draft = draft.map_err(|error| unwritable(path, &error))?;
+            drafts.push((path.clone(), bytes.len(), draft));
+            Ok(())
+        };
+        if let Some(path) = &self.output {
+            draft(path, image)?;
+        }
+        if let Some(path) = &self.emit_c {
+            draft(path, emit::c(image, path)?.as_bytes())?;
+        }
+        if let Some(path) = &self.emit_rust {
+            draft(path, emit::rust(image, path)?.as_bytes())?;
+        }
+        for (path, bytes, draft) in drafts {
+            draft.commit().map_err(|error| unwritable(&path, &error))?;
+            print(&format!("{}: {bytes} bytes\n", path.display()))?;
+        }
+        Ok(())
     }
 }
 
