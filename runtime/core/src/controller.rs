@@ -276,10 +276,15 @@ impl<'a, 'm> Controller<'a, 'm> {
             if only_first {
                 run.counters.timestep = 0;
             }
+            // A cache that the call clears has another half, which holds nothing that counts.
+            let cleared = tables.clears(&call).iter();
+            let cleared = cleared
+                .map(|&state| run.clear(state))
+                .all(|done| done.is_ok());
             // What is appended lies behind the rows that count, where the next step writes too; nothing else is stored. A program
             // that fails does so again in the step, which reports it.
             let room = entry.cache == records::NONE || has_room(&tables, &entry, &run.counters);
-            if room && (first || !only_first) {
+            if cleared && room && (first || !only_first) {
                 let _ = run.entry(&entry, 0);
             }
         }
@@ -383,13 +388,10 @@ impl<'a, 'm> Controller<'a, 'm> {
         let Some(scores) = self.policy.sizes.scores else {
             return &[];
         };
-        let memory = if scores.scope == Scope::Step {
-            &*self.workspace.scratch
-        } else {
-            &*self.workspace.now.plain
-        };
         let start = scores.offset as usize;
-        memory
+        self.workspace
+            .now
+            .plain
             .get(start..start.saturating_add(scores.width as usize))
             .unwrap_or(&[])
     }

@@ -163,7 +163,7 @@ impl Run<'_, '_, '_, '_> {
     }
 
     /// Empties a state for what follows; what is in force stays.
-    fn clear(&mut self, state: u32) -> Result<(), RunError> {
+    pub fn clear(&mut self, state: u32) -> Result<(), RunError> {
         let record = self.state(state)?;
         if record.kind == StateKind::Plain {
             let (at, len) = (record.offset as usize, record.width as usize);

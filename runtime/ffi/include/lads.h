@@ -8,53 +8,6 @@
 
 #include <stddef.h>
 #include <stdint.h>
-
-/**
- * Version of this interface; it grows when a program compiled for an older header would no longer work.
- */
-#define LADS_ABI_VERSION 1
-
-/**
- * Alignment of a workspace, in bytes: a cache line, which is also the widest vector.
- */
-#define LADS_WORKSPACE_ALIGN 64
-
-/**
- * Stack that a call of the library takes at most, in bytes: measured on x86-64 with all functions of the archive.
- */
-#define LADS_STACK_BYTES 6224
-
-/**
- * Words of a `lads_policy`.
- */
-#define LADS_POLICY_WORDS 96
-
-/**
- * Flag: arm when the controller is set up, without a self-test. Whoever sets it vouches for the policy on this machine.
- */
-#define LADS_ARM_WITHOUT_SELF_TEST 1
-
-/**
- * Flag: run the same machine code on every processor of the target instead of the widest instructions that this one has.
- * The results have the same bits.
- */
-#define LADS_PORTABLE_INSTRUCTIONS 2
-
-/**
- * Fallback: to the safe action, and stay there until `lads_resume`.
- */
-#define LADS_FALLBACK_STOP 0
-
-/**
- * Fallback: the last action again.
- */
-#define LADS_FALLBACK_HOLD 1
-
-/**
- * Fallback: towards the safe action with the time constant `decay_s`.
- */
-#define LADS_FALLBACK_DECAY 2
-
 /**
  * What came of a call; 0 is good. The numbers are stable: none ever changes its meaning.
  */
@@ -84,9 +37,13 @@ enum lads_status
      */
     LADS_STATUS_OVERLAP = 5,
     /**
-     * The policy was not opened or the controller was not set up, or it was moved since.
+     * The policy was not opened or the controller was not set up, or it was moved or replaced since.
      */
     LADS_STATUS_NOT_SET_UP = 6,
+    /**
+     * A struct's struct_bytes is not set, or not a size that it can have.
+     */
+    LADS_STATUS_STRUCT_BYTES = 7,
     /**
      * Not a program image.
      */
@@ -112,6 +69,14 @@ enum lads_status
      */
     LADS_STATUS_IMAGE_CHECKSUM = 15,
     /**
+     * A control step of the program image takes more work than is allowed.
+     */
+    LADS_STATUS_IMAGE_WORK = 16,
+    /**
+     * The program image needs an operation that this library was built without.
+     */
+    LADS_STATUS_IMAGE_OPERATION = 17,
+    /**
      * The workspace is smaller than the policy needs.
      */
     LADS_STATUS_WORKSPACE_TOO_SMALL = 20,
@@ -128,19 +93,27 @@ enum lads_status
      */
     LADS_STATUS_WORDS_NOT_FINITE = 32,
     /**
-     * The instruct program failed; there is no instruction now.
+     * The instruction could not be taken in; there is no instruction now.
      */
     LADS_STATUS_INSTRUCT_FAILED = 33,
     /**
-     * The contract has no element of this number.
+     * The channel has no element of this number.
      */
     LADS_STATUS_NO_ELEMENT = 34,
+    /**
+     * The policy has no channel of this number or name.
+     */
+    LADS_STATUS_NO_CHANNEL = 35,
+    /**
+     * The policy takes no instruction.
+     */
+    LADS_STATUS_NO_INSTRUCTION_TAKEN = 36,
     /**
      * No instruction has been set.
      */
     LADS_STATUS_NO_INSTRUCTION = 40,
     /**
-     * The observation has another length than the contract's.
+     * A channel of the observation has another length than the contract's.
      */
     LADS_STATUS_OBSERVATION_LENGTH = 41,
     /**
@@ -180,9 +153,9 @@ enum lads_status
      */
     LADS_STATUS_SELF_TEST_REFUSED = 51,
     /**
-     * The self-test chose another plan than recorded.
+     * The self-test selected another index than recorded.
      */
-    LADS_STATUS_SELF_TEST_PLAN = 52,
+    LADS_STATUS_SELF_TEST_SELECTED = 52,
     /**
      * The self-test computed another action than recorded.
      */
@@ -208,7 +181,11 @@ enum lads_status
      */
     LADS_STATUS_LATE = 64,
     /**
-     * A flag or a fallback has no meaning.
+     * The timestamp lies farther behind the last one than can be.
+     */
+    LADS_STATUS_JUMP = 65,
+    /**
+     * A flag, a rule or a fallback has no meaning to this library.
      */
     LADS_STATUS_UNKNOWN_OPTION = 70,
     /**
@@ -227,6 +204,34 @@ enum lads_status
      * The time constant of the decay is not a finite number above zero.
      */
     LADS_STATUS_GUARD_TIME_CONSTANT = 74,
+    /**
+     * A channel of the observation is not given, or the policy has more than one.
+     */
+    LADS_STATUS_CHANNEL_MISSING = 80,
+    /**
+     * A channel is given that is none of the observation, or is given twice.
+     */
+    LADS_STATUS_CHANNEL_UNKNOWN = 81,
+    /**
+     * A channel is given with elements of another type.
+     */
+    LADS_STATUS_CHANNEL_TYPE = 82,
+    /**
+     * The rows of a channel do not lie one behind the other.
+     */
+    LADS_STATUS_CHANNEL_ROWS = 83,
+    /**
+     * The other policy has another control period.
+     */
+    LADS_STATUS_SWAP_CONTROL_PERIOD = 90,
+    /**
+     * A channel of the other policy differs.
+     */
+    LADS_STATUS_SWAP_CHANNELS = 91,
+    /**
+     * The other policy has no instruction yet.
+     */
+    LADS_STATUS_SWAP_INSTRUCTION = 92,
 };
 #ifndef __cplusplus
 #if __STDC_VERSION__ >= 202311L
@@ -235,6 +240,138 @@ typedef enum lads_status lads_status;
 typedef int32_t lads_status;
 #endif // __STDC_VERSION__ >= 202311L
 #endif // __cplusplus
+
+
+/**
+ * Version of this interface; it grows when a program compiled for an older header would no longer work.
+ */
+#define LADS_ABI_VERSION 2
+
+/**
+ * Alignment of a workspace, in bytes: a cache line, which is also the widest vector.
+ */
+#define LADS_WORKSPACE_ALIGN 64
+
+/**
+ * Stack that a call of the library takes at most, in bytes: measured on x86-64 with all functions of the archive.
+ */
+#define LADS_STACK_BYTES 6224
+
+/**
+ * No channel, element or other number: stands where there is none.
+ */
+#define LADS_NONE UINT32_MAX
+
+/**
+ * Words of a `lads_policy`.
+ */
+#define LADS_POLICY_WORDS 96
+
+/**
+ * At a full context: it starts again behind the instruction, at timestep 0, and the policy goes on.
+ */
+#define LADS_BEYOND_RESTART 0
+
+/**
+ * At a full context: the step is refused (`LADS_STATUS_CONTEXT_FULL`) until `lads_reset` or an instruction.
+ */
+#define LADS_BEYOND_REFUSE 1
+
+/**
+ * Role: given by the caller in every control step.
+ */
+#define LADS_ROLE_OBSERVATION 0
+
+/**
+ * Role: written by every control step.
+ */
+#define LADS_ROLE_ACTION 1
+
+/**
+ * Role: word embeddings, `[words, elements]`.
+ */
+#define LADS_ROLE_INSTRUCTION 2
+
+/**
+ * Role: random numbers, drawn by the library unless `lads_step_channels` is given them.
+ */
+#define LADS_ROLE_NOISE 3
+
+/**
+ * Role: a piece of a demonstration.
+ */
+#define LADS_ROLE_DEMONSTRATION 4
+
+/**
+ * Type: 32-bit floats.
+ */
+#define LADS_F32 0
+
+/**
+ * Type: bytes, such as the pixels of a camera.
+ */
+#define LADS_U8 1
+
+/**
+ * Type: signed 32-bit integers.
+ */
+#define LADS_I32 2
+
+/**
+ * Quaternions: there are none in the channel.
+ */
+#define LADS_QUATERNIONS_NONE 0
+
+/**
+ * Quaternions: scalar first.
+ */
+#define LADS_QUATERNIONS_WXYZ 1
+
+/**
+ * Quaternions: scalar last.
+ */
+#define LADS_QUATERNIONS_XYZW 2
+
+/**
+ * The most axes of a channel.
+ */
+#define LADS_MAX_RANK 4
+
+/**
+ * Flag: arm when the controller is set up, without a self-test. Whoever sets it vouches for the policy on this machine.
+ */
+#define LADS_ARM_WITHOUT_SELF_TEST 1
+
+/**
+ * Flag: run the same machine code on every processor of the target instead of the widest instructions that this one has.
+ * The results have the same bits.
+ */
+#define LADS_PORTABLE_INSTRUCTIONS 2
+
+/**
+ * Fallback: to the safe action, and stay there until `lads_resume`.
+ */
+#define LADS_FALLBACK_STOP 0
+
+/**
+ * Fallback: the last action again.
+ */
+#define LADS_FALLBACK_HOLD 1
+
+/**
+ * Fallback: towards the safe action with the time constant `decay_s`.
+ */
+#define LADS_FALLBACK_DECAY 2
+
+/**
+ * Noise: zeros, the mean of what would be drawn.
+ */
+#define LADS_NOISE_ZERO 0
+
+/**
+ * Noise: standard normals; the same seed gives the same values on every target.
+ */
+#define LADS_NOISE_SEEDED 1
 
 /**
  * A controller with its guard, at the start of its workspace. Private.
@@ -257,7 +394,7 @@ typedef struct lads_policy {
  */
 typedef struct lads_text {
     /**
-     * The first character; never null.
+     * The first character; never null in what a call has written.
      */
     const char *data;
     /**
@@ -271,6 +408,18 @@ typedef struct lads_text {
  */
 typedef struct lads_contract {
     /**
+     * Set to `sizeof(lads_contract)` before the call.
+     */
+    uint32_t struct_bytes;
+    /**
+     * Time from one control step to the next, in seconds.
+     */
+    float control_period_s;
+    /**
+     * Family of policies, for example "lads": to be shown, nothing depends on it.
+     */
+    struct lads_text family;
+    /**
      * Environment, for example "franka-kitchen".
      */
     struct lads_text environment;
@@ -283,7 +432,7 @@ typedef struct lads_contract {
      */
     struct lads_text bundle_sha256;
     /**
-     * Language encoder that made the word embeddings.
+     * Language encoder that made the word embeddings; empty without instructions.
      */
     struct lads_text encoder;
     /**
@@ -291,19 +440,31 @@ typedef struct lads_contract {
      */
     struct lads_text encoder_sha256;
     /**
-     * Time from one control step to the next, in seconds.
+     * Channels, see `lads_channel`.
      */
-    float control_period_s;
+    uint32_t channel_count;
     /**
-     * Control steps from one decision to the next.
+     * Channels that are given in every control step; `lads_step` takes a single one, `lads_step_channels` any number.
      */
-    uint32_t horizon;
+    uint32_t observation_count;
     /**
-     * Entries of the codebook, that is, plans.
+     * Number of the first of them.
      */
-    uint32_t codebook_len;
+    uint32_t observation;
     /**
-     * Elements of an observation.
+     * Number of the action's channel.
+     */
+    uint32_t action;
+    /**
+     * Number of the channel of word embeddings; `LADS_NONE` for a policy that takes no instruction and needs none.
+     */
+    uint32_t instruction;
+    /**
+     * Instructions that the policy knows by number.
+     */
+    uint32_t instruction_count;
+    /**
+     * Elements of the first observation channel.
      */
     size_t observation_len;
     /**
@@ -311,7 +472,7 @@ typedef struct lads_contract {
      */
     size_t action_len;
     /**
-     * The most words of an instruction.
+     * The most words of an instruction; 0 for a policy that takes none.
      */
     size_t words_len;
     /**
@@ -319,25 +480,125 @@ typedef struct lads_contract {
      */
     size_t word_dim;
     /**
-     * Instructions that the policy knows by number.
+     * Similarity to a known instruction from which other sentences may be followed, see `lads_instruction_similarity`; above 1
+     * when none may be.
      */
-    uint32_t instruction_count;
+    float acceptance;
     /**
-     * Control steps that a context holds.
+     * Control steps that a context holds; 0 for no such bound.
      */
     uint32_t context_steps;
+    /**
+     * What happens after them: `LADS_BEYOND_RESTART` or `LADS_BEYOND_REFUSE`.
+     */
+    uint32_t beyond;
+    /**
+     * Indices, such as those of latent plans, that the policy selects from; 0 for one that selects nothing.
+     */
+    uint32_t index_count;
+    /**
+     * Divides the scores when an index is picked at random, unless `lads_set_decision` says otherwise; 0 for argmax.
+     */
+    float temperature;
+    /**
+     * `LADS_NOISE_ZERO` or `LADS_NOISE_SEEDED`, unless `lads_set_noise` says otherwise.
+     */
+    uint32_t noise;
+    /**
+     * Of the picks at random.
+     */
+    uint64_t decision_seed;
+    /**
+     * Of the noise.
+     */
+    uint64_t noise_seed;
+    /**
+     * Values of noise that a control step takes at most; 0 for a policy without noise.
+     */
+    size_t noise_len;
     /**
      * Bytes of the image; what lies behind them is not read.
      */
     size_t image_bytes;
+    /**
+     * Multiply-adds of the most expensive control step.
+     */
+    uint64_t worst_work;
 } lads_contract;
 
 /**
- * One element of an observation or an action.
+ * A channel: a value at the policy's edge.
+ */
+typedef struct lads_channel_t {
+    /**
+     * Set to `sizeof(lads_channel_t)` before the call.
+     */
+    uint32_t struct_bytes;
+    /**
+     * `LADS_ROLE_OBSERVATION`, `_ACTION`, `_INSTRUCTION`, `_NOISE` or `_DEMONSTRATION`.
+     */
+    uint32_t role;
+    /**
+     * Type of its elements: `LADS_F32`, `LADS_U8` or `LADS_I32`.
+     */
+    uint32_t dtype;
+    /**
+     * Axes, 1 to 4.
+     */
+    uint32_t rank;
+    /**
+     * Lengths of the axes; 1 beyond the rank.
+     */
+    uint32_t dims[LADS_MAX_RANK];
+    /**
+     * Elements, in the order of the axes.
+     */
+    size_t len;
+    /**
+     * Name.
+     */
+    struct lads_text name;
+    /**
+     * What its values are relative to, in words, such as "the observed joint position"; empty where the bundle does not say.
+     */
+    struct lads_text reference;
+    /**
+     * `LADS_QUATERNIONS_NONE`, `_WXYZ` or `_XYZW`: order of the components of the quaternions in it.
+     */
+    uint32_t quaternions;
+    /**
+     * 1 when its elements have names and units, 0 for images and the like, whose elements are alike.
+     */
+    uint32_t described;
+} lads_channel_t;
+
+/**
+ * One element of a channel. Its physical value is reference + offset + scale * value, in the unit, where the reference is what
+ * the channel's is for this joint.
  */
 typedef struct lads_element {
     /**
-     * Name.
+     * Set to `sizeof(lads_element)` before the call.
+     */
+    uint32_t struct_bytes;
+    /**
+     * Smallest value, before scale and offset.
+     */
+    float min;
+    /**
+     * Largest value, before scale and offset.
+     */
+    float max;
+    /**
+     * Physical value of one unit of the element.
+     */
+    float scale;
+    /**
+     * Physical value of zero, on top of the channel's reference.
+     */
+    float offset;
+    /**
+     * Name; empty for an element of a channel without descriptions.
      */
     struct lads_text name;
     /**
@@ -349,19 +610,19 @@ typedef struct lads_element {
      */
     struct lads_text joint;
     /**
-     * Smallest value, in the unit.
+     * What of the joint: "position", "velocity", "effort"; empty where the bundle does not say.
      */
-    float min;
-    /**
-     * Largest value, in the unit.
-     */
-    float max;
+    struct lads_text interface;
 } lads_element;
 
 /**
  * One instruction that a policy knows.
  */
 typedef struct lads_instruction {
+    /**
+     * Set to `sizeof(lads_instruction)` before the call.
+     */
+    uint32_t struct_bytes;
     /**
      * Short name.
      */
@@ -371,20 +632,20 @@ typedef struct lads_instruction {
      */
     struct lads_text text;
     /**
-     * Sub-tasks, separated by commas.
-     */
-    struct lads_text sub_tasks;
-    /**
      * Words.
      */
     size_t words_len;
 } lads_instruction;
 
 /**
- * How the guard works. All zero (`lads_options options = {0};`) is a guard with the contract's limits and no rate that stops at
- * the first fault. The lists have `action_len` elements and are copied; null stands for the default.
+ * How the guard works. All zero but the size (`lads_options options = {sizeof options};`) is a guard with the contract's limits and
+ * no rate that stops at the first fault. The lists have `action_len` elements and are copied; null stands for the default.
  */
 typedef struct lads_options {
+    /**
+     * Set to `sizeof(lads_options)`.
+     */
+    uint32_t struct_bytes;
     /**
      * `LADS_ARM_WITHOUT_SELF_TEST`, `LADS_PORTABLE_INSTRUCTIONS`, or both.
      */
@@ -402,9 +663,19 @@ typedef struct lads_options {
      */
     uint32_t late_after;
     /**
+     * Periods in a row whose observation is missing, stale or refused, in which the last action is repeated and the policy's state is
+     * kept before the fallback takes over.
+     */
+    uint32_t coast;
+    /**
      * Stops after so many interventions in a row; 0 for never.
      */
     uint32_t stop_after;
+    /**
+     * The farthest that a timestamp may lie behind the last one, in its unit; 0 for any distance. One beyond it is taken for damaged:
+     * it is refused, and does not count as the last one.
+     */
+    uint64_t max_jump;
     /**
      * Smallest actions, where the contract's are not narrower.
      */
@@ -418,17 +689,91 @@ typedef struct lads_options {
      */
     const float *max_rate;
     /**
-     * Where the stop and the decay lead, and where the first action starts from.
+     * Where the stop and the decay lead, and where the first action starts from; zero, or the limit nearest to it, unless given.
      */
     const float *safe_action;
 } lads_options;
 
 /**
- * What a self-test that passed has measured.
+ * What happened in a call: in a control period, or when something was refused.
+ */
+typedef struct lads_report {
+    /**
+     * Set to `sizeof(lads_report)` before the call.
+     */
+    uint32_t struct_bytes;
+    /**
+     * What the call returned.
+     */
+    int32_t status;
+    /**
+     * 1 when the policy took a step; the next five are 0 otherwise.
+     */
+    uint32_t stepped;
+    /**
+     * Control steps since the context began.
+     */
+    uint32_t timestep;
+    /**
+     * 1 when an index is in force; the next three are 0 otherwise, as for a policy that selects none.
+     */
+    uint32_t has_selected;
+    /**
+     * The index in force, such as that of a latent plan.
+     */
+    uint32_t selected;
+    /**
+     * The largest score of the last selection minus the second largest; infinite with a single one.
+     */
+    float margin;
+    /**
+     * 1 when this step selected the index, else 0.
+     */
+    uint32_t fresh;
+    /**
+     * 1 when the action is the last one again, because the options let so many observations be missed.
+     */
+    uint32_t coasting;
+    /**
+     * 1 when an element of the action was at a limit or beyond and is now at the limit.
+     */
+    uint32_t saturated;
+    /**
+     * 1 when an element of the action moves as fast as it may, less far than it should.
+     */
+    uint32_t rate_limited;
+    /**
+     * The channel that was refused; `LADS_NONE` when it was none.
+     */
+    uint32_t channel;
+    /**
+     * The first of its elements that was refused, or the word element; `LADS_NONE` when it was none.
+     */
+    uint32_t element;
+    /**
+     * That element's value, for `LADS_STATUS_OUT_OF_LIMITS`; 0 otherwise.
+     */
+    float value;
+    /**
+     * Smallest value allowed, for `LADS_STATUS_OUT_OF_LIMITS`; 0 otherwise.
+     */
+    float min;
+    /**
+     * Largest value allowed, for `LADS_STATUS_OUT_OF_LIMITS`; 0 otherwise.
+     */
+    float max;
+} lads_report;
+
+/**
+ * What a self-test has measured, or where it failed.
  */
 typedef struct lads_self_test_t {
     /**
-     * Control steps replayed.
+     * Set to `sizeof(lads_self_test_t)` before the call.
+     */
+    uint32_t struct_bytes;
+    /**
+     * Control steps replayed; 0 when it failed, as are the next two.
      */
     uint32_t steps;
     /**
@@ -440,6 +785,22 @@ typedef struct lads_self_test_t {
      * Largest absolute difference of an action element from the recorded one.
      */
     float largest_error;
+    /**
+     * The first step that failed, counted from 0; `LADS_NONE` when none did.
+     */
+    uint32_t failed_step;
+    /**
+     * The element of the action that was off, for `LADS_STATUS_SELF_TEST_ACTION`; `LADS_NONE` otherwise.
+     */
+    uint32_t element;
+    /**
+     * What is recorded there: the element's value, or the index for `LADS_STATUS_SELF_TEST_SELECTED`.
+     */
+    float expected;
+    /**
+     * What this target computed there.
+     */
+    float got;
 } lads_self_test_t;
 
 /**
@@ -447,57 +808,55 @@ typedef struct lads_self_test_t {
  */
 typedef struct lads_tick {
     /**
-     * When the observation was taken, in any unit. One that is not later than the last one is stale.
+     * Set to `sizeof(lads_tick)`.
      */
-    uint64_t timestamp;
+    uint32_t struct_bytes;
     /**
      * Control periods that have passed without a step since the last one.
      */
     uint32_t missed;
+    /**
+     * When the observation was taken, in any unit. One that is not later than the last one is stale.
+     */
+    uint64_t timestamp;
 } lads_tick;
 
 /**
- * What happened in a control period.
+ * The values of one channel. It has no `struct_bytes`, as it comes in lists; it will not grow.
  */
-typedef struct lads_report {
+typedef struct lads_input {
     /**
-     * What `lads_step` returned.
+     * Number of the channel.
      */
-    int32_t status;
+    uint32_t channel;
     /**
-     * 1 when the policy took a step; the next four are 0 otherwise.
+     * Type of the values, the channel's: `LADS_F32`, `LADS_U8` or `LADS_I32`.
      */
-    uint32_t stepped;
+    uint32_t dtype;
     /**
-     * Control steps since the context began.
+     * The values, one behind the other in the order of the channel's axes. Null says that there is no observation.
      */
-    uint32_t timestep;
+    const void *data;
     /**
-     * The plan in force: an index into the codebook.
+     * How many values there are.
      */
-    uint32_t plan;
+    size_t len;
     /**
-     * 1 when this step decided the plan, else 0.
+     * Bytes from one row to the next, a row being what the first axis counts, such as a line of an image: whoever takes pictures
+     * knows it. A line that is longer than its pixels is refused (`LADS_STATUS_CHANNEL_ROWS`), as the library has no memory to
+     * bring lines together in: copy them first. 0 says that there is no gap.
      */
-    uint32_t decided;
-    /**
-     * The largest logit of the last decision minus the second largest.
-     */
-    float margin;
-    /**
-     * 1 when an element of the action was at a limit or beyond and is now at the limit.
-     */
-    uint32_t saturated;
-    /**
-     * 1 when an element of the action moves as fast as it may, less far than it should.
-     */
-    uint32_t rate_limited;
-} lads_report;
+    size_t row_bytes;
+} lads_input;
 
 /**
  * What a guard has done since the controller was set up, in control periods. `policy` to `refused` add up to `periods`.
  */
 typedef struct lads_counters_t {
+    /**
+     * Set to `sizeof(lads_counters_t)` before the call.
+     */
+    uint32_t struct_bytes;
     /**
      * All.
      */
@@ -519,7 +878,7 @@ typedef struct lads_counters_t {
      */
     uint64_t no_observation;
     /**
-     * With a stale observation.
+     * With a stale observation, or one whose timestamp jumps.
      */
     uint64_t stale;
     /**
@@ -538,6 +897,10 @@ typedef struct lads_counters_t {
      * That the controller refused for another reason: no instruction, a full context, a wrong length.
      */
     uint64_t refused;
+    /**
+     * In which the last action was repeated; counted above as well.
+     */
+    uint64_t coasted;
     /**
      * Missed periods.
      */
@@ -579,28 +942,59 @@ lads_status lads_policy_open(const uint8_t *image,
                              struct lads_policy *policy);
 
 /**
+ * As `lads_policy_open`, but refuses an image whose most expensive control step takes more than so many multiply-adds;
+ * `lads_policy_open` refuses those that take some seconds on a fast core.
+ *
+ * # Safety
+ * As `lads_policy_open`.
+ */
+lads_status lads_policy_open_within(const uint8_t *image,
+                                    size_t image_bytes,
+                                    uint64_t work_limit,
+                                    struct lads_policy *policy);
+
+/**
  * Tells what a policy expects and promises. The texts live as long as the image.
  *
  * # Safety
- * `policy` is null or a `lads_policy`, zeroed or opened; `contract` may be written.
+ * `policy` is null or a `lads_policy`, zeroed or opened; `contract` may be read and written.
  */
 lads_status lads_policy_contract(const struct lads_policy *policy, struct lads_contract *contract);
 
 /**
- * Tells about element `index` of an observation: name, unit, joint, limits.
+ * How many channels a policy has; 0 when it was not opened.
  *
  * # Safety
- * As `lads_policy_contract`.
+ * `policy` is null or a `lads_policy`, zeroed or opened.
  */
-lads_status lads_policy_observation(const struct lads_policy *policy, size_t index, struct lads_element *element);
+uint32_t lads_channel_count(const struct lads_policy *policy);
 
 /**
- * Tells about element `index` of an action: name, unit, joint, limits.
+ * Tells about a channel by its number, from 0.
  *
  * # Safety
  * As `lads_policy_contract`.
  */
-lads_status lads_policy_action(const struct lads_policy *policy, size_t index, struct lads_element *element);
+lads_status lads_channel(const struct lads_policy *policy, uint32_t number, struct lads_channel_t *channel);
+
+/**
+ * Finds the number of a channel by its name, byte for byte.
+ *
+ * # Safety
+ * As `lads_policy_contract`; `name` points to `name_len` bytes, no zero needed; `number` may be written.
+ */
+lads_status lads_channel_find(const struct lads_policy *policy, const char *name, size_t name_len, uint32_t *number);
+
+/**
+ * Tells about an element of a channel: name, unit, limits, joint, interface, and what its values mean.
+ *
+ * # Safety
+ * As `lads_policy_contract`.
+ */
+lads_status lads_channel_element(const struct lads_policy *policy,
+                                 uint32_t channel,
+                                 size_t index,
+                                 struct lads_element *element);
 
 /**
  * Tells about an instruction that the policy knows, by its number.
@@ -633,34 +1027,74 @@ size_t lads_workspace_bytes(const struct lads_policy *policy);
 
 /**
  * Sets up a controller with its guard in `workspace`, aligned to `LADS_WORKSPACE_ALIGN`, which need not be initialised.
- * `options` may be null; so may `controller`, the handle for the other functions, which is the address of the workspace. It is
- * not armed unless `LADS_ARM_WITHOUT_SELF_TEST` is set. To end it, stop using it: nothing has to be undone.
+ * `options` may be null; so may `controller`, the handle for the other functions, which is the address of the workspace; so may
+ * `report`, which names the element of the action whose limits, rate or safe action were refused. The controller is not armed unless
+ * `LADS_ARM_WITHOUT_SELF_TEST` is set. A refusal touches nothing of the workspace: a controller that runs there goes on. To end
+ * a controller, stop using it: nothing has to be undone.
  *
  * # Safety
  * `policy` is null or a `lads_policy`, zeroed or opened; `workspace` points to `workspace_bytes` writable bytes that nobody
  * else uses or moves as long as the controller is used; lists in the options are as long as an action; `controller` is null or
- * may be written.
+ * may be written; `report` is null or may be read and written.
  */
 lads_status lads_controller_init(const struct lads_policy *policy,
                                  void *workspace,
                                  size_t workspace_bytes,
                                  const struct lads_options *options,
-                                 struct lads_controller **controller);
+                                 struct lads_controller **controller,
+                                 struct lads_report *report);
 
 /**
- * Replays the recorded episode, compares plans and actions, and arms the controller if it passes, disarms it if not. Afterwards
- * there is no instruction. `result`, which may be null, gets what a test that passed has measured.
+ * Replays the recorded episode, compares indices and actions, and arms the controller if it passes, disarms it if not. Afterwards
+ * there is no instruction. `result`, which may be null, gets what a test has measured, or where it failed.
  *
  * # Safety
  * `controller` is null or a workspace, zeroed or set up by `lads_controller_init`, and no other call uses it now;
- * `result` is null or may be written.
+ * `result` is null or may be read and written.
  */
 lads_status lads_self_test(struct lads_controller *controller,
                            struct lads_self_test_t *result);
 
 /**
- * Follows a known instruction, by its number, from the next step on: a new episode. `LADS_STATUS_INSTRUCT_FAILED`, which a sound image
- * never causes, leaves the controller without an instruction.
+ * Puts another policy in the place of the one that runs, between two steps. `next` is a controller that was set up beside it, in a
+ * workspace of its own, tested and given its instruction, which another thread may have done while this one ran.
+ *
+ * Afterwards `next` is the one to step: it goes on with the limits, rates, fallback, counters and clock of `controller`, whose options
+ * stay in force, and its first action is no further from the last executed one than the rate allows. It is armed if both
+ * were. `controller` is ended, and its workspace is yours again, for the policy after that.
+ *
+ * Refused, `controller` goes on as if nothing had been asked, and `next` stays as it was: another control period
+ * (`LADS_STATUS_SWAP_CONTROL_PERIOD`), a channel that differs, which the report names (`LADS_STATUS_SWAP_CHANNELS`), no instruction
+ * where `controller` has one (`LADS_STATUS_SWAP_INSTRUCTION`). `report` may be null.
+ *
+ * # Safety
+ * As `lads_self_test`, for both controllers; `report` is null or may be read and written.
+ */
+lads_status lads_swap(struct lads_controller *controller,
+                      struct lads_controller *next,
+                      struct lads_report *report);
+
+/**
+ * Starts a new episode with the same instruction; timestamps may start anew. A stop stays a stop.
+ *
+ * # Safety
+ * As `lads_self_test`.
+ */
+lads_status lads_reset(struct lads_controller *controller);
+
+/**
+ * Brings code, weights and KV caches into the processor's caches, so that the next step is as fast as the ones after it: for right
+ * before the first step, or after a pause. Costs two to three control steps and changes nothing.
+ *
+ * # Safety
+ * As `lads_self_test`.
+ */
+lads_status lads_warm(struct lads_controller *controller);
+
+/**
+ * Follows a known instruction, by its number, from the next step on: a new episode. `LADS_STATUS_INSTRUCT_FAILED`, which a sound
+ * image never causes, leaves the controller without an instruction. A policy whose contract has no instruction channel needs
+ * none.
  *
  * # Safety
  * As `lads_self_test`.
@@ -669,15 +1103,35 @@ lads_status lads_set_instruction(struct lads_controller *controller,
                                  uint32_t number);
 
 /**
- * Follows an instruction given as word embeddings, `len = n * word_dim` elements, as `lads_set_instruction` does.
+ * Follows an instruction given as word embeddings, `len = n * word_dim` elements, as `lads_set_instruction` does. A policy follows
+ * any words, whatever they say: ask `lads_instruction_similarity` first. `report`, which may be null, names the word element that was
+ * refused.
  *
  * # Safety
- * As `lads_self_test`; `words` points to `len` readable elements outside the workspace.
+ * As `lads_self_test`; `words` points to `len` readable elements; `report` is null or may be read and written.
  */
-lads_status lads_set_words(struct lads_controller *controller, const float *words, size_t len);
+lads_status lads_set_words(struct lads_controller *controller,
+                           const float *words,
+                           size_t len,
+                           struct lads_report *report);
 
 /**
- * Picks plans by argmax (`temperature` not above 0) or at random with the softmax of the logits over the temperature.
+ * Says which known instruction a sentence, given as word embeddings, is most like, and how much, from -1 to 1. Whoever lets people
+ * say what they like compares it with the contract's `acceptance` and refuses what is below: the policy follows any words.
+ * Words are compared, not meanings. `number` may be null.
+ *
+ * # Safety
+ * `policy` is null or a `lads_policy`, zeroed or opened; `words` points to `len` readable elements; `number` is null or may be
+ * written, `similarity` may be written.
+ */
+lads_status lads_instruction_similarity(const struct lads_policy *policy,
+                                        const float *words,
+                                        size_t len,
+                                        uint32_t *number,
+                                        float *similarity);
+
+/**
+ * Picks indices by argmax (`temperature` not above 0) or at random with the softmax of the scores over the temperature.
  *
  * # Safety
  * As `lads_self_test`.
@@ -685,16 +1139,29 @@ lads_status lads_set_words(struct lads_controller *controller, const float *word
 lads_status lads_set_decision(struct lads_controller *controller, float temperature, uint64_t seed);
 
 /**
- * One control period: writes an action that is finite and inside limits and rates, whatever the observation is. `LADS_STATUS_OK` says
- * that it is the policy's; any other status why it is the fallback's. A null `observation` says that there is none. `tick` may
- * be null, then nothing is stale or late; so may `report`.
+ * Says where the noise of a policy comes from: `LADS_NOISE_ZERO`, or `LADS_NOISE_SEEDED` with a seed, whose generator starts again.
  *
- * Only when the call itself is wrong, nothing happens and nothing is written: `controller` not set up, `action` of another
- * length than the contract's, null or overlapping the workspace, `tick` or `report` misaligned.
+ * # Safety
+ * As `lads_self_test`.
+ */
+lads_status lads_set_noise(struct lads_controller *controller,
+                           uint32_t rule,
+                           uint64_t seed);
+
+/**
+ * One control period of a policy with one observation channel of floats: writes an action that is finite and inside limits and rates,
+ * whatever the observation is. `LADS_STATUS_OK` says that it is the policy's; any other status why it is the fallback's. A null
+ * `observation` says that there is none. `tick` may be null, then nothing is stale or late; so may `report`, which names the
+ * channel and the element that was refused.
+ *
+ * Nothing is written, and no period is counted, only where there is no room for an action: `controller` is null, misaligned or
+ * not set up; `action` is null, misaligned, of another length than the contract's, or overlaps the workspace or the image. All
+ * else that is wrong with the call, such as a `tick` or a `report` that is misaligned, has no size or overlaps, is a period without an
+ * observation: the fallback's action is written, the status says what was wrong, and so does the report unless it is what is wrong.
  *
  * # Safety
  * As `lads_self_test`; `observation` and `action` point to as many elements as they say; `tick` and `report` are null or may
- * be read and written.
+ * be read, and the report written.
  */
 lads_status lads_step(struct lads_controller *controller,
                       const float *observation,
@@ -705,32 +1172,32 @@ lads_status lads_step(struct lads_controller *controller,
                       struct lads_report *report);
 
 /**
- * Tells what was really executed since the last step, where that is not the action that `lads_step` wrote; the next step
- * continues from there.
+ * One control period of any policy, as `lads_step`: `inputs` are the values of all observation channels, in any order; a null pointer
+ * says that there is no observation. Values for a noise channel, as many as the contract's `noise_len` in the order in which they
+ * are used, take the place of the library's.
  *
  * # Safety
- * As `lads_self_test`; `action` points to `action_len` readable elements outside the workspace.
+ * As `lads_step`; `inputs` points to `count` inputs, whose data are as many values of their type as they say.
+ */
+lads_status lads_step_channels(struct lads_controller *controller,
+                               const struct lads_input *inputs,
+                               size_t count,
+                               const struct lads_tick *tick,
+                               float *action,
+                               size_t action_len,
+                               struct lads_report *report);
+
+/**
+ * Tells what was really executed since the last step, where that is not the action that `lads_step` wrote; the next step
+ * continues from there. `report`, which may be null, names the element that was refused.
+ *
+ * # Safety
+ * As `lads_self_test`; `action` points to `action_len` readable elements; `report` is null or may be read and written.
  */
 lads_status lads_executed(struct lads_controller *controller,
                           const float *action,
-                          size_t action_len);
-
-/**
- * Starts a new episode with the same instruction. A stop stays a stop.
- *
- * # Safety
- * As `lads_self_test`.
- */
-lads_status lads_reset(struct lads_controller *controller);
-
-/**
- * Brings code, weights and KV cache into the processor's caches, so that the next step is as fast as the ones after it: for right
- * before the first step, or after a pause. Costs about two control steps and changes nothing.
- *
- * # Safety
- * As `lads_self_test`.
- */
-lads_status lads_warm(struct lads_controller *controller);
+                          size_t action_len,
+                          struct lads_report *report);
 
 /**
  * Stops as `LADS_FALLBACK_STOP` does, from the next step on.
@@ -752,7 +1219,7 @@ lads_status lads_resume(struct lads_controller *controller);
  * Tells what the guard has done since the controller was set up.
  *
  * # Safety
- * As `lads_self_test`; `counters` may be written.
+ * As `lads_self_test`; `counters` may be read and written.
  */
 lads_status lads_counters(struct lads_controller *controller, struct lads_counters_t *counters);
 

@@ -13,6 +13,8 @@
  *     auto status = controller.step(observation, action, tick);   // every control period: from a controller that is
  *                                                                 // set up, into an action of the contract's length, `action`
  *                                                                 // may be executed, whatever the status
+ *
+ * Structs that begin with struct_bytes are made with lads::made<lads_options>(), which sets it.
  */
 #ifndef LADS_HPP
 #define LADS_HPP
@@ -65,6 +67,33 @@ private:
     lads_status code_;
 };
 
+/** A struct of lads.h, all zero but its size. */
+template <typename T>
+constexpr T made() noexcept {
+    T value{};
+    value.struct_bytes = sizeof(T);
+    return value;
+}
+
+/** The clock of a control period. */
+inline lads_tick tick(std::uint64_t timestamp, std::uint32_t missed = 0) noexcept {
+    auto tick = made<lads_tick>();
+    tick.timestamp = timestamp;
+    tick.missed = missed;
+    return tick;
+}
+
+/** The values of a channel, one behind the other; row_bytes as in lads_input. */
+inline lads_input input(std::uint32_t channel, Span<const float> values, std::size_t row_bytes = 0) noexcept {
+    return {channel, LADS_F32, values.data(), values.size(), row_bytes};
+}
+inline lads_input input(std::uint32_t channel, Span<const std::uint8_t> values, std::size_t row_bytes = 0) noexcept {
+    return {channel, LADS_U8, values.data(), values.size(), row_bytes};
+}
+inline lads_input input(std::uint32_t channel, Span<const std::int32_t> values, std::size_t row_bytes = 0) noexcept {
+    return {channel, LADS_I32, values.data(), values.size(), row_bytes};
+}
+
 /** A text inside the image. */
 inline std::string_view view(lads_text text) noexcept { return {text.data, text.len}; }
 
@@ -76,7 +105,7 @@ public:
     Policy &operator=(const Policy &) = delete;
 
     Status open(Span<const std::uint8_t> image) noexcept {
-        contract_ = {};
+        contract_ = made<lads_contract>();
         const Status status = lads_policy_open(image.data(), image.size(), &policy_);
         return status ? Status(lads_policy_contract(&policy_, &contract_)) : status;
     }
@@ -85,23 +114,42 @@ public:
     std::size_t workspace_bytes() const noexcept { return lads_workspace_bytes(&policy_); }
     const lads_policy *get() const noexcept { return &policy_; }
 
+    std::uint32_t channel_count() const noexcept { return lads_channel_count(&policy_); }
+    Status channel(std::uint32_t number, lads_channel_t &channel) const noexcept {
+        channel = made<lads_channel_t>();
+        return lads_channel(&policy_, number, &channel);
+    }
+    /** By name, byte for byte. */
+    Status find_channel(std::string_view name, std::uint32_t &number) const noexcept {
+        return lads_channel_find(&policy_, name.data(), name.size(), &number);
+    }
+    Status element(std::uint32_t channel, std::size_t index, lads_element &element) const noexcept {
+        element = made<lads_element>();
+        return lads_channel_element(&policy_, channel, index, &element);
+    }
+    /** Of the first observation channel, the only one of most policies. */
     Status observation(std::size_t index, lads_element &element) const noexcept {
-        return lads_policy_observation(&policy_, index, &element);
+        return this->element(contract_.observation, index, element);
     }
     Status action(std::size_t index, lads_element &element) const noexcept {
-        return lads_policy_action(&policy_, index, &element);
+        return this->element(contract_.action, index, element);
     }
     Status instruction(std::uint32_t number, lads_instruction &known) const noexcept {
+        known = made<lads_instruction>();
         return lads_policy_instruction(&policy_, number, &known);
     }
     /** By id or text, byte for byte. */
     Status find_instruction(std::string_view name, std::uint32_t &number) const noexcept {
         return lads_policy_find_instruction(&policy_, name.data(), name.size(), &number);
     }
+    /** Which known instruction words are most like, and how much: compare it with contract().acceptance. */
+    Status similarity(Span<const float> words, std::uint32_t &number, float &similarity) const noexcept {
+        return lads_instruction_similarity(&policy_, words.data(), words.size(), &number, &similarity);
+    }
 
 private:
     lads_policy policy_{};
-    lads_contract contract_{};
+    lads_contract contract_ = made<lads_contract>();
 };
 
 /** A controller with its guard. */
@@ -113,20 +161,22 @@ public:
     ~Controller() { release(); }
 
     /** Allocates a workspace and sets the controller up in it. */
-    Status allocate(const Policy &policy, const lads_options &options = {}) noexcept {
+    Status allocate(const Policy &policy, const lads_options &options = made<lads_options>(),
+                    lads_report *report = nullptr) noexcept {
         const std::size_t bytes = policy.workspace_bytes();
         if (bytes == 0) {
             return LADS_STATUS_NOT_SET_UP;
         }
         release();
         owned_ = ::operator new(bytes, alignment, std::nothrow);
-        return owned_ == nullptr ? Status(LADS_STATUS_WORKSPACE_TOO_SMALL) : init(policy, owned_, bytes, options);
+        return owned_ == nullptr ? Status(LADS_STATUS_WORKSPACE_TOO_SMALL) : init(policy, owned_, bytes, options, report);
     }
 
     /** Sets the controller up in lent memory, aligned to LADS_WORKSPACE_ALIGN, which has to outlive it. */
-    Status use(const Policy &policy, void *workspace, std::size_t bytes, const lads_options &options = {}) noexcept {
+    Status use(const Policy &policy, void *workspace, std::size_t bytes, const lads_options &options = made<lads_options>(),
+               lads_report *report = nullptr) noexcept {
         release();
-        return init(policy, workspace, bytes, options);
+        return init(policy, workspace, bytes, options, report);
     }
 
     /** Replays the recorded episode, and arms if it passes. */
@@ -141,12 +191,13 @@ public:
         const Status status = policy_->find_instruction(name, number);
         return status ? set_instruction(number) : status;
     }
-    Status set_words(Span<const float> words) noexcept {
-        return lads_set_words(controller_, words.data(), words.size());
+    Status set_words(Span<const float> words, lads_report *report = nullptr) noexcept {
+        return lads_set_words(controller_, words.data(), words.size(), report);
     }
     Status set_decision(float temperature, std::uint64_t seed) noexcept {
         return lads_set_decision(controller_, temperature, seed);
     }
+    Status set_noise(std::uint32_t rule, std::uint64_t seed) noexcept { return lads_set_noise(controller_, rule, seed); }
 
     /** One control period; see lads_step. */
     Status step(Span<const float> observation, Span<float> action, const lads_tick &tick,
@@ -157,23 +208,48 @@ public:
     Status step(Span<const float> observation, Span<float> action, lads_report *report = nullptr) noexcept {
         return lads_step(controller_, observation.data(), observation.size(), nullptr, action.data(), action.size(), report);
     }
+    /** One control period of any policy; see lads_step_channels. */
+    Status step_channels(Span<const lads_input> inputs, Span<float> action, const lads_tick *tick = nullptr,
+                         lads_report *report = nullptr) noexcept {
+        return lads_step_channels(controller_, inputs.data(), inputs.size(), tick, action.data(), action.size(), report);
+    }
 
-    Status executed(Span<const float> action) noexcept {
-        return lads_executed(controller_, action.data(), action.size());
+    /**
+     * Lets `next`, which was set up, tested and instructed beside this one, take its place between two steps; see lads_swap.
+     * Afterwards this one is the new policy, and `next` has the old one's memory, to be set up again.
+     */
+    Status swap(Controller &next, lads_report *report = nullptr) noexcept {
+        const Status status = lads_swap(controller_, next.controller_, report);
+        if (status) {
+            controller_ = next.controller_;
+            next.controller_ = nullptr;
+            policy_ = next.policy_;
+            next.policy_ = nullptr;
+            std::swap(owned_, next.owned_);
+        }
+        return status;
+    }
+
+    Status executed(Span<const float> action, lads_report *report = nullptr) noexcept {
+        return lads_executed(controller_, action.data(), action.size(), report);
     }
     Status reset() noexcept { return lads_reset(controller_); }
     Status warm() noexcept { return lads_warm(controller_); }
     Status stop() noexcept { return lads_stop(controller_); }
     Status resume() noexcept { return lads_resume(controller_); }
-    Status counters(lads_counters_t &counters) noexcept { return lads_counters(controller_, &counters); }
+    Status counters(lads_counters_t &counters) noexcept {
+        counters = made<lads_counters_t>();
+        return lads_counters(controller_, &counters);
+    }
 
     lads_controller *get() noexcept { return controller_; }
 
 private:
     static constexpr std::align_val_t alignment{LADS_WORKSPACE_ALIGN};
 
-    Status init(const Policy &policy, void *workspace, std::size_t bytes, const lads_options &options) noexcept {
-        const Status status = lads_controller_init(policy.get(), workspace, bytes, &options, &controller_);
+    Status init(const Policy &policy, void *workspace, std::size_t bytes, const lads_options &options,
+                lads_report *report) noexcept {
+        const Status status = lads_controller_init(policy.get(), workspace, bytes, &options, &controller_, report);
         policy_ = status ? &policy : nullptr;
         return status;
     }

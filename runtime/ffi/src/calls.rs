@@ -3,11 +3,16 @@
 //! Each checks all its pointers before it does anything: that they are what they can be, and that what is written overlaps nothing
 //! ([`apart`](crate::memory::apart)).
 
-pub mod control;
+// In the order in which they are called, which is the header's.
 pub mod describe;
-pub mod instruct;
+
 pub mod setup;
+
+pub mod instruct;
+
 pub mod step;
+
+pub mod control;
 
 use crate::memory::{Area, apart_from};
 use crate::status::Status;

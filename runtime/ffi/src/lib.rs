@@ -50,6 +50,7 @@ mod calls;
 mod handle;
 mod layout;
 mod memory;
+/// cbindgen:ignore
 #[cfg(all(feature = "static-library", not(test)))]
 mod panic;
 mod status;

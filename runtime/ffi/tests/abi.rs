@@ -6,8 +6,7 @@ use core::ffi::CStr;
 use core::ptr::{null, null_mut};
 use core::slice;
 
-use host::support::assemble::{parts, with_golden};
-use host::support::{Memory, Model, Random, Spec};
+use host::support::{Memory, Random};
 use host::*;
 use lads_core::Instruction;
 use lads_ffi::*;
@@ -26,7 +25,7 @@ fn an_episode_through_c_is_the_controllers_episode() {
         .set_instruction(Instruction::Words(&words))
         .expect("two words are enough");
     // SAFETY: the controller and the words are alive.
-    let status = unsafe { lads_set_words(c, words.as_ptr(), words.len()) };
+    let status = unsafe { lads_set_words(c, words.as_ptr(), words.len(), null_mut()) };
     assert_eq!(status, Status::Ok);
     for t in 0..30 {
         if t == 10 {
@@ -49,15 +48,20 @@ fn an_episode_through_c_is_the_controllers_episode() {
         let (status, report) = step(c, &observation, &mut action);
         assert_eq!((status, report.status, report.stepped), (Status::Ok, 0, 1));
         assert_eq!(action, other);
+        let selected = made.selected.expect("the policy selects");
         assert_eq!(
-            (report.timestep, report.plan, report.margin),
-            (made.timestep, made.plan.0, made.margin)
+            (report.timestep, report.selected, report.margin),
+            (made.timestep, selected.index, selected.margin)
         );
-        assert_eq!(report.decided == 1, made.decided);
+        assert_eq!(
+            (report.has_selected, report.fresh == 1),
+            (1, selected.fresh)
+        );
+        assert_eq!((report.channel, report.element), (LADS_NONE, LADS_NONE));
         let executed = random.vec(2, 1.0);
         expected.executed(&executed).expect("the action is sound");
         // SAFETY: the controller and the action are alive.
-        let status = unsafe { lads_executed(c, executed.as_ptr(), 2) };
+        let status = unsafe { lads_executed(c, executed.as_ptr(), 2, null_mut()) };
         assert_eq!(status, Status::Ok);
     }
 }
@@ -72,14 +76,25 @@ fn the_contract_is_the_policys() {
     // SAFETY: the policy is open, in all of these.
     let c = written(|to| unsafe { lads_policy_contract(policy, to) }).expect("it is open");
     assert_eq!((c.observation_len, c.action_len), (3, 2));
-    assert_eq!((c.horizon, c.codebook_len, c.context_steps), (3, 5, 8));
+    assert_eq!((c.index_count, c.context_steps), (5, 8));
+    assert_eq!((c.beyond, c.noise_len), (LADS_BEYOND_RESTART, 0));
+    assert_eq!((c.temperature, c.noise), (0.0, LADS_NOISE_ZERO));
     assert_eq!((c.words_len, c.word_dim, c.instruction_count), (4, 4, 2));
     assert_eq!(
         (c.control_period_s, c.image_bytes),
         (0.08, image.bytes().len())
     );
+    assert_eq!(
+        (c.acceptance, c.worst_work),
+        (contract.acceptance(), contract.worst_work())
+    );
+    assert_eq!(c.observation_count, 1);
+    assert_eq!(c.observation, contract.observation().id().0);
+    assert_eq!(c.action, contract.action().id().0);
+    assert_ne!(c.instruction, LADS_NONE);
     // SAFETY: all texts point into the image.
     unsafe {
+        assert_eq!(c.family.as_str(), contract.family());
         assert_eq!(c.environment.as_str(), contract.environment_id());
         assert_eq!(
             c.environment_version.as_str(),
@@ -88,34 +103,45 @@ fn the_contract_is_the_policys() {
         assert_eq!(c.bundle_sha256.as_str(), contract.bundle_sha256());
         assert_eq!(c.encoder.as_str(), contract.encoder());
         assert_eq!(c.encoder_sha256.as_str(), contract.encoder_sha256());
-        let same = |a: LadsElement, b: lads_core::Element| {
-            assert_eq!(
-                [a.name, a.unit, a.joint].map(|t| t.as_str()),
-                [b.name, b.unit, b.joint]
-            );
-            assert_eq!([a.min, a.max], [b.limits.min, b.limits.max]);
+        assert_eq!(lads_channel_count(policy), c.channel_count);
+        assert_eq!(lads_channel_count(null()), 0);
+        assert_eq!(c.channel_count as usize, contract.channels().count());
+        let by_name = |name: &str| {
+            let (data, len) = (name.as_ptr().cast(), name.len());
+            written(|to| lads_channel_find(policy, data, len, to))
         };
-        for (i, element) in contract.observations().enumerate() {
-            same(
-                written(|to| lads_policy_observation(policy, i, to)).expect("it is there"),
-                element,
-            );
+        for (number, expected) in (0..).zip(contract.channels()) {
+            let got = written(|to| lads_channel(policy, number, to)).expect("it is there");
+            assert_eq!(got.name.as_str(), expected.name());
+            assert_eq!(got.reference.as_str(), expected.reference());
+            assert_eq!(got.len, expected.len());
+            assert_eq!(&got.dims[..got.rank as usize], expected.shape());
+            assert_eq!(by_name(expected.name()), Ok(number));
+            let mut elements = 0;
+            for (i, element) in expected.elements().enumerate() {
+                let got = written(|to| lads_channel_element(policy, number, i, to));
+                let got = got.expect("it is there");
+                let texts = [got.name, got.unit, got.joint, got.interface].map(|t| t.as_str());
+                let theirs = [element.name, element.unit, element.joint, element.interface];
+                assert_eq!(texts, theirs);
+                assert_eq!([got.min, got.max], [element.limits.min, element.limits.max]);
+                assert_eq!([got.scale, got.offset], [element.scale, element.offset]);
+                elements += 1;
+            }
+            assert_eq!(got.described == 1, elements == got.len);
+            let beyond = written(|to| lads_channel_element(policy, number, got.len, to)).err();
+            assert_eq!(beyond, Some(Status::NoElement));
         }
-        for (i, element) in contract.actions().enumerate() {
-            same(
-                written(|to| lads_policy_action(policy, i, to)).expect("it is there"),
-                element,
-            );
-        }
-        let beyond = written(|to| lads_policy_observation(policy, 3, to)).err();
-        assert_eq!(beyond, Some(Status::NoElement));
-        let beyond = written(|to| lads_policy_action(policy, usize::MAX, to)).err();
-        assert_eq!(beyond, Some(Status::NoElement));
+        assert_eq!(by_name("no such channel"), Err(Status::NoChannel));
+        let beyond = written(|to| lads_channel(policy, c.channel_count, to)).err();
+        assert_eq!(beyond, Some(Status::NoChannel));
+        let beyond = written(|to| lads_channel_element(policy, LADS_NONE, 0, to)).err();
+        assert_eq!(beyond, Some(Status::NoChannel));
         for (number, known) in (0..).zip(contract.instructions()) {
             let got =
                 written(|to| lads_policy_instruction(policy, number, to)).expect("it is known");
-            let texts = [got.id, got.text, got.sub_tasks].map(|t| t.as_str());
-            assert_eq!(texts, [known.id, known.text, known.sub_tasks]);
+            let texts = [got.id, got.text].map(|t| t.as_str());
+            assert_eq!(texts, [known.id, known.text]);
             assert_eq!(got.words_len * c.word_dim, known.words.len());
             let by_name = |name: &str| {
                 let (data, len) = (name.as_ptr().cast(), name.len());
@@ -151,14 +177,22 @@ fn the_self_test_arms_or_does_not() {
     instruct(c, 0);
     assert_eq!(step(c, &[0.0; 3], &mut action).0, Status::Ok);
 
-    let mut parts = with_golden(parts(&Model::random(Spec::TINY, 11)), 12);
+    let mut parts = lads(11);
     let episode = parts.golden.as_mut().expect("there is one");
     episode.actions[3] += 0.5;
     let mut host = Host::new(parts.image());
     let c = host.controller();
-    // SAFETY: the controller is alive.
-    let status = unsafe { lads_self_test(c, null_mut()) };
+    // SAFETY: the controller and the result are alive.
+    let status = unsafe { lads_self_test(c, &raw mut result) };
     assert_eq!(status, Status::SelfTestAction);
+    assert_eq!(
+        (result.failed_step, result.element, result.steps),
+        (1, 1, 0)
+    );
+    assert!(
+        (result.expected - result.got - 0.5).abs() < 1e-6,
+        "{result:?}"
+    );
     instruct(c, 0);
     assert_eq!(step(c, &[0.0; 3], &mut action).0, Status::NotArmed);
     parts.golden = None;
@@ -184,11 +218,16 @@ fn a_wrong_observation_gets_the_fallback_and_its_reason() {
         let (status, report) = step(c, observation, &mut action);
         assert_eq!((status, report.status), (expected, expected as i32));
         assert_eq!((action, report.stepped), (last, 0));
+        assert_eq!(report.channel, 0);
+        (report.element, report.value, report.min, report.max)
     };
-    wrong(&[0.0; 2], Status::ObservationLength);
-    wrong(&[], Status::ObservationLength);
-    wrong(&[0.0, f32::NAN, 0.0], Status::NotFinite);
-    wrong(&[0.0, 0.0, 4.0], Status::OutOfLimits);
+    let nothing = (LADS_NONE, 0.0, 0.0, 0.0);
+    assert_eq!(wrong(&[0.0; 2], Status::ObservationLength), nothing);
+    assert_eq!(wrong(&[], Status::ObservationLength), nothing);
+    let not_finite = wrong(&[0.0, f32::NAN, 0.0], Status::NotFinite);
+    assert_eq!(not_finite, (1, 0.0, 0.0, 0.0));
+    let outside = wrong(&[0.0, 0.0, 4.0], Status::OutOfLimits);
+    assert_eq!(outside, (2, 4.0, -3.0, 3.0));
     // SAFETY: the controller and both arrays are alive; what overlaps is refused.
     unsafe {
         let to = action.as_mut_ptr();
@@ -207,7 +246,7 @@ fn a_wrong_observation_gets_the_fallback_and_its_reason() {
         assert_eq!(slice::from_raw_parts(both, 2), last);
         let mut tick = LadsTick {
             timestamp: 5,
-            missed: 0,
+            ..LadsTick::default()
         };
         let tick = &raw mut tick;
         let status = lads_step(c, observation.as_ptr(), 3, tick, to, 2, null_mut());
@@ -250,7 +289,7 @@ fn warming_up_changes_nothing() {
             let mut action = [7.0_f32; 2];
             let (status, report) = step(c, &[0.1 * number as f32; 3], &mut action);
             assert_eq!(status, Status::Ok);
-            bits.push((action.map(f32::to_bits), report.plan));
+            bits.push((action.map(f32::to_bits), report.selected));
         }
         (bits, counters(c).periods)
     };
@@ -313,11 +352,12 @@ fn two_controllers_of_one_policy_run_in_two_threads() {
             ..LadsOptions::default()
         };
         let memory = workspace.as_mut_ptr().cast();
-        let init = |to| {
-            // SAFETY: as above; the workspace is this thread's own.
-            unsafe { lads_controller_init(policy, memory, bytes, &raw const options, to) }
-        };
-        let c = written(init).expect("the workspace suffices");
+        let mut c = null_mut();
+        let (options, to) = (&raw const options, &raw mut c);
+        // SAFETY: as above; the workspace is this thread's own.
+        let status =
+            unsafe { lads_controller_init(policy, memory, bytes, options, to, null_mut()) };
+        assert_eq!(status, Status::Ok);
         instruct(c, (seed % 2) as u32);
         let mut random = Random(seed);
         let mut actions = Vec::new();
@@ -336,24 +376,24 @@ fn two_controllers_of_one_policy_run_in_two_threads() {
 
 #[test]
 fn sampling_follows_the_seed() {
-    let plans = |temperature: f32, seed: u64| {
+    let picked = |temperature: f32, seed: u64| {
         let mut host = Host::new(image());
         let c = host.controller();
         // SAFETY: the controller is alive.
         let status = unsafe { lads_set_decision(c, temperature, seed) };
         assert_eq!(status, Status::Ok);
         instruct(c, 0);
-        let plan = |_| {
+        let pick = |_| {
             let (status, report) = step(c, &[0.1; 3], &mut [0.0; 2]);
             assert_eq!(status, Status::Ok);
-            report.plan
+            report.selected
         };
-        (0..60).map(plan).collect::<Vec<_>>()
+        (0..60).map(pick).collect::<Vec<_>>()
     };
-    assert_eq!(plans(3.0, 1), plans(3.0, 1));
-    assert_ne!(plans(3.0, 1), plans(3.0, 2));
-    assert_eq!(plans(0.0, 1), plans(0.0, 2));
-    assert_eq!(plans(f32::NAN, 1), plans(0.0, 2));
+    assert_eq!(picked(3.0, 1), picked(3.0, 1));
+    assert_ne!(picked(3.0, 1), picked(3.0, 2));
+    assert_eq!(picked(0.0, 1), picked(0.0, 2));
+    assert_eq!(picked(f32::NAN, 1), picked(0.0, 2));
 }
 
 #[test]

@@ -5,6 +5,7 @@ mod host;
 use core::ffi::c_void;
 use core::ptr::{null, null_mut};
 
+use host::support::assemble::ACTION;
 use host::*;
 use lads_ffi::*;
 
@@ -84,9 +85,9 @@ fn policies_and_controllers_that_were_moved_or_never_set_up_are_refused() {
             lads_stop(null_mut()),
             lads_resume(null_mut()),
             lads_set_instruction(null_mut(), 0),
-            lads_set_words(null_mut(), null(), 0),
+            lads_set_words(null_mut(), null(), 0, null_mut()),
             lads_set_decision(null_mut(), 0.0, 0),
-            lads_executed(null_mut(), null(), 0),
+            lads_executed(null_mut(), null(), 0, null_mut()),
             lads_self_test(null_mut(), null_mut()),
             lads_counters(null_mut(), &raw mut counters),
             step(null_mut(), &[0.0; 3], &mut [0.0; 2]).0,
@@ -104,7 +105,16 @@ fn workspaces_that_do_not_fit_are_refused() {
     let image = host.image.bytes().as_ptr().cast_mut().cast();
     let init = |policy, memory: *mut c_void, bytes| {
         // SAFETY: each of these is refused before the memory is used, but for the last one.
-        unsafe { lads_controller_init(policy, memory, bytes, &raw const options, null_mut()) }
+        unsafe {
+            lads_controller_init(
+                policy,
+                memory,
+                bytes,
+                &raw const options,
+                null_mut(),
+                null_mut(),
+            )
+        }
     };
     assert_eq!(init(null(), memory, bytes), Status::Null);
     assert_eq!(init(policy, null_mut(), bytes), Status::Null);
@@ -183,19 +193,66 @@ fn options_are_checked() {
         refused(LadsOptions { min: odd, ..none }),
         Status::Misaligned
     );
-    // After a refusal there is no controller.
-    let memory = host.memory().cast();
-    assert_eq!(host.init(&none).0, Status::Ok);
+}
+
+#[test]
+fn a_refused_set_up_names_the_element_and_leaves_a_running_controller_alone() {
+    let mut host = Host::new(image());
+    let c = host.controller();
+    instruct(c, 0);
+    let mut action = [7.0; 2];
+    assert_eq!(step(c, &[0.1; 3], &mut action).0, Status::Ok);
+    let (memory, bytes, policy) = (host.memory(), host.bytes(), &raw const *host.policy);
+    let before = host.workspace.iter().map(|line| line.0).collect::<Vec<_>>();
+    let refused = |options: LadsOptions| {
+        let mut report = LadsReport::default();
+        let (options, report) = (&raw const options, &raw mut report);
+        // SAFETY: all of it is alive; the lists are as long as an action.
+        unsafe {
+            let status = lads_controller_init(policy, memory, bytes, options, null_mut(), report);
+            (status, (*report).channel, (*report).element)
+        }
+    };
+    let none = LadsOptions::default();
+    let nan = [1.0, f32::NAN];
+    let low = [99.0, 99.0];
+    let (nan, low) = (nan.as_ptr(), low.as_ptr());
+    let rate = LadsOptions {
+        max_rate: nan,
+        ..none
+    };
+    assert_eq!(refused(rate), (Status::GuardRate, ACTION, 1));
+    let limits = LadsOptions { min: low, ..none };
+    assert_eq!(refused(limits), (Status::GuardLimits, ACTION, 0));
+    let safe = LadsOptions {
+        safe_action: low,
+        ..none
+    };
+    assert_eq!(refused(safe), (Status::GuardSafeAction, ACTION, 0));
+    let decay = LadsOptions {
+        fallback: LADS_FALLBACK_DECAY,
+        ..none
+    };
     assert_eq!(
-        host.init(&LadsOptions {
-            max_rate: nan,
-            ..none
-        })
-        .0,
-        Status::GuardRate
+        refused(decay),
+        (Status::GuardTimeConstant, LADS_NONE, LADS_NONE)
     );
-    let status = step(memory, &[0.0; 3], &mut [0.0; 2]).0;
-    assert!(matches!(status, Status::NotSetUp | Status::NotArmed));
+    let flags = LadsOptions { flags: 64, ..none };
+    assert_eq!(
+        refused(flags),
+        (Status::UnknownOption, LADS_NONE, LADS_NONE)
+    );
+    // SAFETY: each of these is refused before anything is written.
+    unsafe {
+        let init = |policy, bytes| {
+            lads_controller_init(policy, memory, bytes, null(), null_mut(), null_mut())
+        };
+        assert_eq!(init(policy, bytes - 1), Status::WorkspaceTooSmall);
+        assert_eq!(init(null(), bytes), Status::Null);
+    }
+    let after = host.workspace.iter().map(|line| line.0).collect::<Vec<_>>();
+    assert!(before == after, "a refusal has touched the workspace");
+    assert_eq!(step(c, &[0.1; 3], &mut action).0, Status::Ok);
 }
 
 #[test]
@@ -208,28 +265,26 @@ fn a_wrong_call_does_nothing() {
     // SAFETY: the controller is alive; each call is refused before what is wrong is used.
     unsafe {
         assert_eq!(lads_set_instruction(c, 2), Status::UnknownInstruction);
-        assert_eq!(lads_set_words(c, from, 3), Status::WordsLength);
-        assert_eq!(lads_set_words(c, null(), 0), Status::WordsLength);
-        assert_eq!(lads_set_words(c, null(), 4), Status::Null);
-        assert_eq!(lads_set_words(c, c.cast(), 4), Status::Overlap);
+        assert_eq!(lads_set_words(c, from, 3, null_mut()), Status::WordsLength);
         assert_eq!(
-            lads_set_words(c, [f32::NAN; 4].as_ptr(), 4),
+            lads_set_words(c, null(), 0, null_mut()),
+            Status::WordsLength
+        );
+        assert_eq!(lads_set_words(c, null(), 4, null_mut()), Status::Null);
+        assert_eq!(lads_set_words(c, c.cast(), 4, null_mut()), Status::Overlap);
+        let mut report = LadsReport::default();
+        assert_eq!(
+            lads_set_words(c, [0.0, 0.0, f32::NAN, 0.0].as_ptr(), 4, &raw mut report),
             Status::WordsNotFinite
         );
+        assert_eq!((report.channel, report.element), (LADS_NONE, 2));
         instruct(c, 0);
-        assert_eq!(lads_executed(c, from, 2), Status::NothingExecuted);
-        assert_eq!(lads_executed(c, c.cast(), 2), Status::Overlap);
-        let odd = LadsReport::default();
-        let odd = (&raw const odd).cast_mut().wrapping_byte_add(1);
+        assert_eq!(
+            lads_executed(c, from, 2, null_mut()),
+            Status::NothingExecuted
+        );
+        assert_eq!(lads_executed(c, c.cast(), 2, null_mut()), Status::Overlap);
         let to = action.as_mut_ptr();
-        assert_eq!(
-            lads_step(c, from, 3, null(), to, 2, odd),
-            Status::Misaligned
-        );
-        assert_eq!(
-            lads_step(c, from, 3, odd.cast(), to, 2, null_mut()),
-            Status::Misaligned
-        );
         assert_eq!(
             lads_step(c, from, 3, null(), null_mut(), 2, null_mut()),
             Status::Null

@@ -147,7 +147,9 @@ impl<'a> Tables<'a> {
         at(
             Tag::Elements,
             all(self.elements).all(|element: Option<ElementRecord>| {
-                element.is_some_and(|e| texts(&[e.name, e.unit, e.joint, e.interface, e.physical_unit]))
+                element.is_some_and(|e| {
+                    texts(&[e.name, e.unit, e.joint, e.interface, e.physical_unit])
+                })
             }),
         )?;
         at(

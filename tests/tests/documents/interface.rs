@@ -9,9 +9,10 @@ use lads_tests::documents::{documents, files};
 use lads_tests::project_path;
 
 /// What begins like a name of the interface and is none.
-const OTHER: [&str; 4] = [
+const OTHER: [&str; 5] = [
     // Environment variables.
     "LADS_CACHE",
+    "LADS_OPS",
     "LADS_WRITE_HEADER",
     // The package that a program's CMake asks for.
     "lads_VERSION",

@@ -21,9 +21,6 @@
 
 enum { OBSERVATION_LEN = 30, ACTION_LEN = 9, SUB_TASKS = 7, GOAL_MOST = 7, EPISODE_STEPS = 280, NS_PER_S = 1000000000 };
 
-/* rad/s (fingers: m/s) that an action of 1 asks for. */
-static const double ACTION_SCALE = 2.0;
-
 static const double SET_POINT_LOW[ACTION_LEN] = {-2.9, -1.8, -2.9, -3.1, -2.9, 0.0, -2.9, 0.0, 0.0};
 static const double SET_POINT_HIGH[ACTION_LEN] = {2.9, 1.8, 2.9, 0.0, 2.9, 3.8, 2.9, 0.04, 0.04};
 
@@ -37,16 +34,17 @@ static const double START[OBSERVATION_LEN] = {
 /* A sub-task is done when its elements of the state are nearer to the goal than 0.3. */
 static const struct {
     const char *name;
+    char letter; /* in the id of an instruction */
     int first, len;
     double goal[GOAL_MOST];
 } TASKS[SUB_TASKS] = {
-    {"microwave", 22, 1, {-0.75}},
-    {"kettle", 23, 7, {-0.23, 0.75, 1.62, 0.99, 0.0, 0.0, -0.06}},
-    {"bottom burner", 11, 2, {-0.88, -0.01}},
-    {"top burner", 15, 2, {-0.92, -0.01}},
-    {"light switch", 17, 2, {-0.69, -0.05}},
-    {"slide cabinet", 19, 1, {0.37}},
-    {"hinge cabinet", 20, 2, {0.0, 1.45}},
+    {"microwave", 'm', 22, 1, {-0.75}},
+    {"kettle", 'k', 23, 7, {-0.23, 0.75, 1.62, 0.99, 0.0, 0.0, -0.06}},
+    {"bottom burner", 'b', 11, 2, {-0.88, -0.01}},
+    {"top burner", 't', 15, 2, {-0.92, -0.01}},
+    {"light switch", 'l', 17, 2, {-0.69, -0.05}},
+    {"slide cabinet", 's', 19, 1, {0.37}},
+    {"hinge cabinet", 'h', 20, 2, {0.0, 1.45}},
 };
 
 static bool is_done(int task, const mjtNum *state) {
@@ -114,9 +112,9 @@ static const char *misfit(const lads_policy *policy, const lads_contract *contra
         return "the policy is not one for the kitchen";
     }
     for (size_t i = 0; i < OBSERVATION_LEN; i++) {
-        lads_element element;
+        lads_element element = {.struct_bytes = sizeof element};
         char joint[64];
-        lads_policy_observation(policy, i, &element);
+        lads_channel_element(policy, contract->observation, i, &element);
         snprintf(joint, sizeof joint, "%.*s", (int)element.joint.len, element.joint.data);
         const int id = mj_name2id(model, mjOBJ_JOINT, joint);
         /* The kettle's free joint has seven positions. */
@@ -130,9 +128,10 @@ static const char *misfit(const lads_policy *policy, const lads_contract *contra
 
 int main(int count, char **arguments) {
     static lads_policy policy;
-    lads_contract contract;
+    lads_contract contract = {.struct_bytes = sizeof contract};
     lads_controller *controller;
-    lads_instruction instruction;
+    lads_instruction instruction = {.struct_bytes = sizeof instruction};
+    lads_report report = {.struct_bytes = sizeof report};
     lads_status status;
     uint32_t number;
     bool fast = false;
@@ -178,14 +177,18 @@ int main(int count, char **arguments) {
     mjData *data = mj_makeData(model);
 
     /* A robot that hears nothing new keeps doing what it does for a moment, then comes to rest. */
-    const lads_options options = {
-        .fallback = LADS_FALLBACK_DECAY, .decay_s = 2 * contract.control_period_s, .late_after = 1, .stop_after = 25};
+    const lads_options options = {.struct_bytes = sizeof options,
+                                  .fallback = LADS_FALLBACK_DECAY,
+                                  .decay_s = 2 * contract.control_period_s,
+                                  .late_after = 1,
+                                  .coast = 1,
+                                  .stop_after = 25};
     const size_t workspace_bytes = lads_workspace_bytes(&policy);
     void *workspace = lines(workspace_bytes);
     if (data == NULL || workspace == NULL) {
         return refuse("memory", "there is not enough");
     }
-    if ((status = lads_controller_init(&policy, workspace, workspace_bytes, &options, &controller)) != LADS_STATUS_OK ||
+    if ((status = lads_controller_init(&policy, workspace, workspace_bytes, &options, &controller, NULL)) != LADS_STATUS_OK ||
         (status = lads_self_test(controller, NULL)) != LADS_STATUS_OK ||
         (status = lads_set_instruction(controller, number)) != LADS_STATUS_OK) {
         return refuse(arguments[1], lads_status_text(status));
@@ -197,30 +200,44 @@ int main(int count, char **arguments) {
     const int physics_steps = (int)lround((double)contract.control_period_s / model->opt.timestep);
     bool done[SUB_TASKS] = {false};
     int left = 0;
-    char asked[256];
-    snprintf(asked, sizeof asked, "%.*s", (int)instruction.sub_tasks.len, instruction.sub_tasks.data);
+    bool asked[SUB_TASKS];
     for (int task = 0; task < SUB_TASKS; task++) {
-        left += strstr(asked, TASKS[task].name) != NULL;
+        asked[task] = memchr(instruction.id.data, TASKS[task].letter, instruction.id.len) != NULL;
+        left += asked[task];
     }
     printf("%.*s\n", (int)instruction.text.len, instruction.text.data);
+
+    /* What an action means the contract says: rad/s (fingers: m/s) that an element of 1 asks for, from the observed position on. */
+    double velocity_scale[ACTION_LEN], velocity_offset[ACTION_LEN];
+    for (size_t i = 0; i < ACTION_LEN; i++) {
+        lads_element element = {.struct_bytes = sizeof element};
+        lads_channel_element(&policy, contract.action, i, &element);
+        velocity_scale[i] = (double)element.scale;
+        velocity_offset[i] = (double)element.offset;
+    }
 
     struct timespec next;
     clock_gettime(CLOCK_MONOTONIC, &next);
     float observation[OBSERVATION_LEN], action[ACTION_LEN];
     for (long step = 1; step <= steps && left > 0; step++) {
-        lads_tick tick = {.timestamp = (uint64_t)step, .missed = 0};
+        lads_tick tick = {.struct_bytes = sizeof tick, .timestamp = (uint64_t)step};
         if (!fast) {
             tick.missed = next_period(&next, period_ns);
         }
         for (int i = 0; i < OBSERVATION_LEN; i++) {
             observation[i] = (float)data->qpos[i];
         }
-        status = lads_step(controller, observation, OBSERVATION_LEN, &tick, action, ACTION_LEN, NULL);
+        status = lads_step(controller, observation, OBSERVATION_LEN, &tick, action, ACTION_LEN, &report);
         if (status != LADS_STATUS_OK) {
-            fprintf(stderr, "kitchen: step %ld: %s\n", step, lads_status_text(status));
+            fprintf(stderr, "kitchen: step %ld: %s", step, lads_status_text(status));
+            if (report.element != LADS_NONE) {
+                fprintf(stderr, " (element %u)", (unsigned)report.element);
+            }
+            fputc('\n', stderr);
         }
         for (int i = 0; i < ACTION_LEN; i++) {
-            const double wanted = data->qpos[i] + ACTION_SCALE * (double)action[i] * (double)contract.control_period_s;
+            const double velocity = velocity_offset[i] + velocity_scale[i] * (double)action[i];
+            const double wanted = data->qpos[i] + velocity * (double)contract.control_period_s;
             data->ctrl[i] = fmin(fmax(wanted, SET_POINT_LOW[i]), SET_POINT_HIGH[i]);
         }
         for (int i = 0; i < physics_steps; i++) {
@@ -229,7 +246,7 @@ int main(int count, char **arguments) {
         for (int task = 0; task < SUB_TASKS; task++) {
             if (!done[task] && is_done(task, data->qpos)) {
                 done[task] = true;
-                const bool wanted = strstr(asked, TASKS[task].name) != NULL;
+                const bool wanted = asked[task];
                 left -= wanted;
                 printf("%6.2f s  %s%s\n", (double)step * (double)contract.control_period_s, TASKS[task].name,
                        wanted ? "" : " (nobody asked)");
@@ -237,7 +254,7 @@ int main(int count, char **arguments) {
         }
     }
 
-    lads_counters_t counters;
+    lads_counters_t counters = {.struct_bytes = sizeof counters};
     lads_counters(controller, &counters);
     printf("%d sub-tasks left; %llu periods, %llu of them the policy's, %llu missed\n", left,
            (unsigned long long)counters.periods, (unsigned long long)counters.policy, (unsigned long long)counters.missed);

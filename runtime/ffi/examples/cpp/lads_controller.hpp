@@ -48,7 +48,7 @@ public:
         action_.assign(contract.action_len, 0.0F);
         states_.assign(contract.observation_len, nullptr);
         commands_.assign(contract.action_len, nullptr);
-        lads_element element{};
+        auto element = lads::made<lads_element>();
         for (std::size_t i = 0; i < states_.size(); ++i) {
             if (!policy_.observation(i, element) || (states_[i] = find(states, lads::view(element.name))) == nullptr) {
                 return missing("state", lads::view(element.name));
@@ -60,13 +60,13 @@ public:
             }
         }
         const std::vector<float> rates(contract.action_len, parameters.max_rate);
-        lads_options options{};
+        auto options = lads::made<lads_options>();
         options.fallback = LADS_FALLBACK_DECAY;
         options.decay_s = parameters.decay_s;
         options.late_after = 2;
         options.stop_after = 50;
         options.max_rate = parameters.max_rate > 0.0F ? rates.data() : nullptr;
-        if (auto status = controller_.allocate(policy_, options); !status) {
+        if (auto status = controller_.allocate(policy_, options, &report_); !status) {
             return failed("controller", status);
         }
         instruction_ = parameters.instruction;
@@ -78,8 +78,11 @@ public:
         if (auto status = controller_.self_test(); !status) {
             return failed("self-test", status);
         }
-        if (auto status = controller_.set_instruction(instruction_); !status) {
-            return failed(instruction_, status);
+        // Some policies take none.
+        if (policy_.contract().instruction != LADS_NONE) {
+            if (auto status = controller_.set_instruction(instruction_); !status) {
+                return failed(instruction_, status);
+            }
         }
         // The first update is to take no longer than the others.
         if (auto status = controller_.warm(); !status) {
@@ -93,7 +96,7 @@ public:
         for (std::size_t i = 0; i < states_.size(); ++i) {
             observation_[i] = static_cast<float>(states_[i]->value);
         }
-        const lads::Status status = controller_.step(observation_, action_, lads_tick{time_ns, missed}, &report_);
+        const lads::Status status = controller_.step(observation_, action_, lads::tick(time_ns, missed), &report_);
         for (std::size_t i = 0; i < commands_.size(); ++i) {
             commands_[i]->value = static_cast<double>(action_[i]);
         }
@@ -103,7 +106,7 @@ public:
     const lads_report &report() const noexcept { return report_; }
     const lads::Policy &policy() const noexcept { return policy_; }
     lads_counters_t counters() noexcept {
-        lads_counters_t counters{};
+        auto counters = lads::made<lads_counters_t>();
         (void)controller_.counters(counters);
         return counters;
     }
@@ -138,7 +141,7 @@ private:
     std::string instruction_;
     std::vector<float> observation_, action_;
     std::vector<Interface *> states_, commands_;
-    lads_report report_{};
+    lads_report report_ = lads::made<lads_report>();
 };
 
 } // namespace example

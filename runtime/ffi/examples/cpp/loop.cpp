@@ -64,7 +64,7 @@ struct Hardware {
 
     explicit Hardware(const lads::Policy &policy) {
         const lads_contract &contract = policy.contract();
-        lads_element element{};
+        auto element = lads::made<lads_element>();
         for (std::size_t i = 0; i < contract.observation_len && policy.observation(i, element); ++i) {
             states.push_back({std::string(lads::view(element.name)), std::clamp(0.0F, element.min, element.max)});
             limits.push_back(element);

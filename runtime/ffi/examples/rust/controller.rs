@@ -58,9 +58,10 @@ fn run() -> Result<(), Box<dyn Error>> {
     controller.set_instruction(Instruction::Id(number as u32))?;
 
     // The hardware: every action element moves the first observed element of its joint.
-    let limits: Vec<_> = contract.observations().collect();
+    let limits: Vec<_> = contract.observation().elements().collect();
     let moved: Vec<_> = contract
-        .actions()
+        .action()
+        .elements()
         .map(|action| limits.iter().position(|state| state.joint == action.joint))
         .collect();
     let mut observation: Vec<f32> = limits.iter().map(|limit| limit.limits.clamp(0.0)).collect();

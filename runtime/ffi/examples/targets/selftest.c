@@ -24,14 +24,14 @@ static void say_hash(const char *what, uint32_t hash) {
 }
 
 int run(void) {
-    lads_contract contract;
-    lads_element element;
+    lads_contract contract = {.struct_bytes = sizeof contract};
+    lads_element element = {.struct_bytes = sizeof element};
+    lads_self_test_t tested = {.struct_bytes = sizeof tested};
     lads_controller *controller;
-    lads_self_test_t tested;
     float observation[OBSERVATION_MOST], action[ACTION_MOST];
     lads_status status = lads_policy_open(IMAGE, IMAGE_BYTES, &policy);
     if (status == LADS_STATUS_OK) {
-        status = lads_controller_init(&policy, workspace, sizeof workspace, NULL, &controller);
+        status = lads_controller_init(&policy, workspace, sizeof workspace, NULL, &controller, NULL);
     }
     if (status == LADS_STATUS_OK) {
         status = lads_self_test(controller, &tested);
@@ -51,7 +51,7 @@ int run(void) {
     uint32_t hash = 2166136261u, random = 1;
     for (int step = 0; step < STEPS; step++) {
         for (size_t i = 0; i < contract.observation_len; i++) {
-            lads_policy_observation(&policy, i, &element);
+            lads_channel_element(&policy, contract.observation, i, &element);
             random = random * 1664525u + 1013904223u;
             const float share = (float)(random >> 16) / 65536.0f;
             const float width = element.max - element.min;

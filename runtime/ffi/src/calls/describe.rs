@@ -102,9 +102,7 @@ fn same(text: &str, name: &[u8]) -> bool {
 }
 
 fn channel_of<'a>(contract: &Contract<'a>, number: u32) -> Result<Channel<'a>, Status> {
-    contract
-        .channel(ChannelId(number))
-        .ok_or(Status::NoChannel)
+    contract.channel(ChannelId(number)).ok_or(Status::NoChannel)
 }
 
 /// Tells what a policy expects and promises. The texts live as long as the image.
@@ -164,7 +162,9 @@ pub unsafe extern "C" fn lads_channel_find(
     // SAFETY: the caller guarantees all three.
     status(unsafe {
         find(policy, name, name_len, number, |contract, name| {
-            let found = contract.channels().find(|channel| same(channel.name(), name));
+            let found = contract
+                .channels()
+                .find(|channel| same(channel.name(), name));
             found.map(|channel| channel.id().0).ok_or(Status::NoChannel)
         })
     })

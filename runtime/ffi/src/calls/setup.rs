@@ -6,9 +6,7 @@ use super::{report_area, status, told};
 use crate::handle::{self, Setup};
 use crate::memory::{Area, apart, apart_from};
 use crate::status::Status;
-use crate::types::{
-    LadsController, LadsOptions, LadsPolicy, LadsReport, LadsSelfTest, Refusal,
-};
+use crate::types::{LadsController, LadsOptions, LadsPolicy, LadsReport, LadsSelfTest, Refusal};
 use crate::versioned;
 
 /// Bytes of workspace for one controller of a policy; 0 when the policy was not opened.

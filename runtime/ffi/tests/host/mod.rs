@@ -5,15 +5,20 @@
 pub mod support;
 
 use core::ffi::c_void;
-use core::mem::MaybeUninit;
 use core::ptr::{null, null_mut};
 
 use lads_ffi::*;
-use support::assemble::{parts, with_golden};
+use support::assemble::parts;
+use support::writer::Parts;
 use support::{Image, Model, Spec};
 
+/// A small LADS policy with a recorded episode.
+pub fn lads(seed: u64) -> Parts {
+    parts(&Model::random(Spec::TINY, seed)).with_golden(12)
+}
+
 pub fn image() -> Image {
-    with_golden(parts(&Model::random(Spec::TINY, 11)), 12).image()
+    lads(11).image()
 }
 
 pub const LINE: usize = LADS_WORKSPACE_ALIGN;
@@ -73,6 +78,7 @@ impl Host {
                 bytes,
                 options,
                 &raw mut made,
+                null_mut(),
             )
         };
         (status, made)
@@ -120,19 +126,53 @@ pub fn instruct(controller: *mut LadsController, number: u32) {
 }
 
 pub fn counters(controller: *mut LadsController) -> LadsCounters {
-    let mut counters = LadsCounters::default();
     // SAFETY: the controller is alive.
-    let status = unsafe { lads_counters(controller, &raw mut counters) };
-    assert_eq!(status, Status::Ok);
-    counters
+    written(|to| unsafe { lads_counters(controller, to) }).expect("it is alive")
 }
 
 /// What is written through a pointer by a function that returns a status.
-pub fn written<T>(f: impl FnOnce(*mut T) -> Status) -> Result<T, Status> {
-    let mut value = MaybeUninit::uninit();
-    match f(value.as_mut_ptr()) {
-        // SAFETY: the functions write what they return `Ok` for.
-        Status::Ok => Ok(unsafe { value.assume_init() }),
+pub fn written<T: Default>(f: impl FnOnce(*mut T) -> Status) -> Result<T, Status> {
+    let mut value = T::default();
+    match f(&raw mut value) {
+        Status::Ok => Ok(value),
         status => Err(status),
     }
+}
+
+/// The values of a channel as C gives them.
+pub fn input(channel: u32, values: &support::Values) -> LadsInput {
+    let (dtype, data, len) = match values {
+        support::Values::F32(values) => (LADS_F32, values.as_ptr().cast(), values.len()),
+        support::Values::U8(values) => (LADS_U8, values.as_ptr().cast(), values.len()),
+        support::Values::I32(values) => (LADS_I32, values.as_ptr().cast(), values.len()),
+    };
+    LadsInput {
+        channel,
+        dtype,
+        data,
+        len,
+        row_bytes: 0,
+    }
+}
+
+/// A control period with any channels.
+pub fn step_channels(
+    controller: *mut LadsController,
+    inputs: &[LadsInput],
+    action: &mut [f32],
+) -> (Status, LadsReport) {
+    let mut report = LadsReport::default();
+    // SAFETY: the inputs and their values are alive, and so are the action and the controller.
+    let status = unsafe {
+        lads_step_channels(
+            controller,
+            inputs.as_ptr(),
+            inputs.len(),
+            null(),
+            action.as_mut_ptr(),
+            action.len(),
+            &raw mut report,
+        )
+    };
+    (status, report)
 }

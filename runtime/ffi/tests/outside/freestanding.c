@@ -30,7 +30,7 @@ static lads_status run(void) {
     if (status != LADS_STATUS_OK) {
         return status;
     }
-    status = lads_controller_init(&policy, workspace, sizeof workspace, NULL, &controller);
+    status = lads_controller_init(&policy, workspace, sizeof workspace, NULL, &controller, NULL);
     return status == LADS_STATUS_OK ? lads_self_test(controller, NULL) : status;
 }
 

@@ -14,7 +14,7 @@
 static unsigned char *image;
 static size_t image_bytes;
 static lads_policy policy;
-static lads_contract contract;
+static lads_contract contract = {.struct_bytes = sizeof contract};
 static lads_controller *controller;
 static void *workspace;
 static float *observation, *action;
@@ -24,12 +24,12 @@ static void *nothing(void *unused) { return unused; }
 
 static void *everything(void *unused) {
     uint32_t number;
-    lads_instruction known;
-    lads_report report;
-    const lads_tick tick = {.timestamp = 1, .missed = 0};
-    const lads_options options = {.fallback = LADS_FALLBACK_DECAY, .decay_s = 0.5f};
+    lads_instruction known = {.struct_bytes = sizeof known};
+    lads_report report = {.struct_bytes = sizeof report};
+    const lads_tick tick = {.struct_bytes = sizeof tick, .timestamp = 1};
+    const lads_options options = {.struct_bytes = sizeof options, .fallback = LADS_FALLBACK_DECAY, .decay_s = 0.5f};
     failed |= lads_policy_open(image, image_bytes, &policy);
-    failed |= lads_controller_init(&policy, workspace, lads_workspace_bytes(&policy), &options, &controller);
+    failed |= lads_controller_init(&policy, workspace, lads_workspace_bytes(&policy), &options, &controller, &report);
     failed |= lads_self_test(controller, NULL);
     failed |= lads_policy_instruction(&policy, 0, &known);
     failed |= lads_policy_find_instruction(&policy, known.id.data, known.id.len, &number);
@@ -39,6 +39,13 @@ static void *everything(void *unused) {
     for (int t = 0; t < 100; t++) {
         failed |= lads_step(controller, observation, contract.observation_len, NULL, action, contract.action_len, &report);
     }
+    /* Of all functions the one with the largest frame. */
+    const lads_input input = {.channel = contract.observation,
+                              .dtype = LADS_F32,
+                              .data = observation,
+                              .len = contract.observation_len};
+    failed |= lads_step_channels(controller, &input, 1, NULL, action, contract.action_len, &report);
+    failed |= lads_warm(controller);
     lads_step(controller, NULL, 0, NULL, action, contract.action_len, &report);
     return unused;
 }
@@ -80,8 +87,8 @@ int main(int count, char **arguments) {
         return 5;
     }
     for (size_t i = 0; i < contract.observation_len; i++) {
-        lads_element element;
-        failed |= lads_policy_observation(&policy, i, &element);
+        lads_element element = {.struct_bytes = sizeof element};
+        failed |= lads_channel_element(&policy, contract.observation, i, &element);
         observation[i] = element.min + (element.max - element.min) / 2;
     }
     const size_t bare = stack_of(nothing, stack);

@@ -19,11 +19,11 @@ static int fail(const char *what, lads_status status) {
 
 int main(int count, char **arguments) {
     static lads_policy policy;
-    lads_contract contract;
-    lads_element element;
+    lads_contract contract = {.struct_bytes = sizeof contract};
+    lads_element element = {.struct_bytes = sizeof element};
+    lads_counters_t counters = {.struct_bytes = sizeof counters};
+    lads_self_test_t tested = {.struct_bytes = sizeof tested};
     lads_controller *controller;
-    lads_counters_t counters;
-    lads_self_test_t tested;
 
     if (count != 2 || lads_abi_version() != LADS_ABI_VERSION) {
         return 2;
@@ -49,7 +49,7 @@ int main(int count, char **arguments) {
     }
     printf("%.*s, every %g s\n", (int)contract.environment.len, contract.environment.data, (double)contract.control_period_s);
     for (size_t i = 0; i < contract.action_len; i++) {
-        if ((status = lads_policy_action(&policy, i, &element)) != LADS_STATUS_OK) {
+        if ((status = lads_channel_element(&policy, contract.action, i, &element)) != LADS_STATUS_OK) {
             return fail("action", status);
         }
         printf("  %.*s [%.*s] %g to %g\n", (int)element.name.len, element.name.data, (int)element.unit.len,
@@ -62,8 +62,8 @@ int main(int count, char **arguments) {
     if (workspace == NULL || observation == NULL || action == NULL) {
         return 5;
     }
-    const lads_options options = {.fallback = LADS_FALLBACK_HOLD};
-    status = lads_controller_init(&policy, workspace, lads_workspace_bytes(&policy), &options, &controller);
+    const lads_options options = {.struct_bytes = sizeof options, .fallback = LADS_FALLBACK_HOLD};
+    status = lads_controller_init(&policy, workspace, lads_workspace_bytes(&policy), &options, &controller, NULL);
     if (status != LADS_STATUS_OK) {
         return fail("init", status);
     }
@@ -74,11 +74,11 @@ int main(int count, char **arguments) {
         return fail("instruction", status);
     }
     for (size_t i = 0; i < contract.observation_len; i++) {
-        lads_policy_observation(&policy, i, &element);
+        lads_channel_element(&policy, contract.observation, i, &element);
         observation[i] = element.min + (element.max - element.min) / 2;
     }
     for (uint64_t t = 1; t <= 100; t++) {
-        const lads_tick tick = {.timestamp = t, .missed = 0};
+        const lads_tick tick = {.struct_bytes = sizeof tick, .timestamp = t};
         status = lads_step(controller, observation, contract.observation_len, &tick, action, contract.action_len, NULL);
         if (status != LADS_STATUS_OK) {
             return fail("step", status);

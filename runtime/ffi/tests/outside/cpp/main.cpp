@@ -30,7 +30,7 @@ int main(int count, char **arguments) {
         std::fprintf(stderr, "open: %s\n", status.text());
         return 1;
     }
-    lads_options options{};
+    auto options = lads::made<lads_options>();
     options.fallback = LADS_FALLBACK_DECAY;
     options.decay_s = 0.5F;
     if (auto status = controller.allocate(policy, options); !status) {
@@ -41,7 +41,7 @@ int main(int count, char **arguments) {
         std::fprintf(stderr, "self-test: %s\n", status.text());
         return 1;
     }
-    lads_instruction known{};
+    auto known = lads::made<lads_instruction>();
     if (!policy.instruction(0, known) || !controller.set_instruction(lads::view(known.id)) ||
         controller.set_instruction("make tea") != LADS_STATUS_UNKNOWN_INSTRUCTION) {
         return 5;
@@ -49,7 +49,7 @@ int main(int count, char **arguments) {
     const lads_contract &contract = policy.contract();
     std::vector<float> observation(contract.observation_len);
     for (std::size_t i = 0; i < observation.size(); ++i) {
-        lads_element element{};
+        auto element = lads::made<lads_element>();
         if (!policy.observation(i, element)) {
             return 6;
         }
@@ -57,12 +57,12 @@ int main(int count, char **arguments) {
     }
     std::vector<float> action(contract.action_len);
     for (std::uint64_t t = 1; t <= 100; ++t) {
-        if (auto status = controller.step(observation, action, lads_tick{t, 0}); !status) {
+        if (auto status = controller.step(observation, action, lads::tick(t)); !status) {
             std::fprintf(stderr, "step: %s\n", status.text());
             return 1;
         }
     }
-    lads_report report{};
+    auto report = lads::made<lads_report>();
     if (controller.step(lads::Span<const float>(), action, &report) != LADS_STATUS_NO_OBSERVATION || report.stepped != 0) {
         return 7;
     }
@@ -70,7 +70,7 @@ int main(int count, char **arguments) {
     if (controller.step(observation, wrong) != LADS_STATUS_ACTION_LENGTH) {
         return 8;
     }
-    lads_counters_t counters{};
+    auto counters = lads::made<lads_counters_t>();
     if (!controller.counters(counters) || counters.policy != 100 || counters.no_observation != 1) {
         return 9;
     }
