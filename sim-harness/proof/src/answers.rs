@@ -63,8 +63,8 @@ impl fmt::Display for Answer {
 pub struct Reply {
     /// Whether it decided a plan.
     pub decided: bool,
-    /// The plan in force.
-    pub plan: u32,
+    /// The plan in force; `None` of a policy that selects none.
+    pub plan: Option<u32>,
     /// The logits of a step that decided.
     pub logits: Vec<f32>,
     /// Its action.
@@ -214,7 +214,7 @@ impl<'t> Traced<'t> {
 
     fn decision(&self, number: usize, reply: &'t Reply) -> Option<Decision<'t>> {
         Some(Decision {
-            plan: reply.plan,
+            plan: reply.plan?,
             reference: *self.episode.plans.get(number)?,
             margin: *self.episode.margins.get(number)?,
             logits: &reply.logits,

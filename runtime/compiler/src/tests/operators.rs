@@ -17,12 +17,7 @@ pub(super) fn compile(small: &Small) -> Result<Compiled, CompileError> {
         .iter()
         .map(|output| output.name.as_str())
         .collect();
-    compiled(
-        &small.model(18),
-        &small.signature,
-        &outputs,
-        Cache::NONE,
-    )
+    compiled(&small.model(18), &small.signature, &outputs, Cache::NONE)
 }
 
 /// Compiles, runs and compares.
@@ -45,11 +40,7 @@ pub(super) fn agrees(mut small: Small) -> Compiled {
     }
     machine.run(&program.placed, 0);
     for (name, wanted) in oracle.run(&inputs) {
-        close(
-            &name,
-            &machine.output(&program.placed, &name),
-            &wanted,
-        );
+        close(&name, &machine.output(&program.placed, &name), &wanted);
     }
     program
 }
