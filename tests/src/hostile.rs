@@ -6,12 +6,13 @@
 
 use std::sync::OnceLock;
 
-use lads_compiler::{Bundle, CacheFormat, Options, WeightFormat, compile, compile_with};
+use lads_compiler::{Bundle, CacheFormat, Image, Options, WeightFormat, compile, compile_with};
 use lads_core::{ChannelId, DType, Data, GuardConfig, GuardedController, Instruction, Policy, Tick};
 use lads_host::Memory;
 use lads_image::format::{CRC_WORD, crc32};
 
-use crate::wire;
+use crate::episode::{FOLDER, KINDS, folder};
+use crate::{compiled, wire};
 
 /// Bytes of one edit.
 const EDIT_BYTES: usize = 8;
@@ -71,10 +72,15 @@ fn script(bytes: &[u8]) -> impl Iterator<Item = Edit> {
 /// The small bundle.
 const TINY: &[u8] = include_bytes!("../../runtime/compiler/tests/data/tiny.onnx");
 
-/// The small bundle's images: exact, and with weights and cache of fewer bits.
-fn tiny_images() -> &'static [Vec<u32>; 2] {
-    static IMAGES: OnceLock<[Vec<u32>; 2]> = OnceLock::new();
+/// The images that are edited: the small bundle's, exact and with weights and cache of fewer bits, and where the parity tests have
+/// made them, one of every family.
+fn images() -> &'static [Vec<u32>] {
+    static IMAGES: OnceLock<Vec<Vec<u32>>> = OnceLock::new();
     IMAGES.get_or_init(|| {
+        let words = |image: &Image| {
+            let (words, _) = image.as_bytes().as_chunks::<4>();
+            words.iter().map(|&word| u32::from_le_bytes(word)).collect()
+        };
         let bundle = Bundle::from_bytes(TINY).expect("the bundle is sound");
         let smaller = Options {
             weights: WeightFormat::Int8,
@@ -83,11 +89,15 @@ fn tiny_images() -> &'static [Vec<u32>; 2] {
             force: true,
             ..Options::default()
         };
-        [Options::default(), smaller].map(|options| {
-            let image = compile_with(&bundle, options).expect("it compiles");
-            let (words, _) = image.as_bytes().as_chunks::<4>();
-            words.iter().map(|&word| u32::from_le_bytes(word)).collect()
-        })
+        let mut images: Vec<Vec<u32>> = [Options::default(), smaller]
+            .iter()
+            .map(|&options| words(&compile_with(&bundle, options).expect("it compiles")))
+            .collect();
+        if std::env::var_os(FOLDER).is_some() {
+            let family = |kind| words(&compiled(&folder().join(format!("{kind}.onnx"))));
+            images.extend(KINDS.into_iter().map(family));
+        }
+        images
     })
 }
 
@@ -97,8 +107,8 @@ fn tiny_images() -> &'static [Vec<u32>; 2] {
 ///
 /// When anything panics, or an action is not finite.
 pub fn image(edits: &[u8]) {
-    let which = edits.len() % 2;
-    let mut words = tiny_images()[which].clone();
+    let images = images();
+    let mut words = images[edits.len() % images.len()].clone();
     let mut len = words.len() * 4;
     for Edit { kind, place, value } in script(edits) {
         // The tables come first: most edits go there.
