@@ -275,7 +275,7 @@ fn a_channel_of_another_shape_names_itself_and_the_value() {
         &[
             "trajectory_encoder/encode/observations",
             "[1, 4, 5]",
-            "[1, 4, 6]",
+            "[4, 6]",
         ],
     );
 }
