@@ -14,7 +14,9 @@ use std::path::Path;
 use std::process::Command;
 
 use lads_compiler::{Bundle, Options, WeightFormat, compile_with};
-use lads_core::{ChannelId, Controller, DType, Data, Decision, Instruction, Policy, StepReport};
+use lads_core::{
+    ChannelId, Contract, Controller, DType, Data, Decision, Instruction, Policy, StepReport,
+};
 use lads_host::{Aligned, Memory};
 use lads_tests::episode::{KINDS, folder};
 use lads_tests::project_path;
@@ -77,15 +79,15 @@ impl Random {
 
 /// Random values of every observation channel, and the steps that see them.
 struct Observed<'p> {
-    policy: Policy<'p>,
+    contract: Contract<'p>,
     floats: Vec<(ChannelId, Vec<f32>)>,
     bytes: Vec<(ChannelId, Vec<u8>)>,
 }
 
 impl<'p> Observed<'p> {
-    fn new(policy: Policy<'p>) -> Self {
+    fn new(policy: &Policy<'p>) -> Self {
         Self {
-            policy,
+            contract: *policy.contract(),
             floats: vec![],
             bytes: vec![],
         }
@@ -95,7 +97,7 @@ impl<'p> Observed<'p> {
     fn draw(&mut self, random: &mut Random) {
         self.floats.clear();
         self.bytes.clear();
-        for channel in self.policy.contract().observations() {
+        for channel in self.contract.observations() {
             // Limits may be as wide as all numbers; a machine's are not.
             let values = channel.limits().map(|limits| {
                 let (min, max) = (limits.min.max(-10.0), limits.max.min(10.0));
@@ -122,16 +124,16 @@ impl<'p> Observed<'p> {
 }
 
 /// Opens the image that the parent wrote.
-fn with_image(work: impl FnOnce(Policy<'_>)) {
+fn with_image(work: impl FnOnce(&Policy<'_>)) {
     let path = std::env::var_os(IMAGE).expect("the parent names it");
     let image = Aligned::new(&std::fs::read(path).unwrap());
-    work(Policy::new_checked(image.as_bytes()).unwrap());
+    work(&Policy::new_checked(image.as_bytes()).unwrap());
 }
 
 /// A step of an episode of the kitchen's policy, over and over.
-fn steps((_, decision, before): (WeightFormat, Decision, usize), policy: Policy<'_>) {
-    let mut memory = Memory::of(&policy).expect("there is memory");
-    let mut controller = memory.controller(&policy).unwrap();
+fn steps((_, decision, before): (WeightFormat, Decision, usize), policy: &Policy<'_>) {
+    let mut memory = Memory::of(policy).expect("there is memory");
+    let mut controller = memory.controller(policy).unwrap();
     controller.set_decision(decision);
     let mut action = vec![0.0; policy.contract().action_len()];
     let first = policy.golden().unwrap().step(0).unwrap();
@@ -150,9 +152,9 @@ fn steps((_, decision, before): (WeightFormat, Decision, usize), policy: Policy<
 }
 
 /// The first steps of a random policy's contexts, each with observations of its own.
-fn episodes(policy: Policy<'_>) {
-    let mut memory = Memory::of(&policy).expect("there is memory");
-    let mut controller = memory.controller(&policy).unwrap();
+fn episodes(policy: &Policy<'_>) {
+    let mut memory = Memory::of(policy).expect("there is memory");
+    let mut controller = memory.controller(policy).unwrap();
     let mut action = vec![0.0; policy.contract().action_len()];
     if policy.contract().instruction_channel().is_some() {
         controller.set_instruction(Instruction::Id(0)).unwrap();
