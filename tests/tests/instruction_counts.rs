@@ -82,6 +82,7 @@ struct Observed<'p> {
     contract: Contract<'p>,
     floats: Vec<(ChannelId, Vec<f32>)>,
     bytes: Vec<(ChannelId, Vec<u8>)>,
+    integers: Vec<(ChannelId, Vec<i32>)>,
 }
 
 impl<'p> Observed<'p> {
@@ -90,6 +91,7 @@ impl<'p> Observed<'p> {
             contract: *policy.contract(),
             floats: vec![],
             bytes: vec![],
+            integers: vec![],
         }
     }
 
@@ -97,6 +99,7 @@ impl<'p> Observed<'p> {
     fn draw(&mut self, random: &mut Random) {
         self.floats.clear();
         self.bytes.clear();
+        self.integers.clear();
         for channel in self.contract.observations() {
             // Limits may be as wide as all numbers; a machine's are not.
             let values = channel.limits().map(|limits| {
@@ -109,7 +112,10 @@ impl<'p> Observed<'p> {
                     let bytes = values.map(|x| x as u8).collect();
                     self.bytes.push((channel.id(), bytes));
                 }
-                DType::I32 => unreachable!("no policy here observes integers"),
+                DType::I32 => {
+                    let integers = values.map(|x| x as i32).collect();
+                    self.integers.push((channel.id(), integers));
+                }
             }
         }
     }
@@ -119,7 +125,9 @@ impl<'p> Observed<'p> {
         let floats = floats.map(|(id, values)| (*id, Data::F32(values)));
         let bytes = self.bytes.iter();
         let bytes = bytes.map(|(id, values)| (*id, Data::U8(values)));
-        floats.chain(bytes).collect()
+        let integers = self.integers.iter();
+        let integers = integers.map(|(id, values)| (*id, Data::I32(values)));
+        floats.chain(bytes).chain(integers).collect()
     }
 }
 
