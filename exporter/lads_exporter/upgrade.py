@@ -117,7 +117,7 @@ def model(old, stated=None, where="the model"):
     return found
 
 
-def rebind(path, before, after, purpose):
+def rebind(path, before, after, contract):
     """Puts the bundle's new sha256 into the files beside it that name the old one -> their names."""
     path, changed = Path(path), []
     for suffix in (".reference.json", ".results.json", ".md"):
@@ -127,7 +127,7 @@ def rebind(path, before, after, purpose):
             continue
         text = text.replace(before, after)
         if suffix == ".reference.json":
-            text = _line(text, "purpose_sha256", purpose)
+            text = recorded(_line(text, "purpose_sha256", reference.purpose_sha256(contract)), contract)
         write_atomically(beside, text.encode())
         changed.append(beside.name)
     return changed
@@ -139,6 +139,15 @@ def _line(text, key, value):
     return text[:start] + value + text[text.index('"', start) :]
 
 
+def recorded(text, contract):
+    """Replaces the contract that a reference of version 2 records at its head; one of version 1 records none and stays as it is."""
+    start = text.find('\n "contract": ')
+    if start < 0:
+        return text
+    end = text.index("\n", start + 1)
+    return f'{text[:start]}\n "contract": {json.dumps(contract, ensure_ascii=False)},{text[end:]}'
+
+
 def write(path, output=None, environment=None):
     """Upgrades the bundle at `path`, in place unless `output` names another file -> what to tell the user."""
     old, found = read(path)
@@ -148,6 +157,6 @@ def write(path, output=None, environment=None):
     after = model(old, lambda known: environment_file(known, environment), path)
     before = hashlib.sha256(Path(path).read_bytes()).hexdigest()
     sha256 = bundle.save(old, output or path)
-    changed = [] if output and Path(output).resolve() != Path(path).resolve() else rebind(path, before, sha256, reference.purpose_sha256(after))
+    changed = [] if output and Path(output).resolve() != Path(path).resolve() else rebind(path, before, sha256, after)
     beside = f"; the new sha256 is in {', '.join(changed)} too" if changed else ""
     return f"{output or path}: contract version {contracts.VERSION}, sha256 {sha256}{beside}"

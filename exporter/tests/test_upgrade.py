@@ -143,3 +143,9 @@ def test_other_files_are_refused_with_one_line(old, tmp_path):
         assert out.returncode == 2, out.stderr
         assert message in out.stderr and str(path) in out.stderr and out.stderr.count("\n") == 1
         assert (path.read_bytes() if path.exists() else None) == before
+
+
+def test_the_contract_that_a_reference_records_is_upgraded_too():
+    text = '{\n "format_version": 2,\n "contract": {"version": 1, "a": "}, \\" b"},\n "seed": 0\n}\n'
+    assert upgrade.recorded(text, {"version": 2}) == '{\n "format_version": 2,\n "contract": {"version": 2},\n "seed": 0\n}\n'
+    assert upgrade.recorded('{\n "format_version": 1\n}\n', {"version": 2}) == '{\n "format_version": 1\n}\n'

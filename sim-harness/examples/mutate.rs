@@ -1,6 +1,6 @@
 //! `make mutate`: every change of a bundle, what it moves, and what a verification says of it, as a table.
 //!
-//! Exit code 1 if fewer than 98 % of the changes that move a logit by more than 1e-2 or an action by more than 1e-4 are DIFFERENT, or if one
+//! Exit code 1 if fewer than 98 % of the changes that move a logit by more than 1e-2, an action by more than 1e-4 or an encoding are DIFFERENT, or if one
 //! that is harmless is.
 
 #[path = "../tests/common/mutate.rs"]
@@ -52,12 +52,14 @@ impl Bench {
             answers.largest_logit_difference,
             answers.largest_action_difference,
         );
-        let moving = logit > LOGIT || action > ACTION;
+        let moving = logit > LOGIT || action > ACTION || answers.differing_segments > 0;
         let different = judged.different();
         kind.different += usize::from(different);
         kind.moving += usize::from(moving);
         kind.found += usize::from(moving && different);
-        if moving != different {
+        // What a contract says need not move anything here.
+        let said = !judged.contract.differing.is_empty();
+        if moving != different && !said {
             let verdict = if different {
                 "DIFFERENT"
             } else {
@@ -211,7 +213,7 @@ fn main() -> ExitCode {
     kinds.push(options(&model, &bench));
     let harmless = harmless(&model, &bench);
     println!(
-        "| change | number | refused | DIFFERENT | move a logit > {LOGIT} or an action > {ACTION} | of these DIFFERENT |"
+        "| change | number | refused | DIFFERENT | move a logit > {LOGIT}, an action > {ACTION} or an encoding | of these DIFFERENT |"
     );
     println!("|---|---|---|---|---|---|");
     for kind in kinds.iter().chain([&harmless]) {

@@ -189,7 +189,7 @@ fn sentences_that_nobody_can_hear_are_refused() {
         said(empty, &[], &["--instruction", "empty sentence"]);
     }
     let hint = if cfg!(feature = "language") {
-        "make language"
+        "lads_exporter"
     } else {
         "make say"
     };

@@ -63,7 +63,7 @@ fn one_episode_agrees_on_every_instruction_set_and_is_too_few() {
             found["contract"]["fields"]
                 .as_array()
                 .unwrap()
-                .contains(&"decision".into())
+                .contains(&"family".into())
         );
         assert_eq!(found["contract"]["differing"], Value::Array(Vec::new()));
         assert!(found["environment"]["largest_state_difference"].as_f64() <= Some(1e-6));

@@ -138,7 +138,8 @@ fn every_field_of_the_contract_is_compared_or_refused() {
 fn another_rule_is_different_and_runs() {
     let (model, reference) = shipped();
     let mut contract = model.contract();
-    contract["decision"] = serde_json::json!({"rule": "sample", "temperature": 5.0, "seed": 0});
+    contract["family"]["decision"] =
+        serde_json::json!({"rule": "sample", "temperature": 5.0, "seed": 0});
     let found = judged(&model.with_contract(&contract), &reference);
     let fields: Vec<_> = found
         .contract
@@ -146,7 +147,10 @@ fn another_rule_is_different_and_runs() {
         .iter()
         .map(|it| it.field.as_str())
         .collect();
-    assert_eq!(fields, ["decision.rule", "decision.temperature"]);
+    assert_eq!(
+        fields,
+        ["family.decision.rule", "family.decision.temperature"]
+    );
     assert!(found.contract.image_differing.is_empty());
     let answer = found
         .answers

@@ -6,8 +6,8 @@ mod bench;
 use std::io::Cursor;
 use std::sync::atomic::AtomicBool;
 
-use bench::{Bench, Says, tiny_image};
-use lads_core::{Decision, Isa, Policy};
+use bench::{Bench, Says, tiny_contract, tiny_policy};
+use lads_core::{Channel, Decision, Isa, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Setup};
 use lads_sim::faults::Faults;
@@ -37,7 +37,7 @@ fn try_evaluate(
     threads: usize,
     setup: Setup<'_>,
 ) -> Result<Evaluated, EvaluationError> {
-    let commanded = fit::check(&policy.contract(), &Bench::new(Says::default())).unwrap();
+    let commanded = fit::check(tiny_contract(), &Bench::new(Says::default())).unwrap();
     let assignments: Vec<_> = (0..)
         .zip(commanded)
         .map(|(instruction, commanded)| Assignment {
@@ -48,6 +48,7 @@ fn try_evaluate(
         .collect();
     let evaluation = Evaluation {
         policy: *policy,
+        contract: tiny_contract(),
         assignments: &assignments,
         episodes: 3,
         seed: 5,
@@ -96,13 +97,17 @@ fn log(policy: &Policy<'_>, evaluated: &Evaluated) -> Log {
             seed: 5,
             noise: "none".to_owned(),
             control_period_s: 0.05,
-            horizon: contract.horizon(),
-            observation_names: contract.observations().map(|e| e.name.to_owned()).collect(),
-            action_names: contract.actions().map(|e| e.name.to_owned()).collect(),
+            period: tiny_contract().period(),
+            observation_names: names(&contract.observation()),
+            action_names: names(&contract.action()),
             notes: [("mujoco".to_owned(), "none".to_owned())].into(),
         },
         flights: flights.collect(),
     }
+}
+
+fn names(channel: &Channel<'_>) -> Vec<String> {
+    channel.elements().map(|e| e.name.to_owned()).collect()
 }
 
 fn bytes(log: &Log) -> Vec<u8> {
@@ -119,13 +124,13 @@ fn read(bytes: &[u8]) -> Result<Log, recorder::LogError> {
 }
 
 fn replayed(policy: &Policy<'_>, log: &Log) -> Replayed {
-    replay(policy, log, &|| {}).unwrap()
+    let period = tiny_contract().period();
+    replay(policy, period, Isa::portable(), log, &|| {}).unwrap()
 }
 
 #[test]
 fn a_log_reads_back_and_replays_bit_for_bit() {
-    let image = tiny_image();
-    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let policy = tiny_policy();
     for decision in [Decision::Argmax, SAMPLE] {
         let evaluated = evaluate(&policy, decision, 2, Setup::default());
         assert_eq!(evaluated.traces.len(), 12);
@@ -145,15 +150,14 @@ fn a_log_reads_back_and_replays_bit_for_bit() {
 
 #[test]
 fn the_first_step_that_differs_is_named() {
-    let image = tiny_image();
-    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let policy = tiny_policy();
     let mut log = log(
         &policy,
         &evaluate(&policy, Decision::Argmax, 1, Setup::default()),
     );
     let steps = &mut log.flights[4].trace.steps;
     steps[7].action[1] = f32::from_bits(steps[7].action[1].to_bits() ^ 1);
-    steps[9].plan += 1;
+    steps[9].plan = steps[9].plan.map(|plan| plan + 1);
     let differences = replayed(&policy, &log).differences;
     assert_eq!(differences.len(), 1);
     let flight = &log.flights[4];
@@ -167,14 +171,15 @@ fn the_first_step_that_differs_is_named() {
     assert_eq!(difference.action.as_ref().unwrap().0, "joint2_velocity");
 
     log.origin.action_names[0].push('x');
-    let error = replay(&policy, &log, &|| {}).unwrap_err().to_string();
+    let period = tiny_contract().period();
+    let error = replay(&policy, period, Isa::detect(), &log, &|| {}).unwrap_err();
+    let error = error.to_string();
     assert!(error.contains("joint1_velocityx"), "{error}");
 }
 
 #[test]
 fn a_damaged_log_is_refused() {
-    let image = tiny_image();
-    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let policy = tiny_policy();
     let whole = bytes(&log(
         &policy,
         &evaluate(&policy, Decision::Argmax, 1, Setup::default()),
@@ -196,8 +201,7 @@ fn a_damaged_log_is_refused() {
 
 #[test]
 fn faults_depend_on_the_episode_alone_and_are_recorded() {
-    let image = tiny_image();
-    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let policy = tiny_policy();
     let faults = Faults {
         delay_steps: 2,
         drop_rate: 0.3,
@@ -238,10 +242,9 @@ fn faults_depend_on_the_episode_alone_and_are_recorded() {
 
 #[test]
 fn commanded_plans_are_followed_and_encoded() {
-    let image = tiny_image();
-    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let policy = tiny_policy();
     let contract = policy.contract();
-    let horizon = contract.horizon();
+    let horizon = tiny_contract().period().unwrap();
     let ids: Vec<_> = contract
         .instructions()
         .map(|known| known.id.to_owned())
@@ -253,7 +256,8 @@ fn commanded_plans_are_followed_and_encoded() {
         plans: vec![1, 0, 2],
     };
     let file = PlanFile::new(horizon, ids.iter().map(sequence).collect());
-    let book = file.check(&contract, index).unwrap();
+    let period = tiny_contract().period();
+    let book = file.check(&policy, period, index).unwrap();
     let setup = Setup {
         plans: Some(&book),
         ..Setup::default()
@@ -262,7 +266,7 @@ fn commanded_plans_are_followed_and_encoded() {
     for trace in &evaluated.traces {
         assert!(trace.commanded && trace.steps.len() <= 3 * horizon);
         for (number, step) in trace.steps.iter().enumerate() {
-            assert_eq!(step.plan, [1, 0, 2][number / horizon]);
+            assert_eq!(step.plan, Some([1, 0, 2][number / horizon]));
         }
     }
     assert_eq!(replayed(&policy, &log(&policy, &evaluated)).differences, []);
@@ -304,11 +308,11 @@ fn commanded_plans_are_followed_and_encoded() {
     let refused = |change: &dyn Fn(&mut PlanFile)| {
         let mut file = file.clone();
         change(&mut file);
-        file.check(&contract, index).unwrap_err().to_string()
+        file.check(&policy, period, index).unwrap_err().to_string()
     };
-    let size = contract.codebook_len() as u32;
-    assert!(refused(&|file| file.horizon += 1).contains("control steps each"));
-    assert!(refused(&|file| file.episodes[0].plans[1] = size).contains("the codebook has"));
+    let size = policy.index_count();
+    assert!(refused(&|file| file.period += 1).contains("control steps each"));
+    assert!(refused(&|file| file.episodes[0].plans[1] = size).contains("the policy has"));
     assert!(refused(&|file| file.episodes[0].plans.clear()).contains("has no plans"));
     assert!(refused(&|file| file.episodes[1] = file.episodes[0].clone()).contains("twice"));
     assert!(refused(&|file| file.episodes[0].instruction.push('?')).contains("does not know"));
@@ -316,8 +320,7 @@ fn commanded_plans_are_followed_and_encoded() {
 
 #[test]
 fn a_refused_observation_ends_its_episode_or_everything() {
-    let image = tiny_image();
-    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let policy = tiny_policy();
     // Noise of up to 0.05, 20 times: beyond the contract's limits sooner or later.
     let mut setup = Setup {
         faults: Faults {

@@ -5,7 +5,7 @@ mod bench;
 
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
-use bench::{Bench, Says, tiny_image};
+use bench::{Bench, Says, tiny_contract, tiny_policy};
 use lads_core::{Decision, Isa, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Setup};
@@ -22,8 +22,8 @@ fn open() -> Box<dyn Environment> {
     Box::new(Bench::new(Says::default()))
 }
 
-fn assignments(policy: &Policy<'_>) -> Vec<Assignment> {
-    let commanded = fit::check(&policy.contract(), &Bench::new(Says::default())).unwrap();
+fn assignments() -> Vec<Assignment> {
+    let commanded = fit::check(tiny_contract(), &Bench::new(Says::default())).unwrap();
     (0..)
         .zip(commanded)
         .map(|(instruction, commanded)| Assignment {
@@ -35,9 +35,10 @@ fn assignments(policy: &Policy<'_>) -> Vec<Assignment> {
 }
 
 fn evaluate(policy: &Policy<'_>, seed: u64, decision: Decision, threads: usize) -> Evaluated {
-    let assignments = assignments(policy);
+    let assignments = assignments();
     let evaluation = Evaluation {
         policy: *policy,
+        contract: tiny_contract(),
         assignments: &assignments,
         episodes: 5,
         seed,
@@ -54,8 +55,7 @@ fn evaluate(policy: &Policy<'_>, seed: u64, decision: Decision, threads: usize) 
 
 #[test]
 fn the_number_of_threads_does_not_show() {
-    let image = tiny_image();
-    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let policy = tiny_policy();
     for decision in [Decision::Argmax, SAMPLE] {
         let one = evaluate(&policy, 3, decision, 1).episodes;
         assert_eq!(one.len(), 4);
@@ -101,12 +101,12 @@ impl Onlooker for Restless {
 
 #[test]
 fn who_looks_on_changes_no_episode() {
-    let image = tiny_image();
-    let policy = Policy::new_checked(image.as_bytes()).unwrap();
-    let assignments = assignments(&policy);
+    let policy = tiny_policy();
+    let assignments = assignments();
     let restless = Restless::default();
     let evaluation = Evaluation {
         policy,
+        contract: tiny_contract(),
         assignments: &assignments,
         episodes: 5,
         seed: 3,
@@ -138,8 +138,7 @@ fn who_looks_on_changes_no_episode() {
 
 #[test]
 fn sampling_chooses_other_plans_and_episodes_differ() {
-    let image = tiny_image();
-    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let policy = tiny_policy();
     let plans = |decision| {
         let episodes = evaluate(&policy, 3, decision, 2).episodes;
         episodes
@@ -155,12 +154,11 @@ fn sampling_chooses_other_plans_and_episodes_differ() {
 
 #[test]
 fn episodes_end_when_the_commanded_sub_tasks_are_done() {
-    let image = tiny_image();
-    let policy = Policy::new_checked(image.as_bytes()).unwrap();
+    let policy = tiny_policy();
     let evaluated = evaluate(&policy, 0, Decision::Argmax, 2);
-    let horizon = policy.contract().horizon();
+    let horizon = tiny_contract().period().unwrap();
     let mut early = 0;
-    for (assignment, episodes) in assignments(&policy).iter().zip(&evaluated.episodes) {
+    for (assignment, episodes) in assignments().iter().zip(&evaluated.episodes) {
         for Episode {
             steps,
             success,
@@ -213,11 +211,11 @@ fn episodes_end_when_the_commanded_sub_tasks_are_done() {
 
 #[test]
 fn a_stop_ends_the_work_without_a_result() {
-    let image = tiny_image();
-    let policy = Policy::new_checked(image.as_bytes()).unwrap();
-    let assignments = assignments(&policy);
+    let policy = tiny_policy();
+    let assignments = assignments();
     let evaluation = Evaluation {
         policy,
+        contract: tiny_contract(),
         assignments: &assignments,
         episodes: 5,
         seed: 0,
@@ -240,10 +238,8 @@ fn a_stop_ends_the_work_without_a_result() {
 
 #[test]
 fn a_contract_that_does_not_fit_is_refused_by_name() {
-    let image = tiny_image();
-    let policy = Policy::new_checked(image.as_bytes()).unwrap();
     let refusal = |says: Says| {
-        fit::check(&policy.contract(), &Bench::new(says))
+        fit::check(tiny_contract(), &Bench::new(says))
             .unwrap_err()
             .to_string()
     };
@@ -310,11 +306,11 @@ fn a_contract_that_does_not_fit_is_refused_by_name() {
 /// A thread that panics ends the others after their current episode, not after the whole queue.
 #[test]
 fn a_panic_stops_all_threads() {
-    let image = tiny_image();
-    let policy = Policy::new_checked(image.as_bytes()).unwrap();
-    let assignments = assignments(&policy);
+    let policy = tiny_policy();
+    let assignments = assignments();
     let evaluation = Evaluation {
         policy,
+        contract: tiny_contract(),
         assignments: &assignments,
         episodes: 200,
         seed: 0,

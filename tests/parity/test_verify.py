@@ -162,14 +162,14 @@ def test_another_rule_is_different_though_the_networks_are_the_same(tmp_path):
     """What runs samples at temperature 5, and hardly ever succeeds: the contract is compared, and its own rule is what is run."""
     model = onnx.load(BUNDLE)
     contract = json.loads(properties(model)["lads.contract"])
-    contract["decision"] |= {"rule": "sample", "temperature": 5.0}
+    contract["family"]["decision"] |= {"rule": "sample", "temperature": 5.0}
     set_property(model, "lads.contract", json.dumps(contract))
     path = tmp_path / "sampled.onnx"
     path.write_bytes(model.SerializeToString())
     code, certificate = verify(path, tmp_path)
     assert code == DIFFERENT and certificate["setting"]["decision"] == "sampling at temperature 5"
-    assert "decision.rule" in certificate["reasons"][0]
-    assert [row["field"] for row in certificate["contract"]["differing"]] == ["decision.rule", "decision.temperature"]
+    assert "family.decision.rule" in certificate["reasons"][0]
+    assert [row["field"] for row in certificate["contract"]["differing"]] == ["family.decision.rule", "family.decision.temperature"]
 
 
 def test_the_shipped_policy_is_not(tmp_path):

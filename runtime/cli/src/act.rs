@@ -1,17 +1,19 @@
 //! `lads act`: the controller on a pipe. One observation per line of input, one action per line of output, flushed, in the same form.
 //!
-//! A line is read up to the length that an observation can have, whatever comes. An empty line starts a new episode of the same instruction and is not answered. An observation that is refused ends the command with
-//! the number of its line; the lines before it have been answered.
+//! A line holds the elements of all observation channels, one channel behind the other in the policy's order. It is read up to the length
+//! that an observation can have, whatever comes. An empty line starts a new episode of the same instruction and is not answered. An
+//! observation that is refused ends the command with the number of its line; the lines before it have been answered.
 
 use std::fmt::Display;
 use std::io::{BufRead, ErrorKind, Read as _, Write};
 
-use lads_compiler::Memory;
-use lads_core::{Controller, Decision, Instruction, Policy};
+use lads_core::{Controller, Decision, Instruction, Policy, StepError};
+use lads_host::Memory;
 
 use crate::line;
 use crate::model::Model;
 use crate::refusal::Refusal;
+use crate::seen::Seen;
 use crate::self_test;
 
 /// Bytes of a line that are read at most: for every element, and for the rest of it. A number of f32 in any usual form takes fewer.
@@ -21,10 +23,10 @@ const BYTES_BESIDE: usize = 1024;
 /// What to act on.
 pub struct Request<'r> {
     /// Text or id of an instruction that the policy knows.
-    pub instruction: &'r str,
-    /// Append the index of the plan in force to every action.
+    pub instruction: Option<&'r str>,
+    /// Append the index in force to every action.
     pub plans: bool,
-    /// Sample plans, from the stream with this seed, instead of following the contract's rule.
+    /// Sample indices, from the stream with this seed, instead of following the contract's rule.
     pub sample: Option<u64>,
 }
 
@@ -35,8 +37,21 @@ pub fn act(
     input: impl BufRead,
     output: impl Write,
 ) -> Result<(), Refusal> {
-    let policy = model.policy()?;
-    let instruction = model.instruction(request.instruction)?;
+    let policy = model.policy();
+    let takes = policy.contract().instruction_channel().is_some();
+    let instruction = match request.instruction {
+        Some(wanted) => Some(model.instruction(wanted)?),
+        None if takes => {
+            let wrong = "the policy takes an instruction and none is given";
+            let remedy = "give the text or the id of one that it knows, which `lads inspect` lists";
+            return Err(Refusal::new("--instruction", wrong, remedy));
+        }
+        None => None,
+    };
+    if request.plans && policy.index_count() == 0 {
+        let wrong = "the policy selects no index";
+        return Err(Refusal::new("--plans", wrong, "leave it out"));
+    }
     let mut memory = Memory::of(&policy).map_err(|error| model.refused(error))?;
     let mut controller = memory
         .controller(&policy)
@@ -46,9 +61,13 @@ pub fn act(
     if let Some(seed) = request.sample {
         controller.set_decision(sampling(&policy, seed));
     }
-    controller
-        .set_instruction(Instruction::Id(instruction))
-        .map_err(|error| Refusal::new(model.path.display(), error, "export the bundle again"))?;
+    if let Some(instruction) = instruction {
+        controller
+            .set_instruction(Instruction::Id(instruction))
+            .map_err(|error| {
+                Refusal::new(model.path.display(), error, "export the bundle again")
+            })?;
+    }
     let mut pipe = Pipe {
         policy,
         controller,
@@ -79,9 +98,9 @@ impl Pipe<'_, '_> {
         mut input: impl BufRead,
         mut output: impl Write,
     ) -> Result<(), Refusal> {
-        let mut observation = vec![0.0; self.policy.contract().observation_len()];
+        let mut seen = Seen::of(self.policy.contract());
         let mut action = vec![0.0; self.policy.contract().action_len()];
-        let most = BYTES_BESIDE + BYTES_PER_ELEMENT * observation.len();
+        let most = BYTES_BESIDE + BYTES_PER_ELEMENT * seen.len();
         let (mut bytes, mut answered) = (vec![], String::new());
         for number in 1_u64.. {
             bytes.clear();
@@ -105,7 +124,7 @@ impl Pipe<'_, '_> {
                 self.controller.reset();
                 continue;
             }
-            let plan = self.answer(asked, &mut observation, &mut action);
+            let plan = self.answer(asked, &mut seen, &mut action);
             let (form, plan) = plan.map_err(|wrong| self.refuse(number, &wrong))?;
             line::format(form, &action, plan, &mut answered);
             match output
@@ -126,26 +145,30 @@ impl Pipe<'_, '_> {
         Ok(())
     }
 
-    /// One control step; on success the form of the line, and the plan where it was asked for.
+    /// One control step; on success the form of the line, and the index in force where it was asked for.
     fn answer(
         &mut self,
         asked: &str,
-        observation: &mut [f32],
+        seen: &mut Seen,
         action: &mut [f32],
     ) -> Result<(line::Form, Option<u32>), String> {
-        let form = line::parse(asked, observation).map_err(|error| error.to_string())?;
-        let report = self
-            .controller
-            .step(observation, action)
-            .map_err(|error| error.to_string())?;
-        Ok((form, self.plans.then_some(report.plan.0)))
+        let form = seen.read(asked)?;
+        let report =
+            self.controller
+                .step_with(&seen.given(), action)
+                .map_err(|error| match error {
+                    StepError::Input(error) => seen.refused(&error),
+                    other => other.to_string(),
+                })?;
+        let selected = report.selected.map(|selected| selected.index);
+        Ok((form, selected.filter(|_| self.plans)))
     }
 
     fn refuse(&self, number: u64, wrong: &str) -> Refusal {
-        let contract = self.policy.contract();
+        let channels = self.policy.contract().observations();
         let remedy = format!(
             "send {} finite numbers inside the contract's limits, which `lads inspect` lists",
-            contract.observation_len()
+            channels.map(|channel| channel.len()).sum::<usize>()
         );
         Refusal::new(format_args!("input line {number}"), wrong, remedy)
     }

@@ -8,7 +8,7 @@ use std::path::Path;
 use crate::refusal::Refusal;
 
 /// Alignment of the array, in bytes: that of the weights in the image.
-const ALIGN: usize = lads_core::image::WEIGHTS_ALIGN;
+const ALIGN: usize = lads_image::format::WEIGHTS_ALIGN;
 
 /// Bytes of the image in a line of source.
 const BYTES_PER_LINE: usize = 32;

@@ -6,11 +6,13 @@
 
 mod act;
 mod bench;
+mod compile;
 mod emit;
 mod inspect;
 mod line;
 mod model;
 mod refusal;
+mod seen;
 mod self_test;
 
 use std::io::{self, ErrorKind, Write};
@@ -18,9 +20,8 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use lads_compiler::{CacheFormat, Options, WeightFormat};
-use lads_host::output;
 
+use crate::inspect::foreign::Foreign;
 use crate::model::Model;
 use crate::refusal::Refusal;
 
@@ -37,9 +38,9 @@ struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Prints contract, programs, and the sizes of image, workspace and weights
+    /// Prints channels, schedule, programs, states and memory of a policy; of another ONNX file, all that it misses to be one
     Inspect {
-        /// Bundle (.onnx) or compiled image (.lads)
+        /// Bundle (.onnx), compiled image (.lads), or any ONNX file
         model: PathBuf,
         /// As one JSON object
         #[arg(long)]
@@ -49,57 +50,27 @@ enum Command {
         observations: bool,
     },
     /// Compiles a bundle to a program image, and writes it as a file, as source, or both
-    Compile {
-        /// Bundle (.onnx); with --emit-c or --emit-rust also a compiled image (.lads)
-        model: PathBuf,
-        /// The image to write
-        #[arg(short, long, required_unless_present_any = ["emit_c", "emit_rust"])]
-        output: Option<PathBuf>,
-        /// A C source to write: the image as a constant, aligned byte array
-        #[arg(long, value_name = "FILE")]
-        emit_c: Option<PathBuf>,
-        /// A Rust source to write: the image as a constant, aligned byte array
-        #[arg(long, value_name = "FILE")]
-        emit_rust: Option<PathBuf>,
-        /// How the weights are stored: f32; int16 or int8, with which the inputs of a layer are rounded too, and which are faster
-        /// than f32 on x86-64; f16 or bf16, which are decoded. Fewer bits than 32 have to pass a gate: the golden episode replays
-        /// with the same plans, and with actions inside the tolerance
-        #[arg(long, value_name = "FORMAT", default_value = "f32", value_parser = weight_format)]
-        weights: WeightFormat,
-        /// How the weights of the low level are stored, if otherwise: with f32 the actions of a plan keep their bits, and all
-        /// that fewer bits elsewhere can do is to choose another plan
-        #[arg(long, value_name = "FORMAT", value_parser = weight_format)]
-        low_level: Option<WeightFormat>,
-        /// How the KV cache is stored: f32, or f16 in half the memory. It has to pass the same gate
-        #[arg(long, value_name = "FORMAT", default_value = "f32", value_parser = cache_format)]
-        cache: CacheFormat,
-        /// Largest difference of an action that the gate, and later the image's self-test, accept, in the action's units; the
-        /// bundle's own is meant for 32-bit weights
-        #[arg(long, value_name = "DIFFERENCE", value_parser = tolerance)]
-        tolerance: Option<f32>,
-        /// Writes an image that the gate refuses, for experiments; its self-test fails
-        #[arg(long)]
-        force: bool,
-    },
-    /// Replays the policy's golden episode on this machine and compares plans and actions
+    Compile(compile::Request),
+    /// Replays the policy's golden episode on this machine and compares the indices in force and the actions
     SelfTest {
         /// Bundle (.onnx) or compiled image (.lads)
         model: PathBuf,
     },
     /// Answers each observation (a line of stdin: CSV or JSON array) with an action (a line of stdout)
     ///
-    /// An empty line starts a new episode of the same instruction.
+    /// A line holds the elements of all observation channels, in the policy's order. An empty line starts a new episode of the same
+    /// instruction.
     Act {
         /// Bundle (.onnx) or compiled image (.lads)
         #[arg(long)]
         model: PathBuf,
-        /// What to do: the text or the id of an instruction that the policy knows
+        /// What to do: the text or the id of an instruction that the policy knows; none for a policy that takes none
         #[arg(long)]
-        instruction: String,
-        /// Append the index of the latent plan in force to every action
+        instruction: Option<String>,
+        /// Append the index in force, such as that of a latent plan, to every action
         #[arg(long)]
         plans: bool,
-        /// Sample plans from the policy's distribution instead of taking the likeliest
+        /// Sample indices from the policy's distribution instead of taking the likeliest
         #[arg(long)]
         sample: bool,
         /// Seed of the sampling
@@ -149,83 +120,8 @@ fn run(command: Command) -> Result<(), Refusal> {
             model,
             json,
             observations,
-        } => {
-            let model = Model::open(&model)?;
-            if observations {
-                return print(&inspect::observations(&model)?);
-            }
-            let report = inspect::Report::of(&model)?;
-            if json {
-                print(&format!("{:#}\n", report.json()))
-            } else {
-                print(&report.to_string())
-            }
-        }
-        Command::Compile {
-            model,
-            output,
-            emit_c,
-            emit_rust,
-            weights,
-            low_level,
-            cache,
-            tolerance,
-            force,
-        } => {
-            let options = Options {
-                weights,
-                low_level,
-                cache,
-                tolerance,
-                force,
-            };
-            let outputs: Vec<_> = [
-                ("-o", &output),
-                ("--emit-c", &emit_c),
-                ("--emit-rust", &emit_rust),
-            ]
-            .into_iter()
-            .filter_map(|(option, path)| Some((option, path.as_deref()?)))
-            .collect();
-            output::check(&[("", &model)], &outputs).map_err(Refusal::of)?;
-            let model = Model::compile(&model, options)?;
-            let again = output.is_some() || options != Options::default();
-            if again && !model.is_bundle() {
-                return Err(Refusal::new(
-                    model.path.display(),
-                    "it is a compiled image already",
-                    "give the bundle (.onnx)",
-                ));
-            }
-            model.policy()?;
-            let image = model.image();
-            // Everything that can be refused is, before the first file is written.
-            let c = emit_c.map(|path| emit::c(image, &path).map(|text| (path, text)));
-            let rust = emit_rust.map(|path| emit::rust(image, &path).map(|text| (path, text)));
-            let sources = [c.transpose()?, rust.transpose()?];
-            let sources = sources
-                .iter()
-                .flatten()
-                .map(|(path, text)| (path, text.as_bytes()));
-            let mut drafts = vec![];
-            for (path, bytes) in output.iter().map(|path| (path, image)).chain(sources) {
-                let draft = output::draft(path).and_then(|mut draft| {
-                    draft.write_all(bytes)?;
-                    Ok(draft)
-                });
-                let draft = draft.map_err(|error| unwritable(path, &error))?;
-                drafts.push((path, bytes.len(), draft));
-            }
-            for (path, bytes, draft) in drafts {
-                draft.commit().map_err(|error| unwritable(path, &error))?;
-                print(&format!("{}: {bytes} bytes\n", path.display()))?;
-            }
-            if options.is_exact() || force {
-                return Ok(());
-            }
-            let line = self_test::self_test(&model)?;
-            print(&format!("{options}: {line}\n"))
-        }
+        } => inspect(&model, json, observations),
+        Command::Compile(request) => compile::compile(request),
         Command::SelfTest { model } => {
             let line = self_test::self_test(&Model::open(&model)?)?;
             print(&format!("{line}\n"))
@@ -239,7 +135,7 @@ fn run(command: Command) -> Result<(), Refusal> {
         } => {
             let sample = sample.then_some(seed);
             let request = act::Request {
-                instruction: &instruction,
+                instruction: instruction.as_deref(),
                 plans,
                 sample,
             };
@@ -253,27 +149,26 @@ fn run(command: Command) -> Result<(), Refusal> {
     }
 }
 
-fn weight_format(name: &str) -> Result<WeightFormat, String> {
-    named(name, WeightFormat::ALL, WeightFormat::name)
-}
-
-fn cache_format(name: &str) -> Result<CacheFormat, String> {
-    named(name, CacheFormat::ALL, CacheFormat::name)
-}
-
-fn named<T: Copy, const N: usize>(
-    name: &str,
-    known: [T; N],
-    name_of: fn(T) -> &'static str,
-) -> Result<T, String> {
-    let found = known.into_iter().find(|&format| name_of(format) == name);
-    found.ok_or_else(|| format!("known are {}", known.map(name_of).join(", ")))
-}
-
-fn tolerance(text: &str) -> Result<f32, String> {
-    let number: Option<f32> = text.parse().ok();
-    let positive = number.filter(|number| number.is_finite() && *number > 0.0);
-    positive.ok_or_else(|| "it has to be a positive number".into())
+fn inspect(path: &Path, json: bool, observations: bool) -> Result<(), Refusal> {
+    let model = match Model::open(path) {
+        Ok(model) => model,
+        Err(refusal) => {
+            let foreign = Foreign::look(path).filter(|_| !observations);
+            return match foreign.ok_or(refusal)? {
+                foreign if json => print(&format!("{:#}\n", foreign.json())),
+                foreign => print(&foreign.to_string()),
+            };
+        }
+    };
+    if observations {
+        return print(&inspect::observations(&model)?);
+    }
+    let report = inspect::Report::of(&model)?;
+    if json {
+        print(&format!("{:#}\n", report.json()))
+    } else {
+        print(&report.to_string())
+    }
 }
 
 /// Prints to stdout; a reader that has left is no failure.
@@ -290,12 +185,4 @@ fn print(text: &str) -> Result<(), Refusal> {
         )),
         _ => Ok(()),
     }
-}
-
-fn unwritable(path: &Path, error: &io::Error) -> Refusal {
-    Refusal::new(
-        path.display(),
-        error,
-        "name a file in an existing, writable folder",
-    )
 }

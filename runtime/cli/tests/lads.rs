@@ -6,10 +6,12 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
 use lads_compiler::{Bundle, compile};
-use lads_core::codec::{Field, Reader, Writer};
-use lads_core::image::{CRC_WORD, ProgramKind, ProgramRecord, SECTION_TABLE_WORD, Section, crc32};
-use lads_core::op::{OP_WORDS, Op, Operand, Space, Span};
-use lads_core::{Golden, Policy};
+use lads_core::{Golden, Policy, PolicyError, ScheduleError};
+use lads_image::Tables;
+use lads_image::codec::{Field, Reader, Writer};
+use lads_image::format::{COUNT_WORD, CRC_WORD, TABLE_WORD, Tag, crc32};
+use lads_image::op::{OP_WORDS, Op, Operand, Space, Span};
+use lads_image::records::{ContractRecord, EntryRecord};
 use serde_json::Value;
 
 fn tiny() -> PathBuf {
@@ -104,7 +106,7 @@ fn act_answers_the_golden_episode_in_either_form() {
     with_golden(|policy, golden| {
         let instruction = policy
             .contract()
-            .instruction(golden.instruction() as usize)
+            .instruction(golden.instruction().unwrap() as usize)
             .unwrap();
         let arguments = [
             "act",
@@ -114,22 +116,19 @@ fn act_answers_the_golden_episode_in_either_form() {
             instruction.text,
             "--plans",
         ];
-        let asked: String = golden
-            .steps()
-            .map(|(observation, _, _)| csv(observation))
-            .collect();
+        let asked: String = golden.steps().map(|step| csv(step.observation())).collect();
         let answered = answer(&arguments, &asked);
         assert_eq!(answered.lines().count(), golden.len());
-        for (line, (_, plan, action)) in answered.lines().zip(golden.steps()) {
-            let (got_plan, got) = numbers(line)
+        for (line, step) in answered.lines().zip(golden.steps()) {
+            let (got_index, got) = numbers(line)
                 .split_last()
-                .map(|(&plan, got)| (plan, got.to_vec()))
+                .map(|(&index, got)| (index, got.to_vec()))
                 .unwrap();
-            assert_eq!(got_plan, plan as f32);
-            assert_eq!(got.len(), action.len());
+            assert_eq!(got_index, step.selected.unwrap() as f32);
+            assert_eq!(got.len(), step.action.len());
             assert!(
                 got.iter()
-                    .zip(action)
+                    .zip(step.action)
                     .all(|(a, b)| (a - b).abs() <= golden.tolerance()),
                 "{line}"
             );
@@ -243,10 +242,8 @@ fn inspect_tells_what_the_contract_and_the_image_hold() {
     let json: Value = serde_json::from_str(&answer(&["inspect", &model, "--json"], "")).unwrap();
     with_golden(|policy, golden| {
         let contract = policy.contract();
-        let names = contract
-            .observations()
-            .chain(contract.actions())
-            .map(|element| element.name);
+        let elements = contract.channels().flat_map(|channel| channel.elements());
+        let names = elements.map(|element| element.name);
         for name in names.chain(contract.instructions().map(|known| known.text)) {
             assert!(text.contains(name), "{name} is not in: {text}");
         }
@@ -257,20 +254,217 @@ fn inspect_tells_what_the_contract_and_the_image_hold() {
         assert_eq!(sizes["state_bytes"], state);
         let workspace = sizes["workspace_bytes"].as_u64().unwrap() as usize;
         assert!((arena + state..arena + state + 4096).contains(&workspace));
-        assert_eq!(sizes["weights_bytes"], size_of_val(policy.weights()));
+        let tables = Tables::new(policy.image()).unwrap();
+        assert_eq!(sizes["weights_bytes"], size_of_val(tables.weights()));
         assert_eq!(json["golden_steps"], golden.len());
+        // All states, the action in both banks, and nothing else.
+        let states = json["states"].as_array().unwrap().iter();
+        let states: u64 = states.map(|state| state["bytes"].as_u64().unwrap()).sum();
+        assert_eq!(states as usize + 2 * 4 * contract.action_len(), state);
+        assert_eq!(json["worst_multiply_adds"], contract.worst_work());
     });
-    assert_eq!(json["contract"]["environment"]["id"], "tiny-bench");
-    assert_eq!(json["contract"]["observation"][2]["min"], -0.1);
-    assert_eq!(json["contract"]["control_period_s"], 0.05);
+    let contract = &json["contract"];
+    assert_eq!(contract["environment"]["id"], "tiny-bench");
+    assert_eq!(contract["control_period_s"], 0.05);
+    let channels = contract["channels"].as_array().unwrap();
+    let channel = |role: &str| {
+        let mut found = channels.iter().filter(|channel| channel["role"] == role);
+        found.next().unwrap()
+    };
+    assert_eq!(channel("observation")["elements"][2]["min"], -0.1);
+    assert_eq!(
+        channel("observation")["elements"][0]["interface"],
+        "position"
+    );
+    assert_eq!(channel("action")["elements"][2]["scale"], 0.4);
     assert_eq!(json["entries"].as_array().unwrap().len(), 7);
-    for entry in [
-        "high_level/instruct",
-        "low_level/act",
-        "trajectory_encoder/encode",
-    ] {
-        assert!(text.contains(entry), "{entry} is not in: {text}");
+    assert_eq!(json["missing"]["operators"], Value::Array(vec![]));
+    assert_eq!(json["missing"]["contract"], Value::Array(vec![]));
+}
+
+#[test]
+fn inspect_shows_what_runs_at_which_step() {
+    let model = tiny().to_str().unwrap().to_owned();
+    let text = answer(&["inspect", &model], "");
+    let json: Value = serde_json::from_str(&answer(&["inspect", &model, "--json"], "")).unwrap();
+    let places = json["schedule"].as_array().unwrap();
+    let place = |steps: &str| {
+        let mut found = places.iter().filter(|place| place["steps"] == steps);
+        found
+            .next()
+            .unwrap_or_else(|| panic!("no {steps}: {places:?}"))
+    };
+    let entries = |place: &Value| -> Vec<String> {
+        let calls = place["calls"].as_array().unwrap().iter();
+        calls
+            .map(|call| call["entry"].as_str().unwrap().to_owned())
+            .collect()
+    };
+    let first = ["high_level/start", "codebook/lookup", "low_level/act"];
+    assert_eq!(entries(place("first")), first);
+    let every = ["high_level/step", "codebook/lookup", "low_level/act"];
+    assert_eq!(entries(place("every 4")), every);
+    assert_eq!(
+        entries(place("other")),
+        ["high_level/record", "low_level/act"]
+    );
+    assert_eq!(place("every 4")["calls"][0]["selects_from"], "logits");
+    for name in ["multiply_adds", "weight_bytes", "state_bytes"] {
+        let cost = |place: &Value| place[name].as_u64().unwrap();
+        let calls = place("every 4")["calls"].as_array().unwrap();
+        assert_eq!(cost(place("every 4")), calls.iter().map(cost).sum::<u64>());
+        assert!(cost(place("every 4")) > cost(place("other")), "{name}");
     }
+    for part in [
+        "every 4 steps",
+        "high_level/step, selects from logits",
+        "other steps",
+        "multiply-adds",
+        "context                  kv",
+    ] {
+        assert!(text.contains(part), "{part} is not in: {text}");
+    }
+}
+
+/// A field of a protocol buffer: its number, and text or a message.
+fn field(number: u8, content: &[u8]) -> Vec<u8> {
+    let mut len = content.len();
+    let mut bytes = vec![number << 3 | 2];
+    while len > 127 {
+        bytes.push(len as u8 | 128);
+        len >>= 7;
+    }
+    bytes.push(len as u8);
+    [bytes, content.to_vec()].concat()
+}
+
+/// A node of an ONNX graph.
+fn node(operator: &str, name: &str, input: &str, output: &str) -> Vec<u8> {
+    let [input, output] =
+        [(1, input), (2, output)].map(|(number, text)| field(number, text.as_bytes()));
+    let named = [field(3, name.as_bytes()), field(4, operator.as_bytes())].concat();
+    field(1, &[input, output, named].concat())
+}
+
+/// An f32 value `[batch, len]` at the edge of an ONNX graph, by the number of the graph's field.
+fn edge(number: u8, name: &str, len: u8) -> Vec<u8> {
+    let dims = [field(1, &field(2, b"batch")), field(1, &[1 << 3, len])].concat();
+    let tensor = [vec![1 << 3, 1], field(2, &dims)].concat();
+    field(
+        number,
+        &[field(1, name.as_bytes()), field(2, &field(1, &tensor))].concat(),
+    )
+}
+
+/// A recurrent policy as somebody else exports one: no contract, and operators of which three are not known.
+fn stranger() -> Vec<u8> {
+    let nodes = [
+        node("Tanh", "squash", "obs", "a"),
+        node("Mystery", "first/Mystery", "a", "b"),
+        node("Relu", "", "b", "c"),
+        node("Enigma", "second/Enigma", "c", "actions"),
+        node("Mystery", "third/Mystery", "h_in", "h_out"),
+    ];
+    let edges = [
+        edge(11, "obs", 5),
+        edge(11, "h_in", 8),
+        edge(12, "actions", 3),
+        edge(12, "h_out", 8),
+    ];
+    let graph = [nodes.concat(), edges.concat()].concat();
+    let opset = field(8, &[2 << 3, 17]);
+    [vec![1 << 3, 8], field(7, &graph), opset].concat()
+}
+
+#[test]
+fn inspect_lists_all_that_a_foreign_file_misses() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder
+        .path()
+        .join("foreign.onnx")
+        .to_str()
+        .unwrap()
+        .to_owned();
+    fs::write(&path, stranger()).unwrap();
+    let json: Value = serde_json::from_str(&answer(&["inspect", &path, "--json"], "")).unwrap();
+    assert_eq!(
+        (&json["form"], &json["opset"]),
+        (&"onnx".into(), &17.into())
+    );
+    let missing = &json["missing"];
+    let operators = missing["operators"].as_array().unwrap();
+    let named: Vec<_> = operators
+        .iter()
+        .map(|node| {
+            (
+                node["operator"].as_str().unwrap(),
+                node["node"].as_str().unwrap(),
+            )
+        })
+        .collect();
+    let expected = [
+        ("Mystery", "first/Mystery"),
+        ("Enigma", "second/Enigma"),
+        ("Mystery", "third/Mystery"),
+    ];
+    assert_eq!(named, expected);
+    assert_eq!(operators[0]["inputs"][0]["shape"], "[1, 5]");
+    assert_eq!(
+        operators[1]["inputs"][0]["shape"], "?",
+        "behind what is not known"
+    );
+    assert_eq!(operators[2]["inputs"][0]["shape"], "[1, 8]");
+    let fields: Vec<_> = missing["contract"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|field| field["field"].as_str().unwrap())
+        .collect();
+    for field in [
+        "family",
+        "environment",
+        "control_period_s",
+        "channels[obs]",
+        "channels[obs].shape[0]",
+        "channels[h_in]",
+        "channels[actions]",
+        "entries",
+        "lads.golden",
+    ] {
+        assert!(fields.contains(&field), "{field} is not in {fields:?}");
+    }
+    let text = answer(&["inspect", &path], "");
+    for part in [
+        "no policy yet",
+        "obs: float32 [batch, 5]",
+        "operators that are missing (3)",
+        "Mystery `first/Mystery` of a [1, 5]",
+        "Enigma `second/Enigma`",
+        "an output feeds (h_out)",
+        "`policy/act/obs`",
+    ] {
+        assert!(text.contains(part), "'{part}' is not in: {text}");
+    }
+    // What needs a policy refuses it, in one line.
+    refused(
+        &["self-test", &path],
+        "",
+        &["foreign.onnx", "lads.contract"],
+    );
+}
+
+#[test]
+fn inspect_lists_the_fields_that_a_contract_misses() {
+    let folder = tempfile::tempdir().unwrap();
+    let one = altered(
+        folder.path(),
+        r#""control_period_s""#,
+        r#""control_perioD_s""#,
+    );
+    let json: Value = serde_json::from_str(&answer(&["inspect", &one, "--json"], "")).unwrap();
+    assert_eq!(json["missing"]["operators"], Value::Array(vec![]));
+    assert_eq!(json["missing"]["contract"].as_array().unwrap().len(), 1);
+    assert_eq!(json["missing"]["contract"][0]["field"], "control_period_s");
 }
 
 #[test]
@@ -310,10 +504,17 @@ fn bad_observations_are_refused_by_line() {
         ("0,0,0,nan,0\n", ["line 3", "value 4 is 'nan'", "inspect"]),
         (
             "[0,0,null,0,0]\n",
-            ["line 3", "value 3 is 'null'", "inspect"],
+            ["line 3", "value 3 is 'null'", "element 2 `drawer`"],
         ),
         ("0,0,0,0,inf\n", ["line 3", "value 5 is 'inf'", "inspect"]),
-        ("0,0,0,99,0\n", ["line 3", "99", "inspect"]),
+        (
+            "0,0,0,99,0\n",
+            [
+                "line 3",
+                "channel `observation`, element 3 `lamp` is 99, its limits are -0.5 to 1.5",
+                "inspect",
+            ],
+        ),
         ("hello\n", ["line 3", "1 values", "inspect"]),
     ] {
         let answered = refused(&arguments, &format!("{good}{good}{bad}{good}"), &parts);
@@ -380,7 +581,16 @@ fn bad_files_are_refused_by_every_command() {
     ];
     for (model, parts) in cases {
         let output = path("out.lads");
-        refused(&["inspect", &model], "", &parts);
+        if parts[0] == "altered.onnx" {
+            // An ONNX model all the same, whose lack is listed.
+            let listed = answer(&["inspect", &model], "");
+            assert!(
+                listed.contains("operators that are missing (0)"),
+                "{listed}"
+            );
+        } else {
+            refused(&["inspect", &model], "", &parts);
+        }
         refused(&["self-test", &model], "", &parts);
         refused(&["compile", &model, "-o", &output], "", &parts);
         refused(&act(&model, &[]), "", &parts);
@@ -388,30 +598,44 @@ fn bad_files_are_refused_by_every_command() {
     }
     let newer = altered(
         folder.path(),
-        r#"{"version": 1, "kind""#,
-        r#"{"version": 7, "kind""#,
+        r#"{"version": 2, "family""#,
+        r#"{"version": 7, "family""#,
     );
     refused(
         &["inspect", &newer],
         "",
-        &["altered.onnx", "version 7", "version 1"],
+        &["altered.onnx", "version 7", "version 2"],
     );
+    let older = altered(
+        folder.path(),
+        r#"{"version": 2, "family""#,
+        r#"{"version": 1, "family""#,
+    );
+    let parts = ["altered.onnx", "version 1", "lads_exporter upgrade"];
+    refused(&["inspect", &older], "", &parts);
 }
 
-/// An image with a program whose arena has `elements`, and, where it is to be used, an op over all of it.
+/// First word of a section.
+fn section(words: &[u32], tag: Tag) -> usize {
+    let (rows, _) = words[TABLE_WORD..].as_chunks::<3>();
+    let mut rows = rows.iter().take(words[COUNT_WORD] as usize);
+    rows.find(|row| row[0] == tag as u32).unwrap()[1] as usize / 4
+}
+
+/// An image with an entry whose arena has `elements`, and, where it is to be used, an op over all of it.
 fn greedy(image: &[u8], elements: u32, used: bool) -> Vec<u8> {
+    let tables = Tables::new(image).unwrap();
+    let mut entries = (0..tables.entries_len()).map(|i| tables.entry(i).unwrap());
+    let named = |entry: &EntryRecord| tables.text(entry.name) == "trajectory_encoder/encode";
+    let index = entries.position(|entry| named(&entry)).unwrap();
     let (words, _) = image.as_chunks::<4>();
     let mut words: Vec<u32> = words.iter().map(|&word| u32::from_le_bytes(word)).collect();
-    let section = |words: &[u32], section: Section| {
-        words[SECTION_TABLE_WORD + 2 * section as usize] as usize / 4
-    };
-    let at =
-        section(&words, Section::Programs) + ProgramKind::Encode as usize * ProgramRecord::WORDS;
-    let mut record = ProgramRecord::take(&mut Reader::new(&words[at..])).unwrap();
+    let at = section(&words, Tag::Entries) + index * EntryRecord::WORDS;
+    let mut record = EntryRecord::take(&mut Reader::new(&words[at..])).unwrap();
     record.arena_len = elements;
     record.put(&mut Writer::new(&mut words[at..]));
     if used {
-        let first = section(&words, Section::Ops) + record.first_op as usize * OP_WORDS;
+        let first = section(&words, Tag::Ops) + record.first_op as usize * OP_WORDS;
         let (ops, _) = words[first..].as_chunks_mut::<OP_WORDS>();
         let unary = ops.iter_mut().find_map(|words| match Op::decode(words) {
             Some(Op::Unary(op)) => Some((words, op)),
@@ -427,10 +651,23 @@ fn greedy(image: &[u8], elements: u32, used: bool) -> Vec<u8> {
         op.y = Span { offset: len, len };
         *words = Op::Unary(op).encode();
     }
-    let mut bytes: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
-    let crc = crc32(&bytes);
-    bytes[CRC_WORD * 4..][..4].copy_from_slice(&crc.to_le_bytes());
-    bytes
+    let sealed = |words: &[u32]| {
+        let mut bytes: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
+        let crc = crc32(&bytes);
+        bytes[CRC_WORD * 4..][..4].copy_from_slice(&crc.to_le_bytes());
+        bytes
+    };
+    // It says truly what that costs.
+    let bytes = lads_host::Aligned::new(&sealed(&words));
+    if let Err(PolicyError::Schedule(ScheduleError::Work { counted, .. })) =
+        Policy::new_checked(bytes.as_bytes())
+    {
+        let at = section(&words, Tag::Contract);
+        let mut record = ContractRecord::take(&mut Reader::new(&words[at..])).unwrap();
+        record.worst_work = counted;
+        record.put(&mut Writer::new(&mut words[at..]));
+    }
+    sealed(&words)
 }
 
 #[test]
@@ -621,10 +858,7 @@ fn observations_of_the_golden_episode_go_through_the_pipe() {
     let model = tiny.to_str().unwrap();
     let observations = answer(&["inspect", model, "--observations"], "");
     with_golden(|_, golden| {
-        let written: String = golden
-            .steps()
-            .map(|(observation, _, _)| csv(observation))
-            .collect();
+        let written: String = golden.steps().map(|step| csv(step.observation())).collect();
         assert_eq!(observations, written);
         assert_eq!(
             answer(&act(model, &[]), &observations).lines().count(),
@@ -635,11 +869,13 @@ fn observations_of_the_golden_episode_go_through_the_pipe() {
 
 #[test]
 fn bad_arguments_are_one_line() {
+    let tiny = tiny();
     refused(
-        &["act", "--model", "m.onnx"],
+        &["act", "--model", tiny.to_str().unwrap()],
         "",
-        &["--instruction", "--help"],
+        &["--instruction", "takes an instruction", "inspect"],
     );
+    refused(&["act"], "", &["--model", "--help"]);
     refused(&["dance"], "", &["dance", "--help"]);
     refused(&[], "", &["subcommand", "self-test", "--help"]);
     refused(
@@ -693,8 +929,6 @@ fn bench_refuses_what_makes_no_sense() {
         (&["--rate", "nan"], &["--rate", "0.1 to 10000"]),
         (&["--seconds=-1"], &["--seconds", "0.1 to 86400"]),
         (&["--load", "100000"], &["--load", "at most"]),
-        #[cfg(not(feature = "peers"))]
-        (&["--peers"], &["--peers", "--features peers"]),
     ] {
         refused(
             &[&["bench", "--model", tiny], arguments].concat(),

@@ -174,8 +174,10 @@ fn gate(policy: &Policy, options: Options, tolerance: f32) -> Result<(), Compile
     bounded(policy.arena_len().saturating_add(policy.state_len()))?;
     let mut arena = vec![0.0; policy.arena_len()];
     let mut state = vec![0.0; policy.state_len()];
-    let workspace = Workspace::new(policy, &mut arena, &mut state).map_err(|small| CompileError::Excessive {
-        bytes: small.needed.saturating_mul(size_of::<f32>()),
+    let workspace = Workspace::new(policy, &mut arena, &mut state).map_err(|small| {
+        CompileError::Excessive {
+            bytes: small.needed.saturating_mul(size_of::<f32>()),
+        }
     })?;
     let replayed = Controller::new(*policy, workspace).self_test();
     replayed.map(|_| ()).map_err(|error| CompileError::Gate {

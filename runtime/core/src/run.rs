@@ -17,6 +17,7 @@ use crate::contract::ChannelId;
 use crate::errors::RunError;
 use crate::inputs::Data;
 use crate::normal::Normals;
+use crate::policy::Policy;
 use crate::workspace::Workspace;
 
 /// The integers of a program.
@@ -131,6 +132,29 @@ fn fill(to: &mut [f32], from: &[f32]) {
     to.get_mut(from.len()..).unwrap_or(&mut []).fill(0.0);
 }
 
+impl<'r, 'a, 'm, 'd> Run<'r, 'a, 'm, 'd> {
+    /// Nothing has run yet; noise is zero.
+    pub fn new(
+        policy: &'r Policy<'a>,
+        memory: &'r mut Workspace<'m>,
+        given: &'r [(ChannelId, Data<'d>)],
+        counters: Counters,
+    ) -> Self {
+        let contract = policy.contract();
+        Self {
+            tables: policy.tables(),
+            memory,
+            action: contract.action_id(),
+            given,
+            noise: contract.noise_id(),
+            draws: Draws::Zero,
+            counters,
+            words: 0,
+            given_index: None,
+        }
+    }
+}
+
 impl Run<'_, '_, '_, '_> {
     /// Runs one call: clears, runs its entry as often as it says. What it selects is the controller's to do.
     #[inline]
@@ -163,7 +187,7 @@ impl Run<'_, '_, '_, '_> {
     }
 
     /// Empties a state for what follows; what is in force stays.
-    fn clear(&mut self, state: u32) -> Result<(), RunError> {
+    pub fn clear(&mut self, state: u32) -> Result<(), RunError> {
         let record = self.state(state)?;
         if record.kind == StateKind::Plain {
             let (at, len) = (record.offset as usize, record.width as usize);

@@ -86,6 +86,12 @@ fn channels_are_observations_and_one_action() {
         channels
     );
     assert_eq!(more(Role::Demonstration, 50), None);
+    assert_eq!(
+        [more(Role::Noise, 1), more(Role::Noise, 2)],
+        [None, channels]
+    );
+    assert_eq!(more(Role::Action, 1), channels);
+    assert_eq!(more(Role::Instruction, 1), channels);
     assert_eq!(more(Role::Demonstration, 124), channels);
 }
 

@@ -24,8 +24,9 @@ fn all(fused: bool) -> Vec<(&'static str, Parts)> {
     let mut all = shapes::all();
     all.push(("lads", tiny()));
     if fused {
-        all.iter_mut()
-            .for_each(|(_, parts)| *parts = with_fuse(parts.clone()));
+        for (_, parts) in &mut all {
+            *parts = with_fuse(parts.clone());
+        }
     }
     all
 }
@@ -44,7 +45,7 @@ fn with_fuse(mut parts: Parts) -> Parts {
         x: x.into(),
         y,
     });
-    fuse.to_state(burnt, y);
+    fuse.gives_state(burnt, y);
     let fuse = parts.entry(fuse.finish());
     let last = parts
         .calls
@@ -101,7 +102,9 @@ fn episode(image: &Image, mut between: impl FnMut(&mut Controller, &Policy, usiz
 fn halve(inputs: &mut [(ChannelId, support::Values)]) {
     for (_, values) in inputs {
         if let support::Values::F32(values) = values {
-            values.iter_mut().for_each(|x| *x *= 0.5);
+            for value in values {
+                *value *= 0.5;
+            }
         }
     }
 }
@@ -237,7 +240,7 @@ fn a_ring_is_as_it_was_after_a_failed_step() {
         let rows = read.state(0, 2 * shapes::MEMORY);
         let index = read.int(lads_image::records::SourceKind::Selected, 0, 0);
         let row = read.gather(rows, 2, index, 0);
-        read.to_channel(shapes::ACTION, row);
+        read.gives_channel(shapes::ACTION, row);
         let read = parts.entry(read.finish());
         parts.calls.push(Call::on(Event::Follow, read));
         if name == "clear" {
@@ -289,4 +292,50 @@ fn resize(parts: &mut Parts, rows: u32) {
             }
         }
     }
+}
+
+/// The one call whose failure is not undone leaves the controller without an instruction, and nothing for the next one.
+#[test]
+fn an_instruction_that_fails_leaves_none() {
+    let image = shapes::recurrent().image();
+    let fresh = episode(&image, |_, _, _| ());
+    let disturbed = episode(&image, |controller, _, step| {
+        if step != 0 && step != 13 {
+            return;
+        }
+        let refused = controller.set_instruction(Instruction::Words(&[3e38; 4]));
+        assert_eq!(refused, Err(InstructionError::Run(RunError::NotFinite)));
+        assert!(!controller.is_instructed());
+        let refused = controller.step(&[0.0; 2], &mut [0.0; 2]);
+        assert_eq!(refused, Err(StepError::NoInstruction));
+        let id = u32::from(step == 13);
+        controller
+            .set_instruction(Instruction::Id(id))
+            .expect("it is known");
+    });
+    assert_eq!(fresh, disturbed);
+}
+
+/// Words so large that nothing can be computed fill the cache with what is not finite; the next instruction does not see it.
+#[test]
+fn what_a_hopeless_instruction_left_in_the_cache_is_not_read() {
+    let image = tiny().image();
+    let fresh = episode(&image, |_, _, _| ());
+    let disturbed = episode(&image, |controller, _, step| {
+        if step != 0 && step != 13 {
+            return;
+        }
+        controller
+            .set_instruction(Instruction::Words(&[3e38; 16]))
+            .expect("words have no limits");
+        for _ in 0..2 {
+            let refused = controller.step(&[0.1; 3], &mut [0.0; 2]);
+            assert_eq!(refused, Err(StepError::Run(RunError::NotFinite)));
+        }
+        let id = u32::from(step == 13);
+        controller
+            .set_instruction(Instruction::Id(id))
+            .expect("it is known");
+    });
+    assert_eq!(fresh, disturbed);
 }

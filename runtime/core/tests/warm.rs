@@ -5,6 +5,7 @@ mod support;
 use lads_core::Instruction;
 use lads_image::records::Beyond;
 use support::assemble::parts;
+use support::draft::kv_len;
 use support::{Image, Memory, Model, Random, Spec, given, observe, shapes};
 
 /// The bits of what an episode gives, with or without warming before every step.
@@ -118,4 +119,33 @@ fn before_the_first_step_later_programs_run() {
     };
     assert_eq!(rows(false), [false, false, false]);
     assert_eq!(rows(true), [true, true, false]);
+}
+
+/// A call that clears its full cache is warmed too, in the half that it would write.
+#[test]
+fn a_call_that_clears_is_warmed_in_the_other_half() {
+    let image = shapes::chunks().image();
+    let policy = image.policy();
+    let half = |warms: bool| {
+        let mut memory = Memory::for_policy(&policy);
+        let mut controller = memory.controller(&policy);
+        controller
+            .set_instruction(Instruction::Id(0))
+            .expect("the instruction is known");
+        for _ in 0..2 {
+            controller
+                .step(&[0.5, -0.25], &mut [0.0; 2])
+                .expect("the context has room");
+        }
+        if warms {
+            controller.warm();
+        }
+        // Behind the first cache: the first step went to the second half.
+        let start = kv_len(6, 2) as usize;
+        memory.state[start..start + kv_len(5, 2) as usize]
+            .iter()
+            .any(|&x| x != 0.0)
+    };
+    assert!(!half(false));
+    assert!(half(true));
 }

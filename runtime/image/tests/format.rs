@@ -94,7 +94,9 @@ proptest! {
         words[format::COUNT_WORD] %= 20;
         words.resize(len, 0);
         if let Ok(sections) = Sections::new(&words) {
-            Tag::ALL.iter().for_each(|&tag| assert!(sections.get(tag).len() <= len));
+            for &tag in Tag::ALL {
+                prop_assert!(sections.get(tag).len() <= len);
+            }
         }
     }
 }

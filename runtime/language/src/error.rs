@@ -18,7 +18,7 @@ pub enum LanguageError {
     )]
     NoCache,
     /// There is no encoder.
-    #[error("the language encoder {encoder} is not in {}; build it once with \"make language\"", folder.display())]
+    #[error("the language encoder {encoder} is not in {}; export it once with `python -m lads_exporter language`", folder.display())]
     Missing {
         /// Its name.
         encoder: String,
@@ -26,7 +26,7 @@ pub enum LanguageError {
         folder: PathBuf,
     },
     /// A file of it cannot be read, or is not what its manifest says.
-    #[error("{}: {problem}; build it again with \"make language\"", path.display())]
+    #[error("{}: {problem}; export it again with `python -m lads_exporter language`", path.display())]
     Damaged {
         /// The file.
         path: PathBuf,
@@ -35,7 +35,7 @@ pub enum LanguageError {
     },
     /// An encoder with other weights than the one that made the bundle's embeddings.
     #[error(
-        "the language encoder in {} has weights of sha256 {got:.12}, the bundle's embeddings were made by {encoder} with {needed:.12}; name the folder of that one, or build it with \"make language\"",
+        "the language encoder in {} has weights of sha256 {got:.12}, the bundle's embeddings were made by {encoder} with {needed:.12}; name the folder of that one, or export it with `python -m lads_exporter language`",
         folder.display()
     )]
     Other {
@@ -79,7 +79,7 @@ pub enum LanguageError {
     },
     /// The encoder failed on a sentence that it should take.
     #[error(
-        "'{text}': the language encoder failed ({problem}); build it again with \"make language\""
+        "'{text}': the language encoder failed ({problem}); export it again with `python -m lads_exporter language`"
     )]
     Run {
         /// The sentence.

@@ -1,6 +1,6 @@
 //! Sentences that are in no bundle's table, to the word embeddings `[n, E]` that the core's `Controller::set_instruction` takes.
 //!
-//! The language encoder is no part of a bundle: `make language` exports it once into a [cache](default_folder), and [`Encoder::open`] takes
+//! The language encoder is no part of a bundle: the exporter writes it once into a [cache](default_folder), and [`Encoder::open`] takes
 //! it only if its weights are those that made the bundle's own embeddings. It runs on the host, before the first control step, and
 //! allocates; the controller never waits for it. A policy follows whatever it hears, nonsense too: before it is told a sentence,
 //! `lads_core::similarity::nearest` says which known instruction the words are most like and how much, and the contract's
@@ -25,7 +25,7 @@ pub struct Readme;
 /// Names the folder that holds what was downloaded or built once for this user.
 pub const CACHE_VARIABLE: &str = "LADS_CACHE";
 
-/// Where `make language` puts an encoder: `language/NAME` in `$LADS_CACHE`, else in `lads` in `$XDG_CACHE_HOME` or `~/.cache`.
+/// Where the exporter puts an encoder: `language/NAME` in `$LADS_CACHE`, else in `lads` in `$XDG_CACHE_HOME` or `~/.cache`.
 ///
 /// The name comes from a bundle, so one that is no plain file name is refused.
 pub fn default_folder(encoder: &str) -> Result<PathBuf, LanguageError> {

@@ -102,7 +102,7 @@ fn a_missing_encoder_is_refused() {
     for folder in ["no/such/folder", "Cargo.toml"] {
         one_line(
             &refusal(Path::new(folder), &words()),
-            &[folder, "tiny-encoder", "make language"],
+            &[folder, "tiny-encoder", "lads_exporter"],
         );
     }
 }
@@ -137,7 +137,7 @@ fn damaged_files_are_refused() {
             trust(folder.path(), file, &bytes);
         }
         let error = refusal(folder.path(), &words());
-        one_line(&error, &[file, "make language"]);
+        one_line(&error, &[file, "lads_exporter"]);
         error.to_string()
     };
     for file in ["encoder.onnx", "tokenizer.json"] {
@@ -161,7 +161,7 @@ fn damaged_files_are_refused() {
     fs::remove_file(folder.path().join("encoder.onnx")).unwrap();
     one_line(
         &refusal(folder.path(), &words()),
-        &["encoder.onnx", "make language"],
+        &["encoder.onnx", "lads_exporter"],
     );
 }
 
@@ -179,7 +179,7 @@ fn an_encoder_that_contradicts_its_manifest_is_refused() {
         fs::write(&path, bytes).unwrap();
         let encoder = Encoder::open(folder.path(), &contract(0, Pooling::Mean, 8)).unwrap();
         let error = encoder.words(&"open ".repeat(words)).unwrap_err();
-        one_line(&error, &["make language"]);
+        one_line(&error, &["lads_exporter"]);
     }
 }
 

@@ -50,16 +50,12 @@ impl<'c, 'a, 'm> Lads<'c, 'a, 'm> {
     }
 
     fn instruct(&mut self) -> Result<(), BenchError> {
-        match self.episode.instruction {
-            Some(number) => self
-                .controller
-                .set_instruction(Instruction::Id(number))
-                .map_err(|error| self.refused(error)),
-            None => {
-                self.controller.reset();
-                Ok(())
-            }
-        }
+        let Some(number) = self.episode.instruction else {
+            self.controller.reset();
+            return Ok(());
+        };
+        let done = self.controller.set_instruction(Instruction::Id(number));
+        done.map_err(|error| self.refused(error))
     }
 
     fn step(&mut self, step: usize) -> Result<StepReport, BenchError> {

@@ -18,7 +18,7 @@ pub struct Episode {
     pub success: bool,
     /// Completed sub-tasks, in order of time.
     pub completions: Vec<Completion>,
-    /// Plan indices in the order in which they were decided.
+    /// The indices that were selected, such as those of plans, in order; none of a policy that selects none.
     pub plans: Vec<u32>,
     /// Noise-free state after the last step.
     pub final_state: Vec<f64>,

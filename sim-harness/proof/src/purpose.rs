@@ -9,16 +9,13 @@ use std::fmt::Write as _;
 use serde_json::Value;
 use sha2::{Digest as _, Sha256};
 
-/// The parts of a contract that say what a policy is for; the others say how it is built.
-const PURPOSE: [&str; 9] = [
+/// The parts of a contract, version 2, that say what a policy is for; the others say how it is built.
+const PURPOSE: [&str; 6] = [
     "environment",
     "control_period_s",
-    "observation",
-    "action",
-    "quaternion_order",
+    "channels",
     "instructions",
     "language",
-    "channels",
     "evaluation",
 ];
 

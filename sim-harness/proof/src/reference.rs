@@ -68,8 +68,9 @@ pub struct Reference {
     pub seed: u64,
     /// Noise level, as the environment names it.
     pub noise: String,
-    /// Control steps between two decisions.
-    pub horizon: usize,
+    /// Control steps from one selection to the next; `None` of a policy that selects nothing.
+    #[serde(rename = "horizon")]
+    pub period: Option<usize>,
     /// Episodes of each instruction.
     pub episodes_per_instruction: u32,
     /// How many of these have a trace.
@@ -133,7 +134,7 @@ pub struct Episode {
     pub completions: Vec<Completion>,
     /// Plan indices in the order in which they were decided.
     pub plans: Vec<u32>,
-    /// The control steps at which they were decided; left out where there is one in each horizon from the episode's start.
+    /// The control steps at which they were decided; left out where they come once a period from the episode's start.
     pub decided_at: Option<Vec<usize>>,
     /// Largest logit minus second largest, of each decision.
     pub margins: Vec<f64>,
@@ -164,7 +165,7 @@ pub struct Trace {
     pub states: Vec<f64>,
     /// Logits of each decision, `[decisions, M]`; empty where none were recorded.
     pub logits: Vec<f32>,
-    /// The plan that the trajectory encoder sees in each full horizon.
+    /// The plan that the trajectory encoder sees in each full segment.
     pub encoded: Option<Vec<u32>>,
     /// How much farther the second nearest code was, relative to the nearest's squared distance.
     pub encoded_margins: Option<Vec<f64>>,
@@ -265,8 +266,8 @@ impl Reference {
     }
 
     fn consistent(&self) -> Result<(), String> {
-        if self.instructions.is_empty() || self.horizon == 0 || self.traced_episodes == 0 {
-            return Err("it has no instruction, no horizon or no traced episode".to_owned());
+        if self.instructions.is_empty() || self.period == Some(0) || self.traced_episodes == 0 {
+            return Err("it has no instruction, no traced episode or decisions every 0 steps".to_owned());
         }
         for instruction in &self.instructions {
             let wrong = |what: &str| Err(format!("instruction '{}': {what}", instruction.id));
@@ -302,7 +303,10 @@ impl Reference {
 
     /// The control steps at which the plans of an episode were decided.
     pub fn decided_at(&self, episode: &Episode) -> Vec<usize> {
-        let grid = || (0..episode.steps).step_by(self.horizon.max(1)).collect();
+        let grid = || {
+            let period = self.period.map(|period| period.max(1));
+            period.map_or_else(Vec::new, |period| (0..episode.steps).step_by(period).collect())
+        };
         episode.decided_at.clone().unwrap_or_else(grid)
     }
 

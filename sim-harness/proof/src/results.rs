@@ -96,7 +96,7 @@ pub struct Results {
     /// What was wrong between policy and environment; left out without faults.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub faults: Option<Faults>,
-    /// Whether the low level ran alone on given plans; left out where the policy decided.
+    /// Whether the policy followed plans that were given; left out where it decided.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub plans_commanded: bool,
     /// Plans in force against plans encoded from what was executed; left out where not asked for.
@@ -119,7 +119,7 @@ pub struct Results {
 pub struct Agreement {
     /// Segments encoded as their plan.
     pub agreed: usize,
-    /// Segments in all: full horizons.
+    /// Segments in all: as long as the encoder reads.
     pub segments: usize,
     /// Wilson 95 % interval of their share.
     pub interval: Option<Interval>,

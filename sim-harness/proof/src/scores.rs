@@ -29,7 +29,7 @@ pub struct Run {
     pub success: Option<bool>,
     /// Completed sub-tasks in the order of their completion.
     pub completions: Vec<Completion>,
-    /// Latent plan indices in the order in which they were decided, one per horizon.
+    /// The indices that were selected, such as those of latent plans, in order; none of a policy that selects none.
     pub plans: Vec<u32>,
 }
 

@@ -9,9 +9,9 @@ use serde::Serialize;
 /// How long everything took, over all episodes of one driver.
 #[derive(Debug, Clone, Default)]
 pub struct Timing {
-    /// Every control step that kept its plan, in nanoseconds.
+    /// Every control step that selected nothing, in nanoseconds.
     pub ordinary_ns: Vec<u64>,
-    /// Every control step that decided a plan, in nanoseconds.
+    /// Every control step that selected an index, such as that of a plan, in nanoseconds.
     pub decision_ns: Vec<u64>,
     /// Every change of instruction, in nanoseconds.
     pub instruct_ns: Vec<u64>,
@@ -71,11 +71,11 @@ impl Latency {
 /// Latency of the controller, in microseconds, by the kind of call.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LatencyByKind {
-    /// Control steps that keep the plan.
+    /// Control steps that select nothing.
     pub ordinary: Latency,
-    /// Control steps that decide a new plan, every horizon.
+    /// Control steps that select an index, such as that of a plan.
     pub decision: Latency,
-    /// Setting an instruction, which runs its words through the high level.
+    /// Setting an instruction, which runs its words through the policy.
     pub instruct: Latency,
 }
 

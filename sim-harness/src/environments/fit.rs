@@ -4,7 +4,8 @@
 //! joint. So id, version, control period and every element must agree, and every sub-task must be one that is watched. Environments name
 //! an element after its joint where the joint has one coordinate, so an element agrees by its name or by its joint.
 
-use lads_core::{Contract, Element};
+use lads_compiler::Contract;
+use lads_compiler::contract::{Channel, DType, Element};
 use thiserror::Error;
 
 use crate::environment::Environment;
@@ -32,6 +33,14 @@ pub enum Misfit {
         contract: f64,
         /// The environment's, in seconds.
         environment: f64,
+    },
+    /// The policy observes more than one vector, or something else.
+    #[error(
+        "the contract's observation channels are {contract}, the environment gives one vector of numbers"
+    )]
+    Channels {
+        /// Their names.
+        contract: String,
     },
     /// Observation or action have different lengths.
     #[error("the contract's {field} has {contract} elements, the environment's has {environment}")]
@@ -72,21 +81,21 @@ pub enum Misfit {
 /// Compares `contract` with `environment`; on success gives, for each instruction of the contract, the environment's indices of the
 /// sub-tasks that it commands.
 pub fn check(
-    contract: &Contract<'_>,
+    contract: &Contract,
     environment: &dyn Environment,
 ) -> Result<Vec<Vec<usize>>, Misfit> {
     same_text(
         "environment.id",
-        contract.environment_id(),
+        &contract.environment.id,
         environment.id(),
     )?;
     same_text(
         "environment.version",
-        contract.environment_version(),
+        &contract.environment.version,
         environment.version(),
     )?;
     let (period, simulated) = (
-        f64::from(contract.control_period_s()),
+        f64::from(contract.control_period_s),
         environment.control_period_s(),
     );
     let difference = (period - simulated).abs();
@@ -96,23 +105,30 @@ pub fn check(
             environment: simulated,
         });
     }
-    same_elements(
-        "observation",
-        contract.observations(),
-        environment.observation_names(),
-    )?;
-    same_elements("action", contract.actions(), environment.action_names())?;
+    let observation = contract.observation();
+    if contract.observations().count() > 1 || observation.dtype != DType::F32 {
+        let names = contract.observations().map(|channel| channel.name.as_str());
+        return Err(Misfit::Channels {
+            contract: names.collect::<Vec<_>>().join(", "),
+        });
+    }
+    same_elements("observation", observation, environment.observation_names())?;
+    same_elements("action", contract.action(), environment.action_names())?;
     contract
-        .instructions()
-        .map(|known| {
-            sub_tasks(known.sub_tasks)
-                .map(|name| index_of(known.id, name, environment))
+        .instructions
+        .iter()
+        .enumerate()
+        .map(|(index, known)| {
+            let (sub_tasks, _) = contract.evaluated(index);
+            let sub_tasks = sub_tasks.iter();
+            sub_tasks
+                .map(|name| index_of(&known.id, name, environment))
                 .collect()
         })
         .collect()
 }
 
-/// The names in a contract's list of sub-tasks.
+/// The names in a list of sub-tasks that a person wrote.
 pub fn sub_tasks(list: &str) -> impl Iterator<Item = &str> {
     list.split(',')
         .map(str::trim)
@@ -145,12 +161,12 @@ fn same_text(field: &'static str, contract: &str, environment: &str) -> Result<(
     })
 }
 
-fn same_elements<'c>(
+fn same_elements(
     field: &'static str,
-    contract: impl Iterator<Item = Element<'c>>,
+    channel: &Channel,
     environment: &[&str],
 ) -> Result<(), Misfit> {
-    let contract: Vec<_> = contract.collect();
+    let contract = &channel.elements;
     if contract.len() != environment.len() {
         return Err(Misfit::Len {
             field,
@@ -158,14 +174,16 @@ fn same_elements<'c>(
             environment: environment.len(),
         });
     }
-    let differs = |element: &Element<'_>, name| element.name != name && element.joint != name;
+    let differs = |element: &Element, name: &str| {
+        element.name != name && element.joint.as_deref() != Some(name)
+    };
     let mut pairs = contract.iter().zip(environment).enumerate();
     match pairs.find(|(_, (element, name))| differs(element, **name)) {
         None => Ok(()),
         Some((index, (element, name))) => Err(Misfit::Name {
             field,
             index,
-            contract: element.name.to_owned(),
+            contract: element.name.clone(),
             environment: (*name).to_owned(),
         }),
     }

@@ -8,20 +8,25 @@ use std::panic::resume_unwind;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 
-use lads_compiler::{Memory, MemoryError};
-use lads_core::{Decision, Isa, KnownInstruction, Policy};
+use lads_compiler::Contract;
+use lads_core::{Decision, Isa, Noise, Policy};
+use lads_host::{Memory, MemoryError};
 use thiserror::Error;
 
 use crate::environment::{Environment, EpisodeSeed};
 use crate::faults::Faults;
 use crate::plans::PlanBook;
 use crate::random::Stream;
+use crate::results::{self, Asked};
 use crate::rollout::{Actor, Driver, Episode, Onlooker, RolloutError, Task, Timing};
 use crate::spoken::WordBook;
 use crate::trace::Trace;
 
 /// Fourth number of the entropy of the stream that seeds plan sampling; the environment's noise has only the first three.
 const DECISION_STREAM: u64 = 1;
+
+/// The same of the stream that seeds what a policy draws at random.
+const NOISE_STREAM: u64 = 5;
 
 /// One instruction to run.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -39,7 +44,7 @@ pub struct Assignment {
 pub struct Setup<'e> {
     /// What is wrong between policy and environment.
     pub faults: Faults,
-    /// Plans for the low level alone.
+    /// Plans that the policy is to follow, instead of its own.
     pub plans: Option<&'e PlanBook>,
     /// Word embeddings that are heard instead of the table's.
     pub words: Option<&'e WordBook>,
@@ -56,6 +61,8 @@ pub struct Setup<'e> {
 pub struct Evaluation<'e> {
     /// The compiled policy.
     pub policy: Policy<'e>,
+    /// The contract of its bundle, which also says how instructions are evaluated.
+    pub contract: &'e Contract,
     /// Its instructions.
     pub assignments: &'e [Assignment],
     /// Episodes of each instruction.
@@ -132,10 +139,9 @@ impl Evaluation<'_> {
     }
 
     /// What an instruction is, be it of the policy's table or a sentence outside it.
-    pub fn instruction(&self, instruction: u32) -> Option<KnownInstruction<'_>> {
-        let contract = self.policy.contract();
-        let known = contract.instruction(instruction as usize);
-        known.or_else(|| Some(self.setup.words?.sentence.as_ref()?.known()))
+    pub fn instruction(&self, instruction: u32) -> Option<Asked<'_>> {
+        let known = results::asked(self.contract, instruction as usize);
+        known.or_else(|| Some(self.setup.words?.sentence.as_ref()?.asked()))
     }
 
     /// Whether there is nothing to run.
@@ -257,6 +263,10 @@ impl Evaluation<'_> {
                     Decision::Sample { seed, .. } => Some(seed),
                     Decision::Argmax => None,
                 },
+                noise_seed: match task.noise {
+                    Noise::Seeded { seed } => Some(seed),
+                    Noise::Zero => None,
+                },
                 commanded: task.plans.is_some(),
                 outcome: run.clone(),
                 steps: driver.take_recording(),
@@ -280,9 +290,15 @@ impl Evaluation<'_> {
         let decision = match self.decision {
             Decision::Sample { temperature, .. } => Decision::Sample {
                 temperature,
-                seed: decision_seed(seed),
+                seed: stream_seed(seed, DECISION_STREAM),
             },
             Decision::Argmax => Decision::Argmax,
+        };
+        let noise = match self.policy.contract().noise() {
+            Noise::Seeded { .. } => Noise::Seeded {
+                seed: stream_seed(seed, NOISE_STREAM),
+            },
+            Noise::Zero => Noise::Zero,
         };
         Task {
             instruction: assignment.instruction,
@@ -294,6 +310,7 @@ impl Evaluation<'_> {
             max_steps: assignment.max_steps,
             seed,
             decision,
+            noise,
             actor: self.actor,
             faults: self.setup.faults,
             plans: self
@@ -304,11 +321,11 @@ impl Evaluation<'_> {
     }
 }
 
-/// Seed of the stream from which one episode's plans are sampled: the first draw of numpy's `default_rng([seed, instruction, episode, 1])`,
-/// 53 bits.
-fn decision_seed(seed: EpisodeSeed) -> u64 {
+/// Seed of one of an episode's streams, such as the one that its plans are sampled from: the first draw of numpy's
+/// `default_rng([seed, instruction, episode, stream])`, 53 bits.
+fn stream_seed(seed: EpisodeSeed, stream: u64) -> u64 {
     let [run, instruction, episode] = seed.entropy();
-    let unit = Stream::new(&[run, instruction, episode, DECISION_STREAM]).unit();
+    let unit = Stream::new(&[run, instruction, episode, stream]).unit();
     (unit * (1_u64 << 53) as f64) as u64
 }
 
@@ -325,14 +342,19 @@ mod tests {
                 episode,
             })
         });
-        let mut drawn: Vec<u64> = seeds.map(decision_seed).collect();
+        let mut drawn: Vec<u64> = seeds
+            .map(|seed| stream_seed(seed, DECISION_STREAM))
+            .collect();
         assert_eq!(
             drawn[0],
-            decision_seed(EpisodeSeed {
-                seed: 7,
-                instruction: 0,
-                episode: 0
-            })
+            stream_seed(
+                EpisodeSeed {
+                    seed: 7,
+                    instruction: 0,
+                    episode: 0
+                },
+                DECISION_STREAM
+            )
         );
         drawn.sort_unstable();
         drawn.dedup();

@@ -4,9 +4,10 @@
 
 use std::collections::BTreeMap;
 
-use lads_core::{Contract, Decision, KnownInstruction};
+use lads_compiler::Contract;
+use lads_core::Decision;
 pub use lads_proof::results::{
-    Agreement, DecisionUsed, EnvironmentUsed, FORMAT, FORMAT_VERSION, HeardBy, Results,
+    Agreement, DecisionUsed, EnvironmentUsed, FORMAT, FORMAT_VERSION, HeardBy, NearestKnown, Results,
 };
 pub use lads_proof::scores::{
     Asked, Completion, InstructionResult, Run, SplitResult, Splits, SubTaskRate,
@@ -14,30 +15,36 @@ pub use lads_proof::scores::{
 pub use lads_proof::timing::{LatencyByKind, TimeUse};
 
 use crate::environment::Environment;
-use crate::fit;
 use crate::rollout::{Actor, Episode};
 
-/// Sums up the episodes of one instruction of a contract; `watched` are the environment's sub-tasks.
+/// Instruction number `index` of a contract and how it is evaluated.
+pub fn asked(contract: &Contract, index: usize) -> Option<Asked<'_>> {
+    let known = contract.instructions.get(index)?;
+    let (sub_tasks, split) = contract.evaluated(index);
+    Some(Asked {
+        id: &known.id,
+        text: &known.text,
+        split,
+        sub_tasks: sub_tasks.iter().map(String::as_str).collect(),
+    })
+}
+
+/// Sums up the episodes of one instruction; `watched` are the environment's sub-tasks.
 pub fn of_instruction(
-    known: &KnownInstruction<'_>,
+    asked: &Asked<'_>,
     watched: &[&str],
     episodes: &[Episode],
 ) -> InstructionResult {
-    let asked = Asked {
-        id: known.id,
-        text: known.text,
-        split: known.split,
-        sub_tasks: fit::sub_tasks(known.sub_tasks).collect(),
-    };
-    InstructionResult::new(&asked, watched, episodes)
+    InstructionResult::new(asked, watched, episodes)
 }
 
 /// The names of the contract's splits, in the order in which its instructions first name them.
-pub fn split_names(contract: &Contract<'_>) -> Vec<String> {
+pub fn split_names(contract: &Contract) -> Vec<String> {
     let mut names: Vec<String> = Vec::new();
-    for known in contract.instructions() {
-        if !names.iter().any(|name| name == known.split) {
-            names.push(known.split.to_owned());
+    for index in 0..contract.instructions.len() {
+        let (_, split) = contract.evaluated(index);
+        if !names.iter().any(|name| name == split) {
+            names.push(split.to_owned());
         }
     }
     names

@@ -6,7 +6,8 @@
 use std::time::{Duration, Instant};
 
 use lads_core::{
-    ActError, Controller, Decision, Instruction, InstructionError, PlanIndex, StepError, StepReport,
+    ChannelId, Controller, Data, Decision, FollowError, Instruction, InstructionError, Noise,
+    Selected, StepError,
 };
 use rustix::time::{ClockId, clock_gettime};
 use thiserror::Error;
@@ -33,13 +34,13 @@ pub enum RolloutError {
         /// The controller's reason.
         error: StepError,
     },
-    /// The low level refused a commanded plan.
-    #[error("the low level gives no action in control step {step}: {error}")]
-    Act {
+    /// The policy refused a plan that it was to follow.
+    #[error("the policy gives no action for the plan of control step {step}: {error}")]
+    Follow {
         /// Control step, from 0.
         step: usize,
-        /// The low level's reason.
-        error: ActError,
+        /// The controller's reason.
+        error: FollowError,
     },
     /// The environment refused an action.
     #[error("the environment refuses the action of control step {step}: {error}")]
@@ -69,8 +70,8 @@ pub struct Glimpse<'g> {
 pub enum Stand {
     /// The next action is about to be executed.
     Acting {
-        /// The plan in force.
-        plan: u32,
+        /// The plan in force; `None` of a policy that selects none.
+        plan: Option<u32>,
     },
     /// The last action was executed.
     Ended {
@@ -125,12 +126,23 @@ pub struct Task<'t> {
     pub seed: EpisodeSeed,
     /// How plans are chosen, with the seed of this episode where they are sampled.
     pub decision: Decision,
+    /// What else the policy draws at random, with the seed of this episode.
+    pub noise: Noise,
     /// Who acts.
     pub actor: Actor,
     /// What is wrong between policy and environment.
     pub faults: Faults,
-    /// Plans for the low level alone, one per horizon; the episode ends with them. `None`: the high level decides.
-    pub plans: Option<&'t [u32]>,
+    /// Plans that the policy is to follow; the episode ends with them. `None`: the policy decides.
+    pub plans: Option<Commanded<'t>>,
+}
+
+/// Plans that are given.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Commanded<'t> {
+    /// In order.
+    pub plans: &'t [u32],
+    /// Control steps that each is followed for.
+    pub period: usize,
 }
 
 /// CPU time that this thread has used: unlike the wall clock's, its differences do not depend on what else the machine does.
@@ -148,6 +160,8 @@ fn cpu_since(earlier: Duration) -> Duration {
 pub struct Driver<'a, 'm, 'e> {
     controller: Controller<'a, 'm>,
     environment: &'e mut dyn Environment,
+    /// The channel that the observation goes to.
+    channel: ChannelId,
     observation: Vec<f32>,
     action: Vec<f32>,
     executed: Vec<f32>,
@@ -165,15 +179,17 @@ pub struct Driver<'a, 'm, 'e> {
 impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
     /// Joins a controller and an environment that were checked to fit (see [`crate::fit`]).
     pub fn new(controller: Controller<'a, 'm>, environment: &'e mut dyn Environment) -> Self {
-        let actions = controller.policy().contract().actions();
-        let limits =
-            actions.map(|element| (f64::from(element.limits.min), f64::from(element.limits.max)));
+        let contract = controller.policy().contract();
+        let limits = contract.action_limits();
+        let limits = limits.map(|limits| (f64::from(limits.min), f64::from(limits.max)));
         let limits = limits.collect();
+        let channel = contract.observation().id();
         let (observation_len, action_len) =
             (environment.observation_len(), environment.action_len());
         Self {
             controller,
             environment,
+            channel,
             observation: vec![0.0; observation_len],
             action: vec![0.0; action_len],
             executed: vec![0.0; action_len],
@@ -240,9 +256,9 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         self.executed.fill(0.0);
         self.timing.simulator_cpu += cpu_since(reset_cpu);
 
-        let horizon = self.controller.policy().contract().horizon();
-        let most = task.plans.map_or(task.max_steps, |plans| {
-            task.max_steps.min(plans.len() * horizon)
+        let most = task.plans.map_or(task.max_steps, |given| {
+            let steps = given.plans.len().saturating_mul(given.period);
+            task.max_steps.min(steps)
         });
         self.plans.clear();
         let mut uniform = task.actor.stream(task.seed);
@@ -250,11 +266,10 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         while step < most && !self.succeeded(task) {
             match &mut uniform {
                 None => {
-                    let (report, elapsed_ns) = self.decide(step, horizon, task.plans)?;
-                    if report.decided {
-                        self.plans.push(report.plan.0);
-                    }
-                    let plan = report.plan.0;
+                    let (selected, elapsed_ns) = self.decide(step, task.plans)?;
+                    let fresh = selected.filter(|selected| selected.fresh);
+                    self.plans.extend(fresh.map(|selected| selected.index));
+                    let plan = selected.map(|selected| selected.index);
                     match self.look(task, Stand::Acting { plan }) {
                         Go::On => {}
                         Go::Again => return Ok(None),
@@ -262,7 +277,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
                     }
                     let before_cpu = cpu_time();
                     link.actuate(&self.action, &mut self.executed);
-                    self.keep(&report, elapsed_ns, task.plans.is_some());
+                    self.keep(selected, elapsed_ns, task.plans.is_some());
                     self.execute(step)?;
                     self.timing.simulator_cpu += cpu_since(before_cpu);
                 }
@@ -293,6 +308,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
 
     fn instruct(&mut self, task: &Task<'_>) -> Result<(), RolloutError> {
         self.controller.set_decision(task.decision);
+        self.controller.set_noise(task.noise);
         let instruction = task
             .words
             .map_or(Instruction::Id(task.instruction), Instruction::Words);
@@ -314,40 +330,47 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         Ok(())
     }
 
-    /// The policy's action for what it sees, and how long that took in nanoseconds.
+    /// The policy's action for what it sees: what was selected for it, and how long that took in nanoseconds.
     fn decide(
         &mut self,
         step: usize,
-        horizon: usize,
-        commanded: Option<&[u32]>,
-    ) -> Result<(StepReport, u64), RolloutError> {
+        commanded: Option<Commanded<'_>>,
+    ) -> Result<(Option<Selected>, u64), RolloutError> {
         let before_cpu = cpu_time();
         let start = Instant::now();
-        let report = match commanded.and_then(|plans| plans.get(step / horizon)) {
+        let given = commanded.and_then(|given| {
+            let period = given.period.max(1);
+            Some((*given.plans.get(step / period)?, period))
+        });
+        let selected = match given {
             None => self
                 .controller
                 .step(&self.observation, &mut self.action)
-                .map_err(|error| RolloutError::Step { step, error }),
-            Some(&plan) => self
-                .controller
-                .act(&self.observation, PlanIndex(plan), &mut self.action)
-                .map_err(|error| RolloutError::Act { step, error })
-                .map(|()| StepReport {
-                    timestep: step as u32,
-                    plan: PlanIndex(plan),
-                    decided: step.is_multiple_of(horizon),
-                    margin: f32::INFINITY,
-                }),
+                .map_err(|error| RolloutError::Step { step, error })
+                .map(|report| report.selected),
+            Some((index, period)) => {
+                let seen = [(self.channel, Data::F32(&self.observation))];
+                self.controller
+                    .follow(&seen, index, &mut self.action)
+                    .map_err(|error| RolloutError::Follow { step, error })
+                    .map(|()| {
+                        Some(Selected {
+                            index,
+                            margin: f32::INFINITY,
+                            fresh: step.is_multiple_of(period),
+                        })
+                    })
+            }
         };
         let elapsed_ns = nanoseconds(start.elapsed());
         self.timing.controller_cpu += cpu_since(before_cpu);
-        let report = report?;
-        if report.decided {
+        let selected = selected?;
+        if selected.is_some_and(|selected| selected.fresh) {
             self.timing.decision_ns.push(elapsed_ns);
         } else {
             self.timing.ordinary_ns.push(elapsed_ns);
         }
-        Ok((report, elapsed_ns))
+        Ok((selected, elapsed_ns))
     }
 
     /// Lets what the policy sees follow the environment, as far as the link lets it through.
@@ -368,23 +391,25 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
     }
 
     /// Records the step, where steps are kept.
-    fn keep(&mut self, report: &StepReport, controller_ns: u64, commanded: bool) {
+    fn keep(&mut self, selected: Option<Selected>, controller_ns: u64, commanded: bool) {
         let Some(recording) = &mut self.recording else {
             return;
         };
-        let logits = if report.decided && !commanded {
-            self.controller.logits()
+        let decided = selected.is_some_and(|selected| selected.fresh);
+        let scores = if decided && !commanded {
+            self.controller.scores()
         } else {
             &[]
         };
+        let margin = selected.map(|selected| selected.margin);
         recording.push(Step {
             observation: self.observation.clone(),
             action: self.action.clone(),
             executed: self.executed.clone(),
-            plan: report.plan.0,
-            decided: report.decided,
-            margin: Some(report.margin).filter(|margin| margin.is_finite()),
-            logits: logits.to_vec(),
+            plan: selected.map(|selected| selected.index),
+            decided,
+            margin: margin.filter(|margin| margin.is_finite()),
+            scores: scores.to_vec(),
             controller_ns,
             gripper: self.environment.gripper(),
         });

@@ -6,14 +6,15 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use lads_compiler::Contract;
 use lads_compiler::contract::Acceptance;
-use lads_core::{Contract, KnownInstruction, similarity};
+use lads_core::similarity;
 use thiserror::Error;
 
 use crate::environment::Environment;
 use crate::evaluate::Assignment;
 use crate::fit;
-use crate::results::InstructionResult;
+use crate::results::{Asked, InstructionResult};
 
 /// Id and split of a sentence outside the table, in results.
 pub const FREE: &str = "free";
@@ -61,8 +62,7 @@ pub enum SubTaskError {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Sentence {
     text: String,
-    /// Names separated by commas, as in contracts; empty for none.
-    sub_tasks: String,
+    sub_tasks: Vec<String>,
     commanded: Vec<usize>,
 }
 
@@ -91,61 +91,50 @@ impl Sentence {
                 commanded.push(place);
             }
         }
-        let names: Vec<_> = commanded
-            .iter()
-            .filter_map(|&place| watched.get(place))
-            .copied()
-            .collect();
+        let names = commanded.iter().filter_map(|&place| watched.get(place));
+        let names = names.map(|&name| name.to_owned());
         Ok(Self {
             text: text.to_owned(),
-            sub_tasks: names.join(","),
+            sub_tasks: names.collect(),
             commanded,
         })
     }
 
     /// Its episodes: numbered behind the table, and as long as those of the first known instruction with the same sub-tasks; where there is
     /// none, as long as the benchmark's longest.
-    pub fn assignment(&self, contract: &Contract<'_>, environment: &dyn Environment) -> Assignment {
-        let set = |list: &str| {
-            fit::sub_tasks(list)
-                .map(str::to_owned)
-                .collect::<BTreeSet<_>>()
-        };
+    pub fn assignment(&self, contract: &Contract, environment: &dyn Environment) -> Assignment {
+        let set = |names: &[String]| names.iter().cloned().collect::<BTreeSet<_>>();
         let own = set(&self.sub_tasks);
-        let alike = contract
-            .instructions()
-            .find(|known| set(known.sub_tasks) == own);
-        let splits = contract
-            .instructions()
-            .map(|known| environment.max_steps(known.split));
+        let known = contract.instructions.len();
+        let mut evaluated = (0..known).map(|index| contract.evaluated(index));
+        let alike = evaluated.find(|(sub_tasks, _)| set(sub_tasks) == own);
+        let splits = (0..known).map(|index| environment.max_steps(contract.evaluated(index).1));
         let max_steps = alike.map_or_else(
             || splits.max().unwrap_or(0),
-            |known| environment.max_steps(known.split),
+            |(_, split)| environment.max_steps(split),
         );
         Assignment {
-            instruction: contract.instruction_count() as u32,
+            instruction: known as u32,
             commanded: self.commanded.clone(),
             max_steps,
         }
     }
 
-    /// As an entry of the table would say it, without its embeddings.
-    pub fn known(&self) -> KnownInstruction<'_> {
-        KnownInstruction {
+    /// As an instruction of the table would be evaluated.
+    pub fn asked(&self) -> Asked<'_> {
+        Asked {
             id: FREE,
             text: &self.text,
-            sub_tasks: &self.sub_tasks,
             split: FREE,
-            words: &[],
+            sub_tasks: self.sub_tasks.iter().map(String::as_str).collect(),
         }
     }
 }
 
-/// The known instruction that `words` are most like, and how much: [`similarity::alignment`].
-pub fn nearest<'c>(contract: &Contract<'c>, words: &[f32]) -> Option<(KnownInstruction<'c>, f32)> {
+/// The number of the known instruction that `words` are most like, and how much: [`similarity::alignment`].
+pub fn nearest(contract: &lads_core::Contract<'_>, words: &[f32]) -> Option<(usize, f32)> {
     let known = contract.instructions().map(|known| known.words);
-    let (place, alike) = similarity::nearest(words, known, contract.word_dim())?;
-    Some((contract.instructions().nth(place)?, alike))
+    similarity::nearest(words, known, contract.word_dim())
 }
 
 /// Why a sentence is not followed.
@@ -175,11 +164,11 @@ pub fn accept(acceptance: Option<&Acceptance>, similarity: f32) -> Result<(), Un
 /// What a sentence that names no sub-tasks has completed, as a line: all, and what of it the nearest known instruction does not ask for.
 ///
 /// Nobody said what the sentence asks for; beside the nearest instruction a person sees what was done un-instructed.
-pub fn completed(nearest: &KnownInstruction<'_>, result: &InstructionResult) -> String {
-    let asked: BTreeSet<&str> = fit::sub_tasks(nearest.sub_tasks).collect();
+pub fn completed(nearest: &Asked<'_>, result: &InstructionResult) -> String {
+    let asked = &nearest.sub_tasks;
     let list = |beyond: bool| {
         let all = result.un_instructed_completions.iter();
-        let done = all.filter(|of| !beyond || !asked.contains(of.sub_task));
+        let done = all.filter(|of| !beyond || !asked.contains(&of.sub_task.as_str()));
         let done: Vec<_> = done
             .map(|of| format!("{} {}", of.sub_task, of.rate.count))
             .collect();

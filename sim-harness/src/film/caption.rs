@@ -69,8 +69,8 @@ pub struct Caption<'c> {
 /// An episode at a state on its way.
 #[derive(Debug, Clone, Copy)]
 pub struct Progress<'p> {
-    /// The plan of every control step that was executed.
-    pub plans: &'p [u32],
+    /// The plan of every control step that was executed, where there is one.
+    pub plans: &'p [Option<u32>],
     /// Completions so far.
     pub completions: &'p [Completion],
     /// What comes next.
@@ -121,14 +121,14 @@ impl Caption<'_> {
         let (number, all) = (progress.plans.len(), self.steps);
         let at = number as f64 * self.period_s;
         let state = match progress.stand {
-            Stand::Acting { plan } => format!("plan {plan:>3}"),
+            Stand::Acting { plan } => plan.map_or_else(String::new, |plan| format!("plan {plan:>3}")),
             Stand::Ended { .. } if self.commanded.is_empty() => "ended".to_owned(),
             Stand::Ended { success: true } => "carried out".to_owned(),
             Stand::Ended { success: false } => "not carried out".to_owned(),
         };
         let text = format!("step {number:>3} of {all}  {at:>5.2} s  {state}");
         write(canvas, &FONT_8X13, INK, Point::new(MARGIN, top), &text);
-        if let Stand::Acting { plan } = progress.stand {
+        if let Stand::Acting { plan: Some(plan) } = progress.stand {
             let x = MARGIN + FONT_8X13.character_size.width as i32 * (text.len() as i32 + 1);
             fill(canvas, Point::new(x, top + 1), [11, 11], plan_color(plan));
         }
@@ -203,6 +203,9 @@ impl Caption<'_> {
         let all = self.steps.max(1);
         let x = |step: usize| (step as u64 * u64::from(width) / all as u64) as u32;
         for (step, &plan) in progress.plans.iter().enumerate() {
+            let Some(plan) = plan else {
+                continue;
+            };
             let corner = Point::new(x(step) as i32, top as i32);
             let size = [x(step + 1) - x(step), STRIP];
             fill(canvas, corner, size, plan_color(plan));

@@ -166,7 +166,7 @@ impl Scene<'_> {
             period_s,
             note: &note,
         };
-        let plans: Vec<u32> = self.trace.steps.iter().map(|step| step.plan).collect();
+        let plans: Vec<Option<u32>> = self.trace.steps.iter().map(|step| step.plan).collect();
         let [width, height] = PICTURE;
         let mut canvas = Canvas::new(width, caption::HEAD + height + caption::FOOT);
         let mut sink = Sink::new(form, path, canvas.size(), period_s)?;
@@ -201,7 +201,7 @@ impl Scene<'_> {
     }
 
     /// How far the episode is at a moment, with the plans of all its control steps.
-    fn progress<'p>(&'p self, moment: Moment<'_>, plans: &'p [u32]) -> Progress<'p> {
+    fn progress<'p>(&'p self, moment: Moment<'_>, plans: &'p [Option<u32>]) -> Progress<'p> {
         let outcome = &self.trace.outcome;
         let done = &outcome.completions;
         let done_len = done.partition_point(|done| done.step <= moment.number);

@@ -1,17 +1,19 @@
-//! Sequences of plans: got from recorded episodes by the trajectory encoder, stored in a file, and given to the low level to follow.
+//! Sequences of plans: got from recorded episodes by the trajectory encoder, stored in a file, and given to the policy to follow.
 //!
-//! The encoder maps one horizon of observations and actions to the codebook entry that it was trained to be (the paper's equation 2 and the
-//! nearest entry of the codebook). Steps of a recording beyond its last full horizon have the plan of the horizon that ends with the last
-//! step, so that whoever follows the plans acts until the recording's end. What can fail: a policy without an encoder, a recording of other lengths, a file that is none or asks for what the policy does not have.
+//! The encoder maps a segment of observations and actions to the plan that it shows (the paper's equation 2 and the nearest plan). Steps of a
+//! recording beyond its last full segment have the plan of the segment that ends with the last step, so that whoever follows the plans
+//! acts until the recording's end. What can fail: a policy without an encoder or that follows no plans, a recording of other lengths, a
+//! file that is none or asks for what the policy does not have.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use lads_compiler::{Memory, MemoryError};
-use lads_core::{Contract, EncodeError, Policy};
+use lads_core::{ChannelId, Contract, Controller, Data, EncodeError, FollowError, Policy, Role};
+use lads_host::{Memory, MemoryError};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use crate::rollout::Commanded;
 use crate::trace::{Step, Trace};
 use lads_proof::metrics::wilson;
 pub use lads_proof::results::Agreement;
@@ -31,7 +33,7 @@ pub struct PlanSequence {
     /// Number of the episode; left out, the plans are for every episode of the instruction.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub episode: Option<u32>,
-    /// Indices into the codebook, one per horizon.
+    /// Their indices.
     pub plans: Vec<u32>,
 }
 
@@ -44,7 +46,8 @@ pub struct PlanFile {
     /// [`FORMAT_VERSION`].
     pub format_version: u32,
     /// Control steps that each plan is for.
-    pub horizon: usize,
+    #[serde(rename = "horizon")]
+    pub period: usize,
     /// The sequences.
     pub episodes: Vec<PlanSequence>,
 }
@@ -58,25 +61,28 @@ pub enum PlanError {
     /// It is no file of plans.
     #[error("it is no {FORMAT} file of version {FORMAT_VERSION} ({0})")]
     Form(String),
-    /// It was made for another horizon.
+    /// It was made for another policy.
     #[error("its plans are for {file} control steps each, the policy's for {policy}")]
-    Horizon {
+    Period {
         /// What the file says.
         file: usize,
         /// The policy's.
         policy: usize,
     },
+    /// The policy cannot follow any.
+    #[error("the policy follows no plans: {0}")]
+    Follow(FollowError),
     /// The policy does not know an instruction.
     #[error("the policy does not know the instruction '{0}'")]
     Instruction(String),
-    /// A plan is not in the codebook.
-    #[error("plan {plan} of '{instruction}': the codebook has {size}")]
+    /// The policy does not have a plan.
+    #[error("plan {plan} of '{instruction}': the policy has {size}")]
     Plan {
         /// The plan.
         plan: u32,
         /// Whose it is.
         instruction: String,
-        /// Entries of the codebook.
+        /// Plans of the policy.
         size: usize,
     },
     /// A sequence has no plans.
@@ -96,16 +102,17 @@ pub enum PlanError {
 /// Plans by instruction and episode, checked against a policy.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct PlanBook {
+    period: usize,
     sequences: BTreeMap<(u32, Option<u32>), Vec<u32>>,
 }
 
 impl PlanFile {
     /// Plans of episodes, one sequence each.
-    pub fn new(horizon: usize, episodes: Vec<PlanSequence>) -> Self {
+    pub fn new(period: usize, episodes: Vec<PlanSequence>) -> Self {
         Self {
             format: FORMAT.to_owned(),
             format_version: FORMAT_VERSION,
-            horizon,
+            period,
             episodes,
         }
     }
@@ -122,19 +129,24 @@ impl PlanFile {
         Ok(file)
     }
 
-    /// Checks every sequence against the policy's contract; `index` finds an instruction by its text or id.
+    /// Checks every sequence against the policy, which selects a plan every `period` control steps; `index` finds an instruction by its
+    /// text or id.
     pub fn check(
         &self,
-        contract: &Contract<'_>,
+        policy: &Policy<'_>,
+        period: Option<usize>,
         index: impl Fn(&str) -> Option<u32>,
     ) -> Result<PlanBook, PlanError> {
-        if self.horizon != contract.horizon() {
-            return Err(PlanError::Horizon {
-                file: self.horizon,
-                policy: contract.horizon(),
+        let Some(period) = period.filter(|_| policy.follows()) else {
+            return Err(PlanError::Follow(FollowError::NotOffered));
+        };
+        if self.period != period {
+            return Err(PlanError::Period {
+                file: self.period,
+                policy: period,
             });
         }
-        let size = contract.codebook_len();
+        let size = policy.index_count() as usize;
         let mut sequences = BTreeMap::new();
         for sequence in &self.episodes {
             let name = || sequence.instruction.clone();
@@ -155,16 +167,19 @@ impl PlanFile {
                 return Err(PlanError::Twice(name()));
             }
         }
-        Ok(PlanBook { sequences })
+        Ok(PlanBook { period, sequences })
     }
 }
 
 impl PlanBook {
     /// The plans of an episode: its own, or those for every episode of the instruction.
-    pub fn of(&self, instruction: u32, episode: u32) -> Option<&[u32]> {
+    pub fn of(&self, instruction: u32, episode: u32) -> Option<Commanded<'_>> {
         let own = self.sequences.get(&(instruction, Some(episode)));
-        own.or_else(|| self.sequences.get(&(instruction, None)))
-            .map(Vec::as_slice)
+        let plans = own.or_else(|| self.sequences.get(&(instruction, None)))?;
+        Some(Commanded {
+            plans,
+            period: self.period,
+        })
     }
 
     /// Whether it has plans for an instruction.
@@ -175,28 +190,68 @@ impl PlanBook {
     }
 }
 
-/// The plan that the trajectory encoder sees in each horizon of a recording; what was executed counts, not what was asked for.
+/// What a trajectory encoder reads: a segment of observations and of actions.
+#[derive(Debug, Clone, Copy)]
+pub struct Segment {
+    observations: ChannelId,
+    actions: ChannelId,
+    /// Its control steps.
+    pub steps: usize,
+}
+
+impl Segment {
+    /// Of a policy that has an encoder.
+    pub fn of(policy: &Policy<'_>) -> Option<Self> {
+        let contract: &Contract<'_> = policy.contract();
+        let find = |name| {
+            let channel = contract.find(name)?;
+            (policy.encodes() && channel.role() == Role::Demonstration).then_some(channel)
+        };
+        let (observations, actions) = (find("observations")?, find("actions")?);
+        let steps = *observations.shape().first()? as usize;
+        Some(Self {
+            observations: observations.id(),
+            actions: actions.id(),
+            steps,
+        })
+    }
+
+    /// The plan that the encoder sees in it.
+    pub fn encode(
+        &self,
+        controller: &mut Controller<'_, '_>,
+        observations: &[f32],
+        actions: &[f32],
+    ) -> Result<u32, EncodeError> {
+        controller.encode(&[
+            (self.observations, Data::F32(observations)),
+            (self.actions, Data::F32(actions)),
+        ])
+    }
+}
+
+/// The plan that the trajectory encoder sees in each segment of a recording; what was executed counts, not what was asked for.
 ///
-/// Steps beyond the last full horizon are the end of one more, which begins earlier: every step has a plan, unless the recording is
-/// shorter than one horizon, which has none.
+/// Steps beyond the last full segment are the end of one more, which begins earlier: every step has a plan, unless the recording is
+/// shorter than one segment, which has none.
 pub fn encode<'t>(
     policy: &Policy<'_>,
     recordings: impl IntoIterator<Item = &'t [Step]>,
 ) -> Result<Vec<Vec<u32>>, PlanError> {
-    let horizon = policy.contract().horizon();
+    let encoder = Segment::of(policy).ok_or(PlanError::Encode(EncodeError::NoEncoder))?;
     let mut memory = Memory::of(policy).map_err(PlanError::Memory)?;
     let mut controller = memory.controller(policy).map_err(PlanError::Memory)?;
     let mut of_segment = |segment: &[Step]| {
         let observations: Vec<f32> = segment.iter().flat_map(|s| s.observation.clone()).collect();
         let actions: Vec<f32> = segment.iter().flat_map(|s| s.executed.clone()).collect();
-        let plan = controller.encode(&observations, &actions);
-        plan.map(|plan| plan.0).map_err(PlanError::Encode)
+        let plan = encoder.encode(&mut controller, &observations, &actions);
+        plan.map_err(PlanError::Encode)
     };
     recordings
         .into_iter()
         .map(|steps| {
-            let whole = steps.chunks_exact(horizon);
-            let last = steps.len().checked_sub(horizon);
+            let whole = steps.chunks_exact(encoder.steps);
+            let last = steps.len().checked_sub(encoder.steps);
             let tail = last.filter(|_| !whole.remainder().is_empty());
             let tail = tail.and_then(|from| steps.get(from..));
             whole.chain(tail).map(&mut of_segment).collect()
@@ -207,12 +262,14 @@ pub fn encode<'t>(
 /// Encodes every executed segment and compares with the plan that was in force.
 pub fn agreement(policy: &Policy<'_>, traces: &[Trace]) -> Result<Agreement, PlanError> {
     let encoded = encode(policy, traces.iter().map(|trace| trace.steps.as_slice()))?;
-    let horizon = policy.contract().horizon();
+    let encoder = Segment::of(policy).ok_or(PlanError::Encode(EncodeError::NoEncoder))?;
     let mut total = Agreement::default();
     for (trace, encoded) in traces.iter().zip(&encoded) {
-        // Without the tail's plan: its horizon has steps of two plans.
-        for (segment, &plan) in trace.steps.chunks_exact(horizon).zip(encoded) {
-            let commanded = segment.first().map_or(plan, |step| step.plan);
+        // Without the tail's plan: its segment has steps of two plans.
+        for (segment, &plan) in trace.steps.chunks_exact(encoder.steps).zip(encoded) {
+            let Some(commanded) = segment.first().and_then(|step| step.plan) else {
+                continue;
+            };
             let of_plan = total.encoded_as.entry(commanded).or_default();
             *of_plan.entry(plan).or_default() += 1;
             total.segments += 1;

@@ -4,11 +4,11 @@
 //! damaged log. What can fail: a log of a policy with other sizes, an instruction that this policy does not know, an observation that it
 //! refuses.
 
-use lads_compiler::{Memory, MemoryError};
 use lads_core::{
-    ActError, Contract, Decision, Element, Instruction, InstructionError, PlanIndex, Policy,
-    StepError,
+    Channel, Contract, Data, Decision, FollowError, Instruction, InstructionError, Isa, Noise,
+    Policy, StepError,
 };
+use lads_host::{Memory, MemoryError};
 use thiserror::Error;
 
 use crate::recorder::{Flight, Log};
@@ -46,15 +46,15 @@ pub enum ReplayError {
         /// Its reason.
         error: StepError,
     },
-    /// The low level refused a commanded plan.
-    #[error("{episode}: the low level gives no action in control step {step}: {error}")]
-    Act {
+    /// The policy refused a commanded plan.
+    #[error("{episode}: the policy gives no action for the plan of control step {step}: {error}")]
+    Follow {
         /// Which episode.
         episode: String,
         /// Control step, from 0.
         step: usize,
         /// Its reason.
-        error: ActError,
+        error: FollowError,
     },
 }
 
@@ -68,7 +68,7 @@ pub struct Difference {
     /// Control step, from 0.
     pub step: usize,
     /// Plan in the log and now, where they differ.
-    pub plans: Option<(u32, u32)>,
+    pub plans: Option<[Option<u32>; 2]>,
     /// The element with the largest difference, its name, and its value in the log and now; `None` where all have the same bits.
     pub action: Option<(String, f32, f32)>,
 }
@@ -84,44 +84,53 @@ pub struct Replayed {
     pub differences: Vec<Difference>,
 }
 
-/// Computes all episodes of a log again; `finished` is called after each.
+/// Computes all episodes of a log again, on the instructions `isa`, by a policy that selects every `period` control steps; `finished` is
+/// called after each.
 pub fn replay(
     policy: &Policy<'_>,
+    period: Option<usize>,
+    isa: Isa,
     log: &Log,
     finished: &dyn Fn(),
 ) -> Result<Replayed, ReplayError> {
-    fits(&policy.contract(), log)?;
+    let contract = policy.contract();
+    fits(contract, period, log)?;
     let mut memory = Memory::of(policy).map_err(ReplayError::Memory)?;
-    let mut controller = memory.controller(policy).map_err(ReplayError::Memory)?;
+    let mut controller = memory
+        .controller_with(policy, isa)
+        .map_err(ReplayError::Memory)?;
+    let channel = contract.observation().id();
     let mut replayed = Replayed::default();
-    let mut action = vec![0.0; policy.contract().action_len()];
+    let mut action = vec![0.0; contract.action_len()];
     for flight in &log.flights {
         let instruction = match &flight.words {
             Some(words) => Instruction::Words(words),
-            None => Instruction::Id(find(&policy.contract(), flight)?),
+            None => Instruction::Id(find(contract, flight)?),
         };
         controller.set_decision(match flight.trace.sampling_seed {
             None => Decision::Argmax,
             Some(seed) => Decision::Sample {
-                temperature: temperature(&policy.contract()),
+                temperature: temperature(contract),
                 seed,
             },
         });
+        let noise = flight.trace.noise_seed;
+        controller.set_noise(noise.map_or(Noise::Zero, |seed| Noise::Seeded { seed }));
         controller
             .set_instruction(instruction)
             .map_err(ReplayError::Instruct)?;
         let episode = || format!("{} episode {}", flight.instruction_id, flight.trace.episode);
         let mut first = None;
         for (number, step) in flight.trace.steps.iter().enumerate() {
-            let plan = if flight.trace.commanded {
-                let plan = PlanIndex(step.plan);
-                let acted = controller.act(&step.observation, plan, &mut action);
-                acted.map_err(|error| ReplayError::Act {
+            let plan = if let Some(plan) = step.plan.filter(|_| flight.trace.commanded) {
+                let seen = [(channel, Data::F32(&step.observation))];
+                let acted = controller.follow(&seen, plan, &mut action);
+                acted.map_err(|error| ReplayError::Follow {
                     episode: episode(),
                     step: number,
                     error,
                 })?;
-                plan.0
+                Some(plan)
             } else {
                 let stepped = controller.step(&step.observation, &mut action);
                 let report = stepped.map_err(|error| ReplayError::Step {
@@ -129,7 +138,7 @@ pub fn replay(
                     step: number,
                     error,
                 })?;
-                report.plan.0
+                report.selected.map(|selected| selected.index)
             };
             if first.is_none() {
                 first = compare(log, flight, number, step, plan, &action);
@@ -151,7 +160,7 @@ fn temperature(contract: &Contract<'_>) -> f32 {
     }
 }
 
-fn fits(contract: &Contract<'_>, log: &Log) -> Result<(), ReplayError> {
+fn fits(contract: &Contract<'_>, period: Option<usize>, log: &Log) -> Result<(), ReplayError> {
     let origin = &log.origin;
     let sizes = |what, log: String, policy: String| {
         if log == policy {
@@ -162,23 +171,20 @@ fn fits(contract: &Contract<'_>, log: &Log) -> Result<(), ReplayError> {
     elements(
         "observation",
         &origin.observation_names,
-        contract.observations(),
+        &contract.observation(),
     )?;
-    elements("action", &origin.action_names, contract.actions())?;
-    sizes(
-        "horizon",
-        origin.horizon.to_string(),
-        contract.horizon().to_string(),
-    )
+    elements("action", &origin.action_names, &contract.action())?;
+    let said = |period: Option<usize>| period.map_or("none".to_owned(), |steps| steps.to_string());
+    sizes("control steps per plan", said(origin.period), said(period))
 }
 
 /// Number and names of the elements; says the first that differs.
-fn elements<'c>(
+fn elements(
     what: &'static str,
     log: &[String],
-    policy: impl Iterator<Item = Element<'c>>,
+    channel: &Channel<'_>,
 ) -> Result<(), ReplayError> {
-    let policy: Vec<&str> = policy.map(|element| element.name).collect();
+    let policy: Vec<&str> = channel.elements().map(|element| element.name).collect();
     let sizes = |log: String, policy: String| Err(ReplayError::Sizes { what, log, policy });
     if log.len() != policy.len() {
         let counted = |count| format!("{count} elements");
@@ -205,7 +211,7 @@ fn compare(
     flight: &Flight,
     number: usize,
     step: &Step,
-    plan: u32,
+    plan: Option<u32>,
     action: &[f32],
 ) -> Option<Difference> {
     let distance = |&(_, was, is): &(usize, f32, f32)| (was - is).abs();
@@ -225,7 +231,7 @@ fn compare(
         instruction: flight.instruction_id.clone(),
         episode: flight.trace.episode,
         step: number,
-        plans: (step.plan != plan).then_some((step.plan, plan)),
+        plans: (step.plan != plan).then_some([step.plan, plan]),
         action: worst.map(|(element, was, is)| {
             let name = names.get(element).cloned().unwrap_or_default();
             (name, was, is)

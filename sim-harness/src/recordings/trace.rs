@@ -14,14 +14,14 @@ pub struct Step {
     pub action: Vec<f32>,
     /// What the environment was given; the same without faults.
     pub executed: Vec<f32>,
-    /// The plan in force.
-    pub plan: u32,
+    /// The plan in force; `None` of a policy that selects none.
+    pub plan: Option<u32>,
     /// Whether this step decided it.
     pub decided: bool,
-    /// The largest logit of the last decision minus the second largest; `None` where no logits were computed or there is but one.
+    /// The largest score of the last decision minus the second largest; `None` where no scores were computed or there is but one.
     pub margin: Option<f32>,
-    /// The logits, one per codebook entry, of a step that decided; empty otherwise.
-    pub logits: Vec<f32>,
+    /// The scores, one per plan, of a step that decided; empty otherwise.
+    pub scores: Vec<f32>,
     /// Time inside the controller, in nanoseconds.
     pub controller_ns: u64,
     /// Where the gripper was when the observation was taken, in metres, if the environment has one.
@@ -37,7 +37,9 @@ pub struct Trace {
     pub episode: u32,
     /// Seed of plan sampling; `None` where the likeliest plan is taken.
     pub sampling_seed: Option<u64>,
-    /// Whether the plans were given from outside: the low level ran alone.
+    /// Seed of what else the policy drew at random; `None` where it drew nothing.
+    pub noise_seed: Option<u64>,
+    /// Whether the plans were given from outside.
     pub commanded: bool,
     /// What it came to.
     pub outcome: Episode,

@@ -140,7 +140,7 @@ pub fn timelines(report: &Report<'_>) -> Vec<Chart> {
 
 fn timeline(report: &Report<'_>, trace: &Trace) -> Chart {
     let steps = (0..).zip(&trace.steps);
-    let points = steps.map(|(number, step)| (f64::from(number), f64::from(step.plan)));
+    let points = steps.filter_map(|(number, step)| Some((f64::from(number), f64::from(step.plan?))));
     let plots: Vec<Plot> = vec![
         LinePlot::new()
             .with_data(points)
@@ -149,14 +149,14 @@ fn timeline(report: &Report<'_>, trace: &Trace) -> Chart {
             .with_stroke_width(2.0)
             .into(),
     ];
-    let title = super::title(&report.contract, trace);
+    let title = super::title(report.contract, trace);
     let steps = trace.steps.len() as f64;
     let mut layout = sized(&plots, &title, HALF, 300.0)
         .with_x_label("control step")
         .with_y_label("plan")
         .with_x_axis_max(steps)
         .with_y_axis_min(0.0)
-        .with_y_axis_max(HEADROOM * report.contract.codebook_len() as f64);
+        .with_y_axis_max(HEADROOM * report.plans as f64);
     let marks = marks(report, trace);
     // Numbers of completions that are close to each other stand at the first of their lines.
     let mut together: Vec<(f64, Vec<&Mark>)> = Vec::new();
@@ -189,10 +189,10 @@ fn timeline(report: &Report<'_>, trace: &Trace) -> Chart {
 
 /// The completions of an episode in their order, and whether the instruction asks for them.
 fn marks(report: &Report<'_>, trace: &Trace) -> Vec<Mark> {
-    let known = report.contract.instruction(trace.instruction as usize);
+    let known = crate::results::asked(report.contract, trace.instruction as usize);
     let asked = |name: &str| {
         // A sentence outside the table asks for what `--sub-tasks` says, which is not in the contract.
-        known.is_none_or(|known| known.sub_tasks.split(',').any(|asked| asked.trim() == name))
+        known.as_ref().is_none_or(|known| known.sub_tasks.contains(&name))
     };
     let mut completions: Vec<_> = trace.outcome.completions.iter().collect();
     completions.sort_by_key(|done| done.step);
@@ -208,18 +208,18 @@ fn marks(report: &Report<'_>, trace: &Trace) -> Vec<Mark> {
     (1..).zip(completions).map(mark).collect()
 }
 
-/// Mean softmax of the first decision's logits, by instruction.
+/// Mean softmax of the first decision's scores, by instruction.
 fn starts(report: &Report<'_>) -> BTreeMap<u32, Vec<f64>> {
     let mut starts: BTreeMap<u32, (Vec<f64>, f64)> = BTreeMap::new();
     for trace in report.traces {
-        let Some(first) = trace.steps.first().filter(|step| !step.logits.is_empty()) else {
+        let Some(first) = trace.steps.first().filter(|step| !step.scores.is_empty()) else {
             continue;
         };
-        let most = first.logits.iter().copied().fold(f32::MIN, f32::max);
+        let most = first.scores.iter().copied().fold(f32::MIN, f32::max);
         let weights: Vec<f64> = first
-            .logits
+            .scores
             .iter()
-            .map(|&logit| f64::from(logit - most).exp())
+            .map(|&score| f64::from(score - most).exp())
             .collect();
         let total: f64 = weights.iter().sum();
         let (sums, count) = starts.entry(trace.instruction).or_default();
@@ -240,11 +240,8 @@ fn starts(report: &Report<'_>) -> BTreeMap<u32, Vec<f64>> {
 pub fn start_distributions(report: &Report<'_>) -> Vec<Chart> {
     let starts = starts(report);
     let id = |i: u32| {
-        report
-            .contract
-            .instruction_id(i as usize)
-            .unwrap_or("?")
-            .to_owned()
+        let known = report.contract.instructions.get(i as usize);
+        known.map_or("?", |known| known.id.as_str()).to_owned()
     };
     let rows = starts
         .iter()
@@ -253,14 +250,9 @@ pub fn start_distributions(report: &Report<'_>) -> Vec<Chart> {
     let mut charts = heat_map(
         "first decision: mean probability",
         rows,
-        report.contract.codebook_len(),
+        report.plans,
     );
-    let words = |i: u32| -> Vec<&str> {
-        let known = report.contract.instruction(i as usize);
-        known.map_or(Vec::new(), |known| {
-            known.sub_tasks.split(',').map(str::trim).collect()
-        })
-    };
+    let words = |i: u32| report.contract.evaluated(i as usize).0;
     for (&composite, line) in &starts {
         let whole = words(composite);
         let atoms: Vec<u32> = starts
@@ -336,15 +328,18 @@ fn heat_map(title: &str, rows: Vec<(String, Vec<f64>)>, plans: usize) -> Vec<Cha
 
 /// Figures 5 and 10 of the paper: the gripper's way while a plan is in force.
 pub fn gripper(report: &Report<'_>) -> Vec<Chart> {
-    let horizon = report.contract.horizon();
+    let Some(period) = report.contract.period() else {
+        return Vec::new();
+    };
     let mut ways: BTreeMap<u32, Vec<[f64; 3]>> = BTreeMap::new();
     let mut uses: BTreeMap<u32, usize> = BTreeMap::new();
     for segment in report
         .traces
         .iter()
-        .flat_map(|trace| trace.steps.chunks(horizon))
+        .flat_map(|trace| trace.steps.chunks(period))
     {
-        let Some((plan, Some(from))) = segment.first().map(|step| (step.plan, step.gripper)) else {
+        let Some((Some(plan), Some(from))) = segment.first().map(|step| (step.plan, step.gripper))
+        else {
             continue;
         };
         *uses.entry(plan).or_default() += 1;
@@ -381,13 +376,13 @@ pub fn gripper(report: &Report<'_>) -> Vec<Chart> {
 
 /// Figure 9 of the paper.
 pub fn heat_maps(report: &Report<'_>) -> Vec<Chart> {
-    let size = report.contract.codebook_len();
+    let size = report.plans;
     let mut by_word: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     let mut by_task: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     for trace in report.traces {
-        let text = report.contract.instruction_text(trace.instruction as usize);
-        let words: BTreeSet<String> = text
-            .unwrap_or_default()
+        let known = report.contract.instructions.get(trace.instruction as usize);
+        let words: BTreeSet<String> = known
+            .map_or("", |known| known.text.as_str())
             .split(|letter: char| !letter.is_alphanumeric())
             .filter(|word| !word.is_empty())
             .map(str::to_lowercase)
@@ -430,7 +425,10 @@ pub fn heat_maps(report: &Report<'_>) -> Vec<Chart> {
     charts
 }
 
-fn count(rows: &mut BTreeMap<String, Vec<f64>>, name: &str, plan: u32, size: usize) {
+fn count(rows: &mut BTreeMap<String, Vec<f64>>, name: &str, plan: Option<u32>, size: usize) {
+    let Some(plan) = plan else {
+        return;
+    };
     let row = rows
         .entry(name.to_owned())
         .or_insert_with(|| vec![0.0; size]);

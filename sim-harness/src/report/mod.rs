@@ -10,7 +10,7 @@ use std::collections::BTreeSet;
 use askama::Template;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use lads_core::Contract;
+use lads_compiler::Contract;
 
 use self::charts::Chart;
 use crate::results::Results;
@@ -23,8 +23,10 @@ pub struct Report<'r> {
     pub results: &'r Results,
     /// Every episode's control steps.
     pub traces: &'r [Trace],
-    /// The policy's contract.
-    pub contract: Contract<'r>,
+    /// The contract of the policy's bundle.
+    pub contract: &'r Contract,
+    /// How many plans the policy has; 0 if it selects none.
+    pub plans: usize,
     /// Names of the sub-tasks that the environment watches.
     pub sub_tasks: &'r [&'static str],
     /// Pictures of the [`chosen`] episodes, or why there are none.
@@ -61,11 +63,11 @@ pub fn chosen(traces: &[Trace]) -> Vec<&Trace> {
 }
 
 /// Instruction, number and end of an episode.
-pub fn title(contract: &Contract<'_>, trace: &Trace) -> String {
-    let known = contract.instruction(trace.instruction as usize);
+pub fn title(contract: &Contract, trace: &Trace) -> String {
+    let known = contract.instructions.get(trace.instruction as usize);
     format!(
         "{}, episode {}: {}",
-        known.map_or("?", |known| known.id),
+        known.map_or("?", |known| known.id.as_str()),
         trace.episode,
         if trace.outcome.success {
             "carried out"
@@ -219,10 +221,10 @@ impl Report<'_> {
             figure(
                 "Plans at the start of an episode",
                 if composites {
-                    "Mean probability that the high level gives each plan in the first decision, by instruction. Then, for composite \
+                    "Mean probability that the policy gives each plan in the first decision, by instruction. Then, for composite \
                      instructions: the line is the composite's distribution, the bars are those of its parts."
                 } else {
-                    "Mean probability that the high level gives each plan in the first decision, by instruction."
+                    "Mean probability that the policy gives each plan in the first decision, by instruction."
                 },
                 starts,
             ),

@@ -2,38 +2,72 @@
 //!
 //! Nothing here can fail.
 
-use lads_core::{Contract, Decision};
-use serde_json::{Value, json};
+use lads_core::{Channel, Contract, Decision, Policy};
+use serde_json::{Map, Value, json};
 
 /// The fields of the contract that an image holds and that decide what it does.
-pub fn of_image(contract: &Contract<'_>) -> Value {
-    let decision = match contract.decision() {
-        Decision::Argmax => json!({"rule": "argmax"}),
-        Decision::Sample { temperature, seed } => {
-            json!({"rule": "sample", "temperature": temperature, "seed": seed})
-        }
-    };
-    let beyond = format!("{:?}", contract.beyond()).to_lowercase();
-    let actions = contract.actions().map(|element| {
-        json!({"name": element.name, "min": element.limits.min, "max": element.limits.max})
-    });
-    let observations = contract.observations().map(|element| {
-        json!({"name": element.name, "min": element.limits.min, "max": element.limits.max})
-    });
+pub fn of_image(policy: &Policy<'_>) -> Value {
+    let contract = policy.contract();
+    let mut family = json!({"kind": contract.family()});
+    if policy.index_count() > 0 {
+        family["decision"] = match contract.decision() {
+            Decision::Argmax => json!({"rule": "argmax"}),
+            Decision::Sample { temperature, seed } => {
+                json!({"rule": "sample", "temperature": temperature, "seed": seed})
+            }
+        };
+    }
     let instructions = contract
         .instructions()
-        .map(|known| json!({"id": known.id, "text": known.text, "split": known.split}));
-    json!({
-        "environment": {"id": contract.environment_id(), "version": contract.environment_version()},
-        "control_period_s": contract.control_period_s(),
-        "horizon": contract.horizon(),
-        "codebook": {"size": contract.codebook_len()},
-        "context": {"words": contract.words_len(), "steps": contract.context_steps(), "beyond": beyond},
-        "decision": decision,
-        "observation": observations.collect::<Vec<_>>(),
-        "action": actions.collect::<Vec<_>>(),
-        "instructions": instructions.collect::<Vec<_>>(),
-    })
+        .map(|known| json!({"id": known.id, "text": known.text}));
+    let mut fields = Map::from_iter([
+        (
+            "environment".to_owned(),
+            json!({"id": contract.environment_id(), "version": contract.environment_version()}),
+        ),
+        (
+            "control_period_s".to_owned(),
+            json!(contract.control_period_s()),
+        ),
+        ("family".to_owned(), family),
+        (
+            "channels".to_owned(),
+            contract.channels().map(|it| channel(&it)).collect(),
+        ),
+    ]);
+    if contract.instruction_count() > 0 {
+        fields.insert("instructions".to_owned(), instructions.collect());
+    }
+    if let Some(steps) = contract.context_steps() {
+        let beyond = format!("{:?}", contract.beyond()).to_lowercase();
+        fields.insert(
+            "context".to_owned(),
+            json!({"steps": steps, "beyond": beyond}),
+        );
+    }
+    Value::Object(fields)
+}
+
+fn channel(channel: &Channel<'_>) -> Value {
+    let mut fields = json!({
+        "name": channel.name(),
+        "role": format!("{:?}", channel.role()).to_lowercase(),
+        "dtype": format!("{:?}", channel.dtype()).to_lowercase(),
+        "shape": channel.shape(),
+    });
+    let elements = channel.elements().map(|element| {
+        json!({
+            "name": element.name,
+            "unit": element.unit,
+            "min": element.limits.min,
+            "max": element.limits.max,
+        })
+    });
+    let elements: Vec<_> = elements.collect();
+    if !elements.is_empty() {
+        fields["elements"] = elements.into();
+    }
+    fields
 }
 
 /// The rule that decides plans, in a word or two.

@@ -79,7 +79,7 @@ pub fn run(
         environment: environment.id().to_owned(),
         bundle_sha256: contract.bundle_sha256().to_owned(),
         image_sha256: lads_compiler::sha256(evaluation.policy.image()),
-        decision: contract::rule(&contract),
+        decision: contract::rule(contract),
         isa: evaluation.isa.name().to_owned(),
         seed: evaluation.seed,
         noise: reference.noise.clone(),
@@ -101,7 +101,7 @@ pub fn run(
     let compared = Compared::new(
         &stated.unwrap_or_default(),
         reference.contract.as_ref(),
-        &contract::of_image(&contract),
+        &contract::of_image(&evaluation.policy),
     );
     let not_covered = unseen(evaluation, &answers);
     Ok(Certificate::new(
@@ -140,10 +140,10 @@ fn unseen(evaluation: &Evaluation<'_>, answers: &Answers) -> Vec<String> {
         ));
     }
     let longest = answers.longest_episode;
-    if longest <= contract.context_steps() {
+    let context = contract.context_steps().filter(|&steps| longest <= steps);
+    if let Some(steps) = context {
         unseen.push(format!(
-            "what happens after {longest} control steps: no replayed episode is longer, and the policy's context holds {}",
-            contract.context_steps()
+            "what happens after {longest} control steps: no replayed episode is longer, and the policy's context holds {steps}"
         ));
     }
     unseen

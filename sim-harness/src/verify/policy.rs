@@ -5,12 +5,13 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use lads_compiler::Memory;
 use lads_core::{Controller, Instruction, Isa, Policy};
+use lads_host::Memory;
 use lads_proof::answers::{Replay, Reply};
 use lads_proof::reference::{Reference, Trace};
 
 use crate::evaluate::{Assignment, EvaluationError};
+use crate::plans::Segment;
 
 /// Asks `policy`, on the instruction set `isa` and by its contract's own rule, about the first `episodes` traced episodes of each assigned
 /// instruction. `finished` is called after each episode, `stop` ends the work early.
@@ -28,6 +29,7 @@ pub fn ask(
         .controller_with(policy, isa)
         .map_err(EvaluationError::Memory)?;
     controller.set_decision(policy.contract().decision());
+    let encoder = Segment::of(policy).filter(|encoder| Some(encoder.steps) == reference.period);
     let mut replays = Vec::new();
     for &Assignment {
         instruction: index, ..
@@ -44,7 +46,7 @@ pub fn ask(
             if let Some(trace) = &recorded.trace {
                 replays.push(Replay {
                     episode,
-                    encoded: encode(&mut controller, trace, reference.horizon),
+                    encoded: encoder.and_then(|encoder| encode(&mut controller, trace, encoder)),
                     ..replay(&mut controller, index, trace)
                 });
             }
@@ -65,9 +67,10 @@ fn replay(controller: &mut Controller<'_, '_>, instruction: u32, trace: &Trace) 
         return replay;
     }
     let contract = controller.policy().contract();
-    let mut action = vec![0.0; contract.action_len()];
-    let observations = trace.observations.chunks_exact(contract.observation_len());
-    for (seen, done) in observations.zip(trace.actions.chunks_exact(contract.action_len())) {
+    let lens = [contract.observation_len(), contract.action_len()];
+    let mut action = vec![0.0; lens[1]];
+    let observations = trace.observations.chunks_exact(lens[0]);
+    for (seen, done) in observations.zip(trace.actions.chunks_exact(lens[1])) {
         let report = match controller.step(seen, &mut action) {
             Ok(report) => report,
             Err(error) => {
@@ -75,15 +78,12 @@ fn replay(controller: &mut Controller<'_, '_>, instruction: u32, trace: &Trace) 
                 break;
             }
         };
-        let logits = if report.decided {
-            controller.logits()
-        } else {
-            &[]
-        };
+        let decided = report.selected.is_some_and(|selected| selected.fresh);
+        let scores = if decided { controller.scores() } else { &[] };
         replay.replies.push(Reply {
-            decided: report.decided,
-            plan: report.plan.0,
-            logits: logits.to_vec(),
+            decided,
+            plan: report.selected.map(|selected| selected.index),
+            logits: scores.to_vec(),
             action: action.clone(),
         });
         // The next question has the reference's history. An executed action is finite, as the trace's length and origin say.
@@ -95,14 +95,18 @@ fn replay(controller: &mut Controller<'_, '_>, instruction: u32, trace: &Trace) 
     replay
 }
 
-/// What the policy's trajectory encoder sees in each full horizon of a trace; `None` where it has none or another horizon.
-fn encode(controller: &mut Controller<'_, '_>, trace: &Trace, horizon: usize) -> Option<Vec<u32>> {
+/// What the policy's trajectory encoder sees in each full segment of a trace; `None` where it refuses one.
+fn encode(
+    controller: &mut Controller<'_, '_>,
+    trace: &Trace,
+    encoder: Segment,
+) -> Option<Vec<u32>> {
     let contract = controller.policy().contract();
     let [observations, actions] =
-        [contract.observation_len(), contract.action_len()].map(|len| len * horizon);
+        [contract.observation_len(), contract.action_len()].map(|len| len * encoder.steps);
     let segments = trace.observations.chunks_exact(observations);
     segments
         .zip(trace.actions.chunks_exact(actions))
-        .map(|(seen, done)| controller.encode(seen, done).ok().map(|plan| plan.0))
+        .map(|(seen, done)| encoder.encode(controller, seen, done).ok())
         .collect()
 }

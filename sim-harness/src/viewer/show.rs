@@ -33,7 +33,7 @@ pub struct Shown {
     /// Control steps of a full episode.
     pub max_steps: usize,
     /// Plan of every control step that was executed.
-    pub plans: Vec<u32>,
+    pub plans: Vec<Option<u32>>,
     /// Completions so far.
     pub completions: Vec<Completion>,
     /// What comes next; `None` before the first control step of all.

@@ -1,16 +1,28 @@
 //! A small environment that needs no simulator, for the small bundle that the compiler's tests use.
 
 use std::path::Path;
+use std::sync::LazyLock;
 
-use lads_compiler::{Bundle, Image, compile};
+use lads_compiler::Contract;
+use lads_core::Policy;
+use lads_host::Opened;
 use lads_sim::environment::{ActionError, Completion, Environment, EpisodeSeed};
 use lads_sim::random::Stream;
 
-/// The small bundle, compiled.
-pub fn tiny_image() -> Image {
+static TINY: LazyLock<Opened> = LazyLock::new(|| {
     let path =
         Path::new(env!("CARGO_MANIFEST_DIR")).join("../runtime/compiler/tests/data/tiny.onnx");
-    compile(&Bundle::open(&path).unwrap()).unwrap()
+    lads_host::open(&path).unwrap()
+});
+
+/// The small bundle, compiled.
+pub fn tiny_policy() -> Policy<'static> {
+    TINY.policy()
+}
+
+/// The small bundle's contract.
+pub fn tiny_contract() -> &'static Contract {
+    TINY.bundle().unwrap().contract()
 }
 
 /// What the environment says of itself; tests change one field at a time.

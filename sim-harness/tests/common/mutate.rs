@@ -7,8 +7,8 @@ use std::ops::Range;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use lads_compiler::{Bundle, Options, compile_with};
-use lads_core::{Isa, Policy};
+use lads_compiler::Options;
+use lads_core::Isa;
 use lads_proof::answers::Answers;
 use lads_proof::contract::Compared;
 use lads_proof::reference::Reference;
@@ -243,20 +243,11 @@ impl Judged {
 /// Compares a bundle with its reference: the contract, and the policy's answers to the first traced episode of the instructions whose index
 /// is a multiple of `every`.
 pub fn verify(bytes: &[u8], options: Options, reference: &Reference, every: usize) -> Said {
-    let compiled = Bundle::from_bytes(bytes)
-        .map_err(|error| error.to_string())
-        .and_then(|bundle| {
-            let image = compile_with(&bundle, options).map_err(|error| error.to_string())?;
-            Ok((bundle, image))
-        });
-    let (bundle, image) = match compiled {
-        Ok(compiled) => compiled,
-        Err(refused) => return Said::Refused(refused),
-    };
-    let policy = match Policy::new_checked(image.as_bytes()) {
-        Ok(policy) => policy,
+    let opened = match lads_host::from_bytes_with(bytes, options) {
+        Ok(opened) => opened,
         Err(refused) => return Said::Refused(refused.to_string()),
     };
+    let (bundle, policy) = (opened.bundle().unwrap(), opened.policy());
     let known = (0..reference.instructions.len() as u32).step_by(every);
     let assignments: Vec<_> = known
         .map(|instruction| Assignment {
@@ -282,7 +273,7 @@ pub fn verify(bytes: &[u8], options: Options, reference: &Reference, every: usiz
         contract: Compared::new(
             &stated,
             reference.contract.as_ref(),
-            &verify::contract::of_image(&policy.contract()),
+            &verify::contract::of_image(&policy),
         ),
         answers: Answers::judge(reference, &replays, tolerance).0,
     }))

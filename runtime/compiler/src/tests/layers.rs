@@ -1,12 +1,11 @@
 //! What several operators become together: layers, concatenations, tables, the LSTM; and what is refused.
 
-use lads_image::op::Port;
-
 use super::compiled;
 use super::machine::Machine;
 use super::models::{Small, float, int, text};
-use super::operators::{PORTS, agrees, cache, compile, names, refused};
+use super::operators::{agrees, compile, names, refused};
 use crate::graph::{Dim, Type};
+use crate::lower::Cache;
 
 #[test]
 fn layers_take_in_what_follows() {
@@ -154,9 +153,9 @@ fn lstm() {
         let program = compile(&small.output("z", &[1, batch, hidden]))
             .unwrap_or_else(|error| panic!("{error}"));
         let mut machine = Machine::new(&program.placed, &program.weights, vec![]);
-        machine.set(&program.placed, Port::Observation, x);
+        machine.set(&program.placed, "a", x);
         machine.run(&program.placed, 0);
-        machine.output(&program.placed, Port::Latent)
+        machine.output(&program.placed, "z")
     };
     assert_eq!(last("reverse", &reversed), last("forward", &x));
     assert_ne!(last("reverse", &x), last("forward", &x));
@@ -244,7 +243,7 @@ fn what_is_not_supported_is_named() {
         .input("a", &[3])
         .node("Relu", &["a"], &["y"], &[])
         .output("y", &[3]);
-    let Err(error) = compiled(&opset.model(9), &opset.signature, &["y"], &PORTS, cache()) else {
+    let Err(error) = compiled(&opset.model(9), &opset.signature, &["y"], Cache::NONE) else {
         panic!("compiled")
     };
     assert!(error.to_string().contains("operator set 9"), "{error}");

@@ -158,7 +158,7 @@ impl Transformer {
         let logits = draft.span(self.head.n);
         self.head
             .run(draft, normed, logits, Activation::None, false);
-        draft.to_state(LOGITS, logits);
+        draft.gives_state(LOGITS, logits);
     }
 
     fn attend(&self, draft: &mut Draft, layer: &PackedLayer, qkv: Span, queries: u32) -> Span {
@@ -346,7 +346,7 @@ fn lookup(model: &Model, parts: &mut Parts) {
     let mut lookup = Draft::new("codebook/lookup");
     let index = lookup.int(SourceKind::Selected, 0, 1);
     let plan = lookup.gather(codebook, model.spec.plan_len as u32, index, 0);
-    lookup.to_state(PLAN, plan);
+    lookup.gives_state(PLAN, plan);
     parts.entry(lookup.finish());
 }
 
@@ -371,7 +371,7 @@ fn act(model: &Model, parts: &mut Parts) {
         Packed::new(parts, dense).run(&mut act, x, y, activation, false);
         x = y;
     }
-    act.to_channel(ACTION, x);
+    act.gives_channel(ACTION, x);
     parts.entry(act.finish());
 }
 

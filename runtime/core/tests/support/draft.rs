@@ -1,8 +1,7 @@
 //! A program under construction: arena is never used twice, weights go into the parts of the image.
 
 use lads_image::op::{
-    self, Activation, BinaryKind, CacheFormat, IntSlot, Op, Operand, Place, Span, StateSpan,
-    WeightSpan,
+    self, BinaryKind, CacheFormat, IntSlot, Op, Operand, Place, Span, StateSpan, WeightSpan,
 };
 use lads_image::records::{self, Source, SourceKind};
 use lads_kernels::{attention_scratch_len, keys_len};
@@ -79,11 +78,11 @@ impl Draft {
         self.0.outputs.push((source, place));
     }
 
-    pub fn to_channel(&mut self, channel: u32, span: Span) {
+    pub fn gives_channel(&mut self, channel: u32, span: Span) {
         self.output(bound(SourceKind::Channel, channel), Place::Span(span));
     }
 
-    pub fn to_state(&mut self, state: u32, span: Span) {
+    pub fn gives_state(&mut self, state: u32, span: Span) {
         self.output(bound(SourceKind::State, state), Place::Span(span));
     }
 
@@ -182,10 +181,6 @@ impl Draft {
         y
     }
 
-    pub fn linear(&mut self, linear: op::Linear) {
-        self.op(linear);
-    }
-
     /// One head of attention in which every token is its own key, value and query; the last one's result. Without `queries` it
     /// only records.
     pub fn attend(&mut self, tokens: Span, rows: u32, queries: bool) -> Span {
@@ -226,7 +221,4 @@ impl Draft {
         });
         y
     }
-
-    /// What is not activated any further.
-    pub const NO_ACTIVATION: Activation = Activation::None;
 }

@@ -58,7 +58,9 @@ pub const ACTION: u32 = 1;
 
 fn words(parts: &mut Parts) -> u32 {
     let channel = parts.channel("words", Role::Instruction, DType::F32, &[2, 2], [-9.0, 9.0]);
-    WORDS.iter().for_each(|words| parts.instruction(2, words));
+    for words in WORDS {
+        parts.instruction(2, words);
+    }
     channel
 }
 
@@ -68,7 +70,7 @@ fn score(parts: &mut Parts, logits: u32) -> u32 {
     let mut score = Draft::new("high_level/step");
     let observation = score.channel(OBSERVATION, 2);
     let scores = score.product(observation, leans);
-    score.to_state(logits, scores);
+    score.gives_state(logits, scores);
     parts.entry(score.finish())
 }
 
@@ -110,7 +112,7 @@ pub fn chunks() -> Parts {
         let attended = step.attend(token, 6, decides);
         if decides {
             let scores = step.product(attended, leans);
-            step.to_state(logits, scores);
+            step.gives_state(logits, scores);
         }
         parts.entry(step.finish())
     });
@@ -135,7 +137,7 @@ pub fn chunks() -> Parts {
         joined.push(observation);
         let joined = low.join(&joined);
         let action = low.attend(joined, 5, true);
-        low.to_channel(ACTION, action);
+        low.gives_channel(ACTION, action);
         parts.entry(low.finish())
     });
     parts.calls = vec![
@@ -169,7 +171,7 @@ pub fn denoise() -> Parts {
     let mut init = Draft::new("low_level/init");
     let noise = init.channel(NOISE, 2);
     let start = init.mul(noise, half);
-    init.to_state(x, start);
+    init.gives_state(x, start);
     let init = parts.entry(init.finish());
 
     let mut denoise = Draft::new("low_level/denoise");
@@ -184,14 +186,14 @@ pub fn denoise() -> Parts {
     let code = denoise.gather(codes, 2, index, 0);
     let drawn = denoise.add(drawn, code);
     let after = denoise.add(kept, drawn);
-    denoise.to_state(x, after);
+    denoise.gives_state(x, after);
     let denoise = parts.entry(denoise.finish());
 
     let mut act = Draft::new("low_level/act");
     let last = act.state(x, 2);
     let observation = act.channel(OBSERVATION, 2);
     let action = act.add(last, observation);
-    act.to_channel(ACTION, action);
+    act.gives_channel(ACTION, action);
     let act = parts.entry(act.finish());
     parts.calls = vec![
         Call::step(score).select(logits),
@@ -210,7 +212,7 @@ pub fn window(fill: Fill) -> Parts {
     let mut push = Draft::new("stack/append");
     let observation = push.channel(OBSERVATION, 2);
     let newest = push.mul(observation, one);
-    push.to_state(stack, newest);
+    push.gives_state(stack, newest);
     let push = parts.entry(push.finish());
 
     let mut act = Draft::new("policy/act");
@@ -222,7 +224,7 @@ pub fn window(fill: Fill) -> Parts {
     let (oldest, middle) = (act.mul(row(0), half), act.mul(row(1), quarter));
     let sum = act.add(oldest, middle);
     let action = act.add(sum, row(2));
-    act.to_channel(ACTION, action);
+    act.gives_channel(ACTION, action);
     let act = parts.entry(act.finish());
     parts.calls = vec![Call::step(push), Call::step(act)];
     parts.sealed()
@@ -267,14 +269,14 @@ pub fn history() -> Parts {
     let placed = step.add(observation, place);
     let tokens = step.join(&[previous, placed]);
     let action = step.attend(tokens, capacity, true);
-    step.to_channel(ACTION, action);
+    step.gives_channel(ACTION, action);
     let step = parts.entry(step.finish());
 
     let mut append = Draft::new("memory/append");
     let previous = append.channel(ACTION, 2);
     let observation = append.channel(OBSERVATION, 2);
     let row = append.add(previous, observation);
-    append.to_state(ring, row);
+    append.gives_state(ring, row);
     let append = parts.entry(append.finish());
     parts.calls = vec![
         Call::step(score).every(2).select(logits),
@@ -295,14 +297,14 @@ pub fn queue() -> Parts {
     let observation = plan.channel(OBSERVATION, 2);
     let rows = rows.map(|row| plan.mul(observation, row));
     let filled = plan.join(&rows);
-    plan.to_state(queue, filled);
+    plan.gives_state(queue, filled);
     let plan = parts.entry(plan.finish());
 
     let mut pop = Draft::new("low_level/pop");
     let rows = pop.state(queue, 6);
     let phase = pop.int(SourceKind::Phase, 3, 2);
     let action = pop.gather(rows, 2, phase, 0);
-    pop.to_channel(ACTION, action);
+    pop.gives_channel(ACTION, action);
     let pop = parts.entry(pop.finish());
     parts.calls = vec![Call::step(plan).every(3), Call::step(pop)];
     parts.sealed()
@@ -332,7 +334,7 @@ pub fn recurrent() -> Parts {
         len: 2,
     };
     let sum = instruct.add(word(0), word(1));
-    instruct.to_state(goal, sum);
+    instruct.gives_state(goal, sum);
     let instruct = parts.entry(instruct.finish());
 
     let mut act = Draft::new("policy/act");
@@ -346,9 +348,9 @@ pub fn recurrent() -> Parts {
     let next_count = act.add(counted, one);
     let (low, high) = (act.mul(after, quarter), act.mul(next_count, eighth));
     let action = act.add(low, high);
-    act.to_state(hidden, after);
-    act.to_state(count, next_count);
-    act.to_channel(ACTION, action);
+    act.gives_state(hidden, after);
+    act.gives_state(count, next_count);
+    act.gives_channel(ACTION, action);
     let act = parts.entry(act.finish());
     parts.calls = vec![Call::on(Event::Instruct, instruct), Call::step(act)];
     parts.sealed()
@@ -364,7 +366,7 @@ pub fn memoryless() -> Parts {
     let timestep = act.int(SourceKind::Timestep, 0, 0);
     let row = act.gather(timesteps, 2, timestep, 0);
     let action = act.add(observation, row);
-    act.to_channel(ACTION, action);
+    act.gives_channel(ACTION, action);
     let act = parts.entry(act.finish());
     parts.calls = vec![Call::step(act)];
     parts.sealed()
@@ -400,7 +402,7 @@ pub fn camera() -> Parts {
     let ticks = act.mul(ticks, tick);
     let (left, right) = (act.add(observation, row), act.add(upper, ticks));
     let action = act.add(left, right);
-    act.to_channel(ACTION, action);
+    act.gives_channel(ACTION, action);
     let act = parts.entry(act.finish());
     parts.calls = vec![Call::step(act)];
     parts.sealed()

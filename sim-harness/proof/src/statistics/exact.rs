@@ -65,8 +65,16 @@ pub fn p_greater(run_only: usize, reference_only: usize, n: usize, delta: f64) -
         return 1.0;
     }
     let seen = score(run_only, reference_only, n, delta) - 1e-9;
+    let Interval(few, many) = clopper_pearson(run_only + reference_only, n);
+    // Both cells are shares, and their difference is `delta`.
+    let (few, many) = (few.max(delta.abs()), many.max(delta.abs()).min(1.0));
+    let share = |at: usize| {
+        let differing = few + (many - few) * at as f64 / (PLACES - 1) as f64;
+        f64::midpoint(differing, -delta).max(0.0)
+    };
+    let (from, to) = (counts(share(0), n).0, counts(share(PLACES - 1), n).1);
     // The least `run_only` for each `reference_only` whose statistic is as large; no number is where there is none.
-    let least: Vec<usize> = (0..=n)
+    let least: Vec<usize> = (from..=to)
         .map(|reference_only| {
             let (mut low, mut high) = (0, n - reference_only + 1);
             while low < high {
@@ -80,26 +88,34 @@ pub fn p_greater(run_only: usize, reference_only: usize, n: usize, delta: f64) -
             low
         })
         .collect();
-    let Interval(few, many) = clopper_pearson(run_only + reference_only, n);
-    // Both cells are shares, and their difference is `delta`.
-    let (few, many) = (few.max(delta.abs()), many.max(delta.abs()).min(1.0));
-    let place = |at: usize| few + (many - few) * at as f64 / (PLACES - 1) as f64;
-    let chance = |differing: f64| tail(&least, n, f64::midpoint(differing, -delta).max(0.0), delta);
-    let largest = (0..PLACES).map(|at| chance(place(at))).fold(0.0, f64::max);
-    (largest + MISSED).min(1.0)
+    let least = |count: usize| {
+        count
+            .checked_sub(from)
+            .and_then(|at| least.get(at))
+            .copied()
+    };
+    let chances = (0..PLACES).map(|at| tail(least, n, share(at), delta));
+    (chances.fold(0.0, f64::max) + MISSED).min(1.0)
+}
+
+/// The counts that a share of `n` comes to; others are too unlikely to matter.
+fn counts(share: f64, n: usize) -> (usize, usize) {
+    let (mean, deviation) = (
+        n as f64 * share,
+        (n as f64 * share * (1.0 - share)).max(0.0).sqrt(),
+    );
+    let from = (mean - 7.5 * deviation - 2.0).max(0.0) as usize;
+    (from, ((mean + 7.5 * deviation + 12.0) as usize).min(n))
 }
 
 /// The probability that `run_only` is at least `least`, where its share is `delta` more than that of `reference_only`.
-fn tail(least: &[usize], n: usize, share: f64, delta: f64) -> f64 {
-    let rest = (1.0 - share).max(f64::MIN_POSITIVE);
-    let other = ((share + delta) / rest).clamp(0.0, 1.0);
-    let (mean, deviation) = (n as f64 * share, (n as f64 * share * rest).sqrt());
-    let from = (mean - 7.5 * deviation - 2.0).max(0.0) as usize;
-    let to = ((mean + 7.5 * deviation + 12.0) as usize).min(n);
+fn tail(least: impl Fn(usize) -> Option<usize>, n: usize, share: f64, delta: f64) -> f64 {
+    let other = ((share + delta) / (1.0 - share).max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
+    let (from, to) = counts(share, n);
     (from..=to)
         .map(|count| {
             let chance = likelihood(count, n, share);
-            let Some(&needed) = least.get(count) else {
+            let Some(needed) = least(count) else {
                 return 0.0;
             };
             if chance < NEVER || needed > n - count {

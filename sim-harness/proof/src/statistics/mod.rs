@@ -31,7 +31,7 @@ const REPORTED: f64 = 0.95;
 /// Confidence of the interval that two one-sided tests at 5 % amount to.
 const EQUIVALENCE: f64 = 0.90;
 /// Where a search for a sufficient number of episodes ends: so many times those there are.
-const MOST_GROWTH: f64 = 256.0;
+const MOST_GROWTH: f64 = 64.0;
 
 /// A difference, run minus reference, and whether it is negligible.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]

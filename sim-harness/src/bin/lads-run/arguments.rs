@@ -37,7 +37,7 @@ pub struct Arguments {
     /// Draw uniform random actions instead of asking the policy: the floor that it is measured against
     #[arg(long, conflicts_with_all = ["sample", "log", "plans", "monitor", "report", "record", "sweep"])]
     pub uniform: bool,
-    /// Write the results to this file as JSON (its form: sim-harness/results.schema.json); of --encode, the plans
+    /// Write the results to this file as JSON (its form: sim-harness/proof/results.schema.json); of --encode, the plans
     #[arg(long)]
     pub json: Option<PathBuf>,
     /// Instructions that the kernels run on; left out, the widest of this CPU. The results have the same bits on all
@@ -51,7 +51,7 @@ pub struct Arguments {
         reason = "clap's form of an option whose value may be left out"
     )]
     pub verify: Option<Option<PathBuf>>,
-    /// Write the certificate of --verify to this file, as JSON (its form: sim-harness/certificate.schema.json) or, where it ends in .html, as
+    /// Write the certificate of --verify to this file, as JSON (its form: sim-harness/proof/certificate.schema.json) or, where it ends in .html, as
     /// a page; may be given twice
     #[arg(long, requires = "verify")]
     pub certificate: Vec<PathBuf>,

@@ -1,9 +1,9 @@
 //! What the policy is told: instructions of the bundle's table, or, through the language encoder (cargo feature `language`), any sentence.
 
 use lads_compiler::Bundle;
-use lads_core::{KnownInstruction, Policy};
+use lads_core::Policy;
 use lads_sim::environment::Environment;
-use lads_sim::results::{HeardBy, NearestKnown, Results};
+use lads_sim::results::{self, Asked, HeardBy, NearestKnown, Results};
 use lads_sim::spoken::{self, Sentence, Unaccepted, WordBook};
 
 use crate::arguments::Arguments;
@@ -106,7 +106,7 @@ pub struct Heard<'p> {
     /// Who heard them, for results; `None` where all come from the table.
     pub by: Option<HeardBy>,
     /// The known instruction that a sentence outside the table is most like.
-    pub nearest: Option<KnownInstruction<'p>>,
+    pub nearest: Option<Asked<'p>>,
     /// What a person must know of it before it is followed.
     pub first: String,
     /// What a person wants to know of it afterwards.
@@ -117,7 +117,7 @@ impl Heard<'_> {
     /// The note, with what a sentence that names no sub-tasks has completed.
     pub fn last(&self, results: &Results) -> String {
         let unjudged = self.words.sentence.as_ref();
-        let unjudged = unjudged.is_some_and(|sentence| sentence.known().sub_tasks.is_empty());
+        let unjudged = unjudged.is_some_and(|sentence| sentence.asked().sub_tasks.is_empty());
         let result = results.instructions.first().filter(|_| unjudged);
         let completed = self.nearest.as_ref().zip(result);
         let completed = completed
@@ -129,8 +129,8 @@ impl Heard<'_> {
 /// Lets the language encoder hear what the table does not have, or, with `--encode-language`, everything.
 pub fn hear<'p>(
     arguments: &Arguments,
-    bundle: &Bundle,
-    policy: &Policy<'p>,
+    bundle: &'p Bundle,
+    policy: &Policy<'_>,
     chosen: &Chosen,
 ) -> Result<Heard<'p>, End> {
     match chosen {
@@ -148,8 +148,8 @@ pub fn hear<'p>(
 
 fn hear_sentence<'p>(
     arguments: &Arguments,
-    bundle: &Bundle,
-    policy: &Policy<'p>,
+    bundle: &'p Bundle,
+    policy: &Policy<'_>,
     text: &str,
 ) -> Result<Heard<'p>, End> {
     let not_known = || {
@@ -163,13 +163,17 @@ fn hear_sentence<'p>(
     let heard = encoder::words(&encoder, text)
         .map_err(|wrong| refused(format!("--instruction {wrong}")))?;
     let contract = policy.contract();
-    let (nearest, similarity) = spoken::nearest(&contract, &heard).ok_or_else(|| {
+    let nearest = spoken::nearest(contract, &heard).and_then(|(place, similarity)| {
+        Some((results::asked(bundle.contract(), place)?, similarity))
+    });
+    let (nearest, similarity) = nearest.ok_or_else(|| {
         refused(format!(
             "{}: no instruction to compare it with",
             not_known()
         ))
     })?;
-    let acceptance = bundle.contract().language.acceptance.as_ref();
+    let acceptance = bundle.contract().language.as_ref();
+    let acceptance = acceptance.and_then(|language| language.acceptance.as_ref());
     let accepted = spoken::accept(acceptance, similarity);
     let shown = text.escape_debug();
     let near = format!(
@@ -211,8 +215,8 @@ fn hear_sentence<'p>(
 
 fn hear_again<'p>(
     arguments: &Arguments,
-    bundle: &Bundle,
-    policy: &Policy<'p>,
+    bundle: &'p Bundle,
+    policy: &Policy<'_>,
     chosen: &Chosen,
 ) -> Result<Heard<'p>, End> {
     let about = |wrong: String| refused(format!("--encode-language: {wrong}"));
@@ -254,10 +258,10 @@ fn heard_by(
     largest_difference: Option<f32>,
     nearest: Option<NearestKnown>,
 ) -> HeardBy {
-    let language = &bundle.contract().language;
+    let language = bundle.contract().language.as_ref();
     HeardBy {
-        encoder: language.encoder.clone(),
-        sha256: language.sha256.clone(),
+        encoder: language.map_or_else(String::new, |it| it.encoder.clone()),
+        sha256: language.map_or_else(String::new, |it| it.sha256.clone()),
         largest_difference,
         nearest,
     }
@@ -275,7 +279,9 @@ mod encoder {
     pub fn open(arguments: &Arguments, bundle: &Bundle) -> Result<Encoder, String> {
         let contract = bundle.contract();
         let named = arguments.language.encoder.clone();
-        let folder = named.map_or_else(|| default_folder(&contract.language.encoder), Ok);
+        let language = contract.language.as_ref();
+        let language = language.ok_or("the policy takes no instructions in words")?;
+        let folder = named.map_or_else(|| default_folder(&language.encoder), Ok);
         let encoder = folder.and_then(|folder| Encoder::open(&folder, contract));
         encoder.map_err(|error| error.to_string())
     }

@@ -27,8 +27,9 @@ use std::time::{Duration, Instant};
 use arguments::Arguments;
 use end::{End, print, refused, unwritable};
 use indicatif::ProgressBar;
-use lads_compiler::{Bundle, Memory};
-use lads_core::{Contract, Decision, Policy};
+use lads_compiler::Contract;
+use lads_core::{Decision, Isa, Policy};
+use lads_host::Memory;
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Setup};
 use lads_sim::faults::Faults;
@@ -70,54 +71,54 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
     let reference = verify::reference(arguments)?;
 
     let about = |wrong: &dyn Display| refused(format!("{}: {wrong}", arguments.model.display()));
-    let bundle = Bundle::open(&arguments.model).map_err(refused)?;
-    let program = Program::of(arguments, &bundle)?;
-    let policy = program.policy(arguments)?;
-    let chosen = Chosen::of(arguments, &bundle)?;
-    let mut heard = language::hear(arguments, &bundle, &policy, &chosen)?;
-    self_test(&policy).map_err(|wrong| about(&wrong))?;
+    let program = Program::open(arguments)?;
+    let (bundle, policy) = (program.bundle(), program.policy());
+    let chosen = Chosen::of(arguments, bundle)?;
+    let mut heard = language::hear(arguments, bundle, &policy, &chosen)?;
+    self_test(&policy, isa).map_err(|wrong| about(&wrong))?;
     let files = &arguments.recordings;
     if let Some(log) = &files.replay {
-        return recordings::replay(&policy, log);
+        return recordings::replay(&policy, bundle, isa, log);
     }
     if let Some(log) = &files.encode {
         return recordings::encode(&policy, log, arguments.json.as_deref());
     }
     let book = files.plans.as_deref();
-    let book = book.map(|path| recordings::plans(&policy, &bundle, path));
+    let book = book.map(|path| recordings::plans(&policy, bundle, path));
     let book = book.transpose()?;
 
-    let contract = policy.contract();
-    let id = contract.environment_id();
+    let contract = bundle.contract();
+    let id = contract.environment.id.as_str();
     let noise = noise(arguments, reference.as_ref(), id);
     let open = registry::load(id, noise, &assets::vendor_dir()).map_err(refused)?;
     let environment = open();
-    let commanded = fit::check(&contract, environment.as_ref()).map_err(|misfit| {
+    let commanded = fit::check(contract, environment.as_ref()).map_err(|misfit| {
         about(&format_args!(
             "{misfit}; use a bundle made for this environment"
         ))
     })?;
     heard.words.sentence = chosen.sentence(arguments, environment.as_ref())?;
     let assignments: Vec<_> = (0..)
-        .zip(contract.instructions().zip(commanded))
+        .zip(commanded)
         .filter(|(instruction, _)| chosen.has(*instruction))
         .filter(|(instruction, _)| book.as_ref().is_none_or(|book| book.knows(*instruction)))
-        .map(|(instruction, (known, commanded))| Assignment {
+        .map(|(instruction, commanded)| Assignment {
             instruction,
             commanded,
-            max_steps: environment.max_steps(known.split),
+            max_steps: environment.max_steps(contract.evaluated(instruction as usize).1),
         })
         .chain(
             heard
                 .words
                 .sentence
                 .iter()
-                .map(|sentence| sentence.assignment(&contract, environment.as_ref())),
+                .map(|sentence| sentence.assignment(contract, environment.as_ref())),
         )
         .collect();
-    check_plans(arguments, book.as_ref(), &assignments, &contract)?;
+    check_plans(arguments, book.as_ref(), &assignments, contract)?;
     let mut evaluation = Evaluation {
         policy,
+        contract,
         assignments: &assignments,
         episodes: arguments.episodes.unwrap_or(EPISODES),
         seed: arguments.seed,
@@ -136,12 +137,12 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
     };
     if let Some(reference) = reference {
         reference
-            .check(&lads_sim::verify::subject(&bundle, environment.as_ref()))
+            .check(&lads_sim::verify::subject(bundle, environment.as_ref()))
             .map_err(refused)?;
         verify::prepare(&mut evaluation, &reference, arguments.episodes)?;
         return verify::run(
             &evaluation,
-            &bundle,
+            bundle,
             &reference,
             &open,
             &arguments.certificate,
@@ -233,11 +234,10 @@ impl Bench<'_> {
         evaluated: &Evaluated,
         wall: Duration,
     ) -> Results {
-        let contract = evaluation.policy.contract();
         let (environment, watched) = (self.environment, self.environment.sub_tasks());
-        let mut splits = results::split_names(&contract);
+        let mut splits = results::split_names(evaluation.contract);
         let sentence = self.heard.words.sentence.as_ref();
-        splits.extend(sentence.map(|sentence| sentence.known().split.to_owned()));
+        splits.extend(sentence.map(|sentence| sentence.asked().split.to_owned()));
         let of_each = evaluation.assignments.iter().zip(&evaluated.episodes);
         let instructions: Vec<_> = of_each
             .filter(|(_, episodes)| !episodes.is_empty())
@@ -251,7 +251,7 @@ impl Bench<'_> {
             format: results::FORMAT,
             format_version: results::FORMAT_VERSION,
             environment: results::environment_used(environment, &splits),
-            bundle_sha256: contract.bundle_sha256().to_owned(),
+            bundle_sha256: evaluation.policy.contract().bundle_sha256().to_owned(),
             image_sha256: lads_compiler::sha256(evaluation.policy.image()),
             seed: evaluation.seed,
             noise: self.noise.to_owned(),
@@ -352,14 +352,14 @@ fn check_plans(
     arguments: &Arguments,
     book: Option<&plans::PlanBook>,
     assignments: &[Assignment],
-    contract: &Contract<'_>,
+    contract: &Contract,
 ) -> Result<(), End> {
     let Some(book) = book else {
         return Ok(());
     };
     let name = |assignment: &Assignment| {
-        let known = contract.instruction_id(assignment.instruction as usize);
-        known.unwrap_or_default().to_owned()
+        let known = contract.instructions.get(assignment.instruction as usize);
+        known.map_or_else(String::new, |known| known.id.clone())
     };
     if assignments.is_empty() {
         return Err(refused(
@@ -454,11 +454,11 @@ fn check_numbers(arguments: &Arguments) -> Result<usize, End> {
     }
 }
 
-/// Replays the bundle's golden episode on this machine; a policy that answers differently is not run.
-fn self_test(policy: &Policy<'_>) -> Result<(), String> {
+/// Replays the bundle's golden episode on the instructions that the policy is to run on; a policy that answers differently is not run.
+fn self_test(policy: &Policy<'_>, isa: Isa) -> Result<(), String> {
     let mut memory = Memory::of(policy).map_err(|error| error.to_string())?;
     let mut controller = memory
-        .controller(policy)
+        .controller_with(policy, isa)
         .map_err(|error| error.to_string())?;
     match controller.self_test() {
         Ok(_) => Ok(()),

@@ -5,56 +5,55 @@
 
 use std::path::Path;
 
-use lads_compiler::{Aligned, Bundle, Image, compile};
+use lads_compiler::Bundle;
 use lads_core::{Isa, Policy};
+use lads_host::Opened;
 
 use crate::arguments::{Arguments, IsaName};
 use crate::end::{End, refused};
 
-/// An image and its memory.
-pub enum Program {
-    Compiled(Image),
-    Read(Aligned),
+/// A bundle and the image of it that runs.
+pub struct Program {
+    image: Opened,
+    bundle: Bundle,
 }
 
 impl Program {
-    pub fn of(arguments: &Arguments, bundle: &Bundle) -> Result<Self, End> {
+    pub fn open(arguments: &Arguments) -> Result<Self, End> {
+        let model = &arguments.model;
         let Some(path) = &arguments.image else {
-            let image = compile(bundle);
-            let image = image.map_err(|error| about(&arguments.model, &error))?;
-            return Ok(Self::Compiled(image));
+            let image = lads_host::open(model).map_err(refused)?;
+            let Some(bundle) = image.bundle().cloned() else {
+                let wrong = "it is a compiled image; name its bundle, and the image with --image";
+                return Err(about(model, &wrong));
+            };
+            return Ok(Self { image, bundle });
         };
-        let again = "compile it again from the bundle, with lads compile";
-        let bytes = lads_host::input::read(path)
-            .map_err(|error| about(path, &format_args!("{error}; name a program image (.lads)")))?;
-        let image = Aligned::new(&bytes);
-        let policy = Policy::new_checked(image.as_bytes())
-            .map_err(|error| about(path, &format_args!("{error}; {again}")))?;
-        if !policy.checksum_matches() {
-            let wrong = "its checksum does not match: it was changed after it was compiled";
-            return Err(about(path, &format_args!("{wrong}; {again}")));
+        let bundle = Bundle::open(model).map_err(refused)?;
+        let image = lads_host::open(path).map_err(refused)?;
+        if image.is_bundle() {
+            return Err(about(path, &"it is a bundle; name a program image (.lads)"));
         }
-        if policy.contract().bundle_sha256() != bundle.sha256() {
-            let model = arguments.model.display();
+        if image.policy().contract().bundle_sha256() != bundle.sha256() {
+            let model = model.display();
             return Err(about(
                 path,
-                &format_args!("it was compiled from another bundle than {model}; {again}"),
+                &format_args!(
+                    "it was compiled from another bundle than {model}; compile it again from the bundle, with lads compile"
+                ),
             ));
         }
-        Ok(Self::Read(image))
+        Ok(Self { image, bundle })
     }
 
-    pub fn policy(&self, arguments: &Arguments) -> Result<Policy<'_>, End> {
-        let bytes = match self {
-            Self::Compiled(image) => image.as_bytes(),
-            Self::Read(image) => image.as_bytes(),
-        };
-        Policy::new_checked(bytes).map_err(|error| {
-            about(
-                &arguments.model,
-                &format_args!("{error}; export the bundle again"),
-            )
-        })
+    /// The checked view on the image.
+    pub fn policy(&self) -> Policy<'_> {
+        self.image.policy()
+    }
+
+    /// The bundle that the image is of.
+    pub fn bundle(&self) -> &Bundle {
+        &self.bundle
     }
 }
 

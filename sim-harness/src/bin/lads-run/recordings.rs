@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use lads_compiler::Bundle;
-use lads_core::Policy;
+use lads_core::{Channel, Isa, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::Evaluation;
 use lads_sim::plans::{self, Agreement, PlanBook, PlanFile, PlanSequence};
@@ -28,7 +28,12 @@ fn read(option: &str, path: &Path) -> Result<Log, End> {
 }
 
 /// Computes a log again.
-pub fn replay(policy: &Policy<'_>, path: &Path) -> Result<ExitCode, End> {
+pub fn replay(
+    policy: &Policy<'_>,
+    bundle: &Bundle,
+    isa: Isa,
+    path: &Path,
+) -> Result<ExitCode, End> {
     let log = read("--replay", path)?;
     let about = |error: &dyn std::fmt::Display| {
         refused(format!(
@@ -37,7 +42,7 @@ pub fn replay(policy: &Policy<'_>, path: &Path) -> Result<ExitCode, End> {
         ))
     };
     let bar = progress(log.flights.len());
-    let replayed = replay::replay(policy, &log, &|| bar.inc(1));
+    let replayed = replay::replay(policy, bundle.contract().period(), isa, &log, &|| bar.inc(1));
     bar.finish_and_clear();
     let replayed = replayed.map_err(|error| about(&error))?;
 
@@ -82,7 +87,8 @@ fn said(difference: &Difference) -> String {
         "{} episode {}: differs first at control step {}:",
         difference.instruction, difference.episode, difference.step
     );
-    if let Some((was, is)) = difference.plans {
+    if let Some(plans) = difference.plans {
+        let [was, is] = plans.map(|plan| plan.map_or("none".to_owned(), |plan| plan.to_string()));
         let _ = write!(line, " plan {was} in the log, {is} now;");
     }
     if let Some((name, was, is)) = &difference.action {
@@ -109,14 +115,15 @@ pub fn encode(policy: &Policy<'_>, path: &Path, json: Option<&Path>) -> Result<E
     };
     let sequences = log.flights.iter().zip(plans).map(sequence);
     let (sequences, short): (Vec<_>, Vec<_>) = sequences.partition(|it| !it.plans.is_empty());
-    let file = PlanFile::new(policy.contract().horizon(), sequences);
+    let steps = plans::Segment::of(policy).map_or(0, |segment| segment.steps);
+    let file = PlanFile::new(steps, sequences);
     if let Some(first) = short.first() {
         eprintln!(
-            "--encode: {} of {} episodes, {} among them, are shorter than the horizon of {} and have no plan",
+            "--encode: {} of {} episodes, {} among them, are shorter than the {} control steps of a plan and have none",
             short.len(),
             log.flights.len(),
             first.instruction,
-            file.horizon
+            file.period
         );
     }
     match json {
@@ -137,7 +144,7 @@ fn pretty(file: &PlanFile) -> String {
     let lines = lines.collect::<Vec<_>>().join(",\n");
     format!(
         "{{\"format\": \"{}\", \"format_version\": {}, \"horizon\": {}, \"episodes\": [\n{lines}\n]}}",
-        file.format, file.format_version, file.horizon
+        file.format, file.format_version, file.period
     )
 }
 
@@ -148,8 +155,12 @@ pub fn plans(policy: &Policy<'_>, bundle: &Bundle, path: &Path) -> Result<PlanBo
         found.first().map(|&index| index as u32)
     };
     let read = PlanFile::read(path);
-    let book = read.and_then(|file| file.check(&policy.contract(), index));
+    let book = read.and_then(|file| file.check(policy, bundle.contract().period(), index));
     book.map_err(|error| refused(format!("--plans {}: {error}", path.display())))
+}
+
+fn names(channel: &Channel<'_>) -> Vec<String> {
+    channel.elements().map(|e| e.name.to_owned()).collect()
 }
 
 /// Writes what happened.
@@ -187,9 +198,9 @@ pub fn log(
             seed: evaluation.seed,
             noise: noise.to_owned(),
             control_period_s: environment.control_period_s(),
-            horizon: contract.horizon(),
-            observation_names: contract.observations().map(|e| e.name.to_owned()).collect(),
-            action_names: contract.actions().map(|e| e.name.to_owned()).collect(),
+            period: evaluation.contract.period(),
+            observation_names: names(&contract.observation()),
+            action_names: names(&contract.action()),
             notes,
         },
         flights: traces.iter().filter_map(flight).collect(),

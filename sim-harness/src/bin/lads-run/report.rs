@@ -36,7 +36,8 @@ mod with {
         let report = Report {
             results,
             traces,
-            contract: evaluation.policy.contract(),
+            contract: evaluation.contract,
+            plans: evaluation.policy.index_count() as usize,
             sub_tasks: open().sub_tasks(),
             strips: strips(traces, evaluation, open, stop)?,
         };
@@ -76,7 +77,7 @@ mod with {
             };
             match scene.strip(environment.as_mut(), &mut camera, stop) {
                 Ok(stills) => strips.push(Strip {
-                    title: lads_sim::report::title(&evaluation.policy.contract(), trace),
+                    title: lads_sim::report::title(evaluation.contract, trace),
                     stills,
                 }),
                 Err(FilmError::Interrupted) => return Err(End::Interrupted),

@@ -7,8 +7,8 @@
 //! | `/episode` | at the start of each | instruction, number, decision rule, outcome |
 //! | `/observation` | every control step | what the policy saw, in the contract's units |
 //! | `/action` | every control step | what it answered, and what was executed |
-//! | `/plan` | every control step | plan in force, whether decided now, margin |
-//! | `/logits` | every decision | one per codebook entry |
+//! | `/plan` | every control step | plan in force, null of a policy that selects none; whether decided now, margin |
+//! | `/logits` | every decision | the scores, one per plan |
 //! | `/timing` | every control step | time inside the controller |
 //! | `/gripper` | every control step, where the environment has one | position |
 //! | `/completion` | when it happens | sub-task |
@@ -39,6 +39,9 @@ pub const FORMAT_VERSION: u32 = 1;
 /// Name of the metadata record.
 const METADATA: &str = "lads";
 
+/// Its key for [`Origin::period`].
+const PERIOD: &str = "horizon";
+
 /// What the episodes of a log depend on besides themselves.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Origin {
@@ -54,8 +57,8 @@ pub struct Origin {
     pub noise: String,
     /// Time between two control steps, in seconds.
     pub control_period_s: f64,
-    /// Control steps per plan.
-    pub horizon: usize,
+    /// Control steps per plan; `None` of a policy that selects none.
+    pub period: Option<usize>,
     /// Names of the elements of an observation.
     pub observation_names: Vec<String>,
     /// Names of the elements of an action.
@@ -114,6 +117,9 @@ struct EpisodeMessage {
     episode: u32,
     /// In decimal digits: a JSON number would lose bits in JavaScript.
     sampling_seed: Option<String>,
+    /// The same, of what else the policy draws at random; left out where it draws nothing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    noise_seed: Option<String>,
     commanded: bool,
     steps: usize,
     success: bool,
@@ -135,7 +141,7 @@ struct ActionMessage {
 /// `/plan`.
 #[derive(Debug, Serialize, Deserialize)]
 struct PlanMessage {
-    index: u32,
+    index: Option<u32>,
     decided: bool,
     margin: Option<f32>,
 }

@@ -13,7 +13,7 @@ use super::schema::{
 };
 use super::{
     ActionMessage, CompletionMessage, EpisodeMessage, FORMAT_VERSION, Flight, GripperMessage, Log,
-    LogError, METADATA, Origin, PlanMessage, TimingMessage, Values,
+    LogError, METADATA, Origin, PERIOD, PlanMessage, TimingMessage, Values,
 };
 use crate::environment::Completion;
 use crate::rollout::Episode;
@@ -109,12 +109,18 @@ fn origin(bytes: &[u8]) -> Result<(Origin, usize), LogError> {
         seed: number(&entries, "seed")?,
         noise: text("noise")?,
         control_period_s: number(&entries, "control_period_s")?,
-        horizon: number(&entries, "horizon")?,
+        period: period(&entries)?,
         observation_names: names("observation_names")?,
         action_names: names("action_names")?,
         notes: notes.collect(),
     };
     Ok((origin, number(&entries, "episodes")?))
+}
+
+/// Left out of a policy that selects nothing.
+fn period(entries: &BTreeMap<String, String>) -> Result<Option<usize>, LogError> {
+    let given = entries.contains_key(PERIOD);
+    given.then(|| number(entries, PERIOD)).transpose()
 }
 
 fn number<N: std::str::FromStr>(
@@ -139,10 +145,10 @@ fn take(topic: usize, data: &[u8], flights: &mut Vec<Flight>) -> Result<(), LogE
             observation: message::<Values>(topic, data)?.values,
             action: Vec::new(),
             executed: Vec::new(),
-            plan: 0,
+            plan: None,
             decided: false,
             margin: None,
-            logits: Vec::new(),
+            scores: Vec::new(),
             controller_ns: 0,
             gripper: None,
         });
@@ -161,11 +167,10 @@ fn take(topic: usize, data: &[u8], flights: &mut Vec<Flight>) -> Result<(), LogE
         PLAN => {
             let plan: PlanMessage = message(topic, data)?;
             (step.plan, step.decided, step.margin) = (plan.index, plan.decided, plan.margin);
-            if plan.decided {
-                flight.trace.outcome.plans.push(plan.index);
-            }
+            let decided = plan.index.filter(|_| plan.decided);
+            flight.trace.outcome.plans.extend(decided);
         }
-        LOGITS => step.logits = message::<Values>(topic, data)?.values,
+        LOGITS => step.scores = message::<Values>(topic, data)?.values,
         TIMING => step.controller_ns = message::<TimingMessage>(topic, data)?.controller_ns,
         GRIPPER => {
             let at: GripperMessage = message(topic, data)?;
@@ -185,8 +190,11 @@ fn take(topic: usize, data: &[u8], flights: &mut Vec<Flight>) -> Result<(), LogE
 }
 
 fn begun(start: EpisodeMessage) -> Result<Flight, LogError> {
-    let seed = start.sampling_seed.as_deref().map(str::parse).transpose();
-    let sampling_seed = seed.map_err(|_| foreign("a sampling seed is no number"))?;
+    let seed = |seed: Option<String>| {
+        let seed = seed.as_deref().map(str::parse).transpose();
+        seed.map_err(|_| foreign("a seed is no number"))
+    };
+    let (sampling_seed, noise_seed) = (seed(start.sampling_seed)?, seed(start.noise_seed)?);
     Ok(Flight {
         instruction_id: start.instruction_id,
         instruction_text: start.instruction_text,
@@ -196,6 +204,7 @@ fn begun(start: EpisodeMessage) -> Result<Flight, LogError> {
             instruction: start.instruction,
             episode: start.episode,
             sampling_seed,
+            noise_seed,
             commanded: start.commanded,
             outcome: Episode {
                 steps: start.steps,

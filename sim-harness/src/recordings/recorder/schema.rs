@@ -20,6 +20,7 @@ enum Kind {
     Flag,
     Text,
     Numbers,
+    MaybeInteger,
     MaybeNumber,
     MaybeText,
 }
@@ -32,6 +33,7 @@ impl Kind {
             Self::Flag => json!({"type": "boolean"}),
             Self::Text => json!({"type": "string"}),
             Self::Numbers => json!({"type": "array", "items": {"type": "number"}}),
+            Self::MaybeInteger => json!({"type": ["integer", "null"]}),
             Self::MaybeNumber => json!({"type": ["number", "null"]}),
             Self::MaybeText => json!({"type": ["string", "null"]}),
         }
@@ -91,10 +93,11 @@ pub const TOPICS: [Topic; 8] = [
                 "seed of plan sampling, null for argmax",
             ),
             (
-                "commanded",
-                Kind::Flag,
-                "plans were given; the low level ran alone",
+                "noise_seed",
+                Kind::Text,
+                "seed of what else the policy draws at random; absent where it draws nothing",
             ),
+            ("commanded", Kind::Flag, "plans were given"),
             ("steps", Kind::Integer, "control steps that follow"),
             ("success", Kind::Flag, "the instruction was carried out"),
         ],
@@ -121,22 +124,26 @@ pub const TOPICS: [Topic; 8] = [
     Topic {
         name: "/plan",
         schema: "lads.Plan",
-        about: "The latent plan in force.",
+        about: "The plan in force.",
         fields: &[
-            ("index", Kind::Integer, "entry of the codebook"),
+            (
+                "index",
+                Kind::MaybeInteger,
+                "its index; null of a policy that selects none",
+            ),
             ("decided", Kind::Flag, "decided in this control step"),
             (
                 "margin",
                 Kind::MaybeNumber,
-                "largest logit minus the second largest",
+                "largest score minus the second largest",
             ),
         ],
     },
     Topic {
         name: "/logits",
         schema: "lads.Logits",
-        about: "The high level's logits at a decision.",
-        fields: &[("values", Kind::Numbers, "one per codebook entry")],
+        about: "The scores of a decision.",
+        fields: &[("values", Kind::Numbers, "one per plan")],
     },
     Topic {
         name: "/timing",

@@ -12,7 +12,7 @@ use super::schema::{
 };
 use super::{
     ActionMessage, CompletionMessage, EpisodeMessage, FORMAT_VERSION, Flight, GripperMessage, Log,
-    METADATA, Origin, PlanMessage, TimingMessage, Values,
+    METADATA, Origin, PERIOD, PlanMessage, TimingMessage, Values,
 };
 
 /// Simulated time between two episodes, in nanoseconds, so that they stay apart on a time axis.
@@ -45,16 +45,17 @@ fn metadata(origin: &Origin, episodes: usize) -> Metadata {
         ("seed", origin.seed.to_string()),
         ("noise", origin.noise.clone()),
         ("control_period_s", origin.control_period_s.to_string()),
-        ("horizon", origin.horizon.to_string()),
         ("observation_names", origin.observation_names.join(" ")),
         ("action_names", origin.action_names.join(" ")),
     ];
+    let period = origin.period.map(|period| (PERIOD, period.to_string()));
+    let known = known.into_iter().chain(period);
     let known = known.map(|(key, value)| (key.to_owned(), value));
     let notes = origin.notes.iter();
     let notes = notes.map(|(key, value)| (format!("note.{key}"), value.clone()));
     Metadata {
         name: METADATA.to_owned(),
-        metadata: known.into_iter().chain(notes).collect(),
+        metadata: known.chain(notes).collect(),
     }
 }
 
@@ -101,6 +102,7 @@ impl<W: Write + Seek> Recorder<W> {
             words: flight.words.clone(),
             episode: trace.episode,
             sampling_seed: trace.sampling_seed.map(|seed| seed.to_string()),
+            noise_seed: trace.noise_seed.map(|seed| seed.to_string()),
             commanded: trace.commanded,
             steps: trace.steps.len(),
             success: trace.outcome.success,
@@ -126,8 +128,8 @@ impl<W: Write + Seek> Recorder<W> {
                 margin: step.margin,
             };
             self.message(PLAN, &plan)?;
-            if !step.logits.is_empty() {
-                let values = step.logits.clone();
+            if !step.scores.is_empty() {
+                let values = step.scores.clone();
                 self.message(LOGITS, &Values { values })?;
             }
             let controller_ns = step.controller_ns;

@@ -1,0 +1,147 @@
+//! `lads compile`: a bundle into a program image, as a file, as source, or both.
+//!
+//! Everything that can be refused is, before the first file is written.
+
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use lads_compiler::{CacheFormat, Options, WeightFormat};
+use lads_host::output;
+
+use crate::model::Model;
+use crate::refusal::Refusal;
+use crate::{emit, print, self_test};
+
+/// What to compile, how, and what to write.
+#[derive(Debug, Args)]
+pub struct Request {
+    /// Bundle (.onnx); with --emit-c or --emit-rust also a compiled image (.lads)
+    model: PathBuf,
+    /// The image to write
+    #[arg(short, long, required_unless_present_any = ["emit_c", "emit_rust"])]
+    output: Option<PathBuf>,
+    /// A C source to write: the image as a constant, aligned byte array
+    #[arg(long, value_name = "FILE")]
+    emit_c: Option<PathBuf>,
+    /// A Rust source to write: the image as a constant, aligned byte array
+    #[arg(long, value_name = "FILE")]
+    emit_rust: Option<PathBuf>,
+    /// How the weights are stored: f32; int16 or int8, with which the inputs of a layer are rounded too, and which are faster
+    /// than f32 on x86-64; f16 or bf16, which are decoded. Fewer bits than 32 have to pass a gate: the golden episode replays
+    /// with the same plans, and with actions inside the tolerance
+    #[arg(long, value_name = "FORMAT", default_value = "f32", value_parser = weight_format)]
+    weights: WeightFormat,
+    /// How the weights of the low level are stored, if otherwise: with f32 the actions of a plan keep their bits, and all
+    /// that fewer bits elsewhere can do is to choose another plan
+    #[arg(long, value_name = "FORMAT", value_parser = weight_format)]
+    low_level: Option<WeightFormat>,
+    /// How the KV cache is stored: f32, or f16 in half the memory. It has to pass the same gate
+    #[arg(long, value_name = "FORMAT", default_value = "f32", value_parser = cache_format)]
+    cache: CacheFormat,
+    /// Largest difference of an action that the gate, and later the image's self-test, accept, in the action's units; the
+    /// bundle's own is meant for 32-bit weights
+    #[arg(long, value_name = "DIFFERENCE", value_parser = tolerance)]
+    tolerance: Option<f32>,
+    /// Writes an image that the gate refuses, for experiments; its self-test fails
+    #[arg(long)]
+    force: bool,
+}
+
+/// Compiles as requested.
+pub fn compile(request: Request) -> Result<(), Refusal> {
+    let Request {
+        model,
+        output,
+        emit_c,
+        emit_rust,
+        weights,
+        low_level,
+        cache,
+        tolerance,
+        force,
+    } = request;
+    let options = Options {
+        weights,
+        low_level,
+        cache,
+        tolerance,
+        force,
+    };
+    let outputs: Vec<_> = [
+        ("-o", &output),
+        ("--emit-c", &emit_c),
+        ("--emit-rust", &emit_rust),
+    ]
+    .into_iter()
+    .filter_map(|(option, path)| Some((option, path.as_deref()?)))
+    .collect();
+    output::check(&[("", &model)], &outputs).map_err(Refusal::of)?;
+    let model = Model::compile(&model, options)?;
+    let again = output.is_some() || options != Options::default();
+    if again && !model.is_bundle() {
+        return Err(Refusal::new(
+            model.path.display(),
+            "it is a compiled image already",
+            "give the bundle (.onnx)",
+        ));
+    }
+    let image = model.image();
+    // Everything that can be refused is, before the first file is written.
+    let c = emit_c.map(|path| emit::c(image, &path).map(|text| (path, text)));
+    let rust = emit_rust.map(|path| emit::rust(image, &path).map(|text| (path, text)));
+    let sources = [c.transpose()?, rust.transpose()?];
+    let sources = sources
+        .iter()
+        .flatten()
+        .map(|(path, text)| (path, text.as_bytes()));
+    let mut drafts = vec![];
+    for (path, bytes) in output.iter().map(|path| (path, image)).chain(sources) {
+        let draft = output::draft(path).and_then(|mut draft| {
+            draft.write_all(bytes)?;
+            Ok(draft)
+        });
+        let draft = draft.map_err(|error| unwritable(path, &error))?;
+        drafts.push((path, bytes.len(), draft));
+    }
+    for (path, bytes, draft) in drafts {
+        draft.commit().map_err(|error| unwritable(path, &error))?;
+        print(&format!("{}: {bytes} bytes\n", path.display()))?;
+    }
+    if options.is_exact() || force {
+        return Ok(());
+    }
+    let line = self_test::self_test(&model)?;
+    print(&format!("{options}: {line}\n"))
+}
+
+pub fn weight_format(name: &str) -> Result<WeightFormat, String> {
+    named(name, WeightFormat::ALL, WeightFormat::name)
+}
+
+fn cache_format(name: &str) -> Result<CacheFormat, String> {
+    named(name, CacheFormat::ALL, CacheFormat::name)
+}
+
+fn named<T: Copy, const N: usize>(
+    name: &str,
+    known: [T; N],
+    name_of: fn(T) -> &'static str,
+) -> Result<T, String> {
+    let found = known.into_iter().find(|&format| name_of(format) == name);
+    found.ok_or_else(|| format!("known are {}", known.map(name_of).join(", ")))
+}
+
+fn tolerance(text: &str) -> Result<f32, String> {
+    let number: Option<f32> = text.parse().ok();
+    let positive = number.filter(|number| number.is_finite() && *number > 0.0);
+    positive.ok_or_else(|| "it has to be a positive number".into())
+}
+
+fn unwritable(path: &Path, error: &io::Error) -> Refusal {
+    Refusal::new(
+        path.display(),
+        error,
+        "name a file in an existing, writable folder",
+    )
+}

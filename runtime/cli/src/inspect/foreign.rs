@@ -1,0 +1,111 @@
+//! An ONNX file that is no policy: what it holds, and all that is missing.
+
+use std::fmt::{self, Display, Formatter};
+use std::path::Path;
+
+use lads_compiler::{Missing, Operand, Operator, Survey, Value as Edge};
+use serde_json::{Value, json};
+
+/// What a file that is no policy holds and misses.
+pub struct Foreign<'p> {
+    path: &'p Path,
+    survey: Survey,
+}
+
+impl<'p> Foreign<'p> {
+    /// Looks into the file, if it is an ONNX model that misses something.
+    pub fn look(path: &'p Path) -> Option<Self> {
+        let bytes = lads_host::input::read(path).ok()?;
+        let survey = lads_compiler::survey(&bytes).ok()?;
+        (!survey.missing.is_empty()).then_some(Self { path, survey })
+    }
+
+    /// Everything as one JSON object.
+    pub fn json(&self) -> Value {
+        let Survey {
+            opset,
+            producer,
+            nodes,
+            inputs,
+            outputs,
+            metadata,
+            missing,
+        } = &self.survey;
+        let edge = |value: &Edge| json!({ "name": value.name, "dtype": value.dtype, "shape": value.shape });
+        json!({
+            "file": self.path.display().to_string(),
+            "form": "onnx",
+            "opset": opset,
+            "producer": producer,
+            "nodes": nodes,
+            "inputs": inputs.iter().map(edge).collect::<Vec<_>>(),
+            "outputs": outputs.iter().map(edge).collect::<Vec<_>>(),
+            "metadata": metadata,
+            "missing": missing_json(missing),
+        })
+    }
+}
+
+fn missing_json(missing: &Missing) -> Value {
+    let operand = |operand: &Operand| json!({ "name": operand.name, "shape": operand.shape });
+    let operators = missing.operators.iter().map(|node| {
+        json!({
+            "operator": node.operator,
+            "node": node.node,
+            "inputs": node.inputs.iter().map(operand).collect::<Vec<_>>(),
+            "problem": node.problem,
+        })
+    });
+    let fields = (missing.contract.iter())
+        .map(|field| json!({ "field": field.field, "needed": field.needed }));
+    json!({
+        "operators": operators.collect::<Vec<_>>(),
+        "contract": fields.collect::<Vec<_>>(),
+    })
+}
+
+impl Display for Foreign<'_> {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        let survey = &self.survey;
+        let opset = survey.opset.map(|set| format!(", operator set {set}"));
+        writeln!(
+            f,
+            "{}: an ONNX model that is no policy yet{}, {} nodes",
+            self.path.display(),
+            opset.unwrap_or_default(),
+            survey.nodes
+        )?;
+        for (what, values) in [("input", &survey.inputs), ("output", &survey.outputs)] {
+            for Edge { name, dtype, shape } in values {
+                writeln!(f, "  {what:<6} {name}: {dtype} [{}]", shape.join(", "))?;
+            }
+        }
+        let Missing {
+            operators,
+            contract,
+        } = &survey.missing;
+        writeln!(f, "\noperators that are missing ({})", operators.len())?;
+        for Operator {
+            operator,
+            node,
+            inputs,
+            problem,
+        } in operators
+        {
+            let read = inputs.iter();
+            let read: Vec<_> = read
+                .map(|Operand { name, shape }| format!("{name} {shape}"))
+                .collect();
+            writeln!(f, "  {operator} `{node}` of {}: {problem}", read.join(", "))?;
+        }
+        writeln!(
+            f,
+            "\nwhat a contract has to say and nothing here does ({})",
+            contract.len()
+        )?;
+        for field in contract {
+            writeln!(f, "  {}: {}", field.field, field.needed)?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,242 @@
+//! What is observed in one control step, as a line of numbers and as values of channels.
+//!
+//! Invariant: there are as many values as the observation channels have elements, one channel behind the other. What can fail: a line
+//! that is none, or a number that is no value of its channel's type; the message names channel and element.
+
+use lads_core::{Channel, ChannelId, Contract, DType, Data, InputError};
+
+use crate::line::{self, Form, LineError};
+
+/// The observation channels of a policy and their values.
+pub struct Seen {
+    channels: Vec<Values>,
+    /// All values as they were read.
+    numbers: Vec<f32>,
+}
+
+/// The values of one channel.
+struct Values {
+    id: ChannelId,
+    name: String,
+    /// Names of the elements; none for images and the like.
+    elements: Vec<String>,
+    held: Held,
+}
+
+enum Held {
+    F32(Vec<f32>),
+    U8(Vec<u8>),
+    I32(Vec<i32>),
+}
+
+impl Seen {
+    /// Zeros for the observation channels of a policy.
+    pub fn of(contract: &Contract) -> Self {
+        let channels: Vec<Values> = contract
+            .observations()
+            .map(|channel| Values::of(&channel))
+            .collect();
+        let numbers = vec![0.0; channels.iter().map(|values| values.held.len()).sum()];
+        Self { channels, numbers }
+    }
+
+    /// Elements of all channels.
+    pub fn len(&self) -> usize {
+        self.numbers.len()
+    }
+
+    /// Takes the values of a line.
+    pub fn read(&mut self, text: &str) -> Result<Form, String> {
+        let form = line::parse(text, &mut self.numbers).map_err(|error| match error {
+            LineError::NotANumber { position, .. } | LineError::NotFinite { position, .. } => {
+                format!("{error} ({})", self.at(position - 1))
+            }
+            other => other.to_string(),
+        })?;
+        let mut rest = &self.numbers[..];
+        let mut place = 0;
+        for values in &mut self.channels {
+            let (own, behind) = rest.split_at(values.held.len());
+            rest = behind;
+            if let Err(element) = values.held.take(own) {
+                let (value, dtype) = (own[element], values.held.dtype());
+                place += element;
+                let at = self.at(place);
+                return Err(format!("value {} is {value}, no {dtype} ({at})", place + 1));
+            }
+            place += own.len();
+        }
+        Ok(form)
+    }
+
+    /// The values, channel by channel.
+    pub fn given(&self) -> Vec<(ChannelId, Data<'_>)> {
+        fn data(held: &Held) -> Data<'_> {
+            match held {
+                Held::F32(values) => Data::F32(values),
+                Held::U8(values) => Data::U8(values),
+                Held::I32(values) => Data::I32(values),
+            }
+        }
+        let all = self.channels.iter();
+        all.map(|values| (values.id, data(&values.held))).collect()
+    }
+
+    /// Channel and element of the value at a place.
+    fn at(&self, mut place: usize) -> String {
+        for values in &self.channels {
+            if place < values.held.len() {
+                return values.element(place);
+            }
+            place -= values.held.len();
+        }
+        String::new()
+    }
+
+    /// What the controller does not take, with the names of channel and element.
+    pub fn refused(&self, error: &InputError) -> String {
+        let found = (self.channels.iter()).find(|values| values.id.0 == error.channel());
+        let Some((values, element)) = found.zip(error.element()) else {
+            return error.to_string();
+        };
+        let at = values.element(element);
+        match error {
+            InputError::OutOfLimits {
+                value, min, max, ..
+            } => format!("{at} is {value}, its limits are {min} to {max}"),
+            _ => format!("{at} is not finite"),
+        }
+    }
+}
+
+impl Values {
+    fn of(channel: &Channel<'_>) -> Self {
+        let len = channel.len();
+        Self {
+            id: channel.id(),
+            name: channel.name().to_owned(),
+            elements: (channel.elements())
+                .map(|element| element.name.to_owned())
+                .collect(),
+            held: match channel.dtype() {
+                DType::F32 => Held::F32(vec![0.0; len]),
+                DType::U8 => Held::U8(vec![0; len]),
+                DType::I32 => Held::I32(vec![0; len]),
+            },
+        }
+    }
+
+    /// Element `i` by its names.
+    fn element(&self, i: usize) -> String {
+        let name = self.elements.get(i).map(|name| format!(" `{name}`"));
+        let name = name.unwrap_or_default();
+        format!("channel `{}`, element {i}{name}", self.name)
+    }
+}
+
+impl Held {
+    fn len(&self) -> usize {
+        match self {
+            Self::F32(values) => values.len(),
+            Self::U8(values) => values.len(),
+            Self::I32(values) => values.len(),
+        }
+    }
+
+    fn dtype(&self) -> &'static str {
+        match self {
+            Self::F32(_) => "number",
+            Self::U8(_) => "byte",
+            Self::I32(_) => "integer of 32 bits",
+        }
+    }
+
+    /// Takes values over; the first that is none of the type is an error.
+    fn take(&mut self, from: &[f32]) -> Result<(), usize> {
+        let whole = |value: f32, min: f64, max: f64| {
+            value.fract() == 0.0 && (min..=max).contains(&f64::from(value))
+        };
+        for (i, &value) in from.iter().enumerate() {
+            match self {
+                Self::F32(values) => values[i] = value,
+                Self::U8(values) => {
+                    if !whole(value, 0.0, 255.0) {
+                        return Err(i);
+                    }
+                    values[i] = value as u8;
+                }
+                Self::I32(values) => {
+                    if !whole(value, i32::MIN.into(), i32::MAX.into()) {
+                        return Err(i);
+                    }
+                    values[i] = value as i32;
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn channel(id: u32, name: &str, elements: &[&str], held: Held) -> Values {
+        Values {
+            id: ChannelId(id),
+            name: name.into(),
+            elements: elements.iter().map(ToString::to_string).collect(),
+            held,
+        }
+    }
+
+    fn seen() -> Seen {
+        Seen {
+            channels: vec![
+                channel(0, "joints", &["hip", "knee"], Held::F32(vec![0.0; 2])),
+                channel(2, "camera", &[], Held::U8(vec![0; 2])),
+                channel(3, "mode", &[], Held::I32(vec![0])),
+            ],
+            numbers: vec![0.0; 5],
+        }
+    }
+
+    #[test]
+    fn a_line_is_split_among_the_channels() {
+        let mut seen = seen();
+        assert_eq!(seen.read("0.5,-1,255,0,-7"), Ok(Form::Csv));
+        let given = seen.given();
+        assert_eq!(given[0], (ChannelId(0), Data::F32(&[0.5, -1.0])));
+        assert_eq!(given[1], (ChannelId(2), Data::U8(&[255, 0])));
+        assert_eq!(given[2], (ChannelId(3), Data::I32(&[-7])));
+    }
+
+    #[test]
+    fn mistakes_name_channel_and_element() {
+        let mut seen = seen();
+        let mut error = |line| seen.read(line).unwrap_err();
+        assert_eq!(
+            error("0,nan,0,0,0"),
+            "value 2 is 'nan', not finite (channel `joints`, element 1 `knee`)"
+        );
+        assert_eq!(
+            error("0,0,0,256,0"),
+            "value 4 is 256, no byte (channel `camera`, element 1)"
+        );
+        assert_eq!(
+            error("0,0,0,0,0.5"),
+            "value 5 is 0.5, no integer of 32 bits (channel `mode`, element 0)"
+        );
+        let beyond = InputError::OutOfLimits {
+            channel: 0,
+            index: 1,
+            value: 9.0,
+            min: -1.0,
+            max: 1.0,
+        };
+        assert_eq!(
+            seen.refused(&beyond),
+            "channel `joints`, element 1 `knee` is 9, its limits are -1 to 1"
+        );
+    }
+}

@@ -1,0 +1,41 @@
+//! The references that ship: they can be read, are what their own contracts say, and record all that is compared.
+
+use std::path::Path;
+
+use lads_proof::reference::{Reference, Subject};
+
+#[test]
+fn shipped_references_are_whole() {
+    for (name, environment) in [("kitchen", "franka-kitchen"), ("lorel", "lorel-table")] {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join("../../models")
+            .join(format!("{name}.reference.json"));
+        let reference = Reference::open(&path).unwrap();
+        let contract = reference.contract.as_ref().unwrap();
+        let channels = contract["channels"].as_array().unwrap();
+        let lens = ["observation", "action"].map(|role| {
+            let channel = channels.iter().find(|channel| channel["role"] == role);
+            channel.unwrap()["shape"][0].as_u64().unwrap() as usize
+        });
+        let subject = Subject {
+            contract: "",
+            instructions: reference
+                .instructions
+                .iter()
+                .map(|row| row.text.as_str())
+                .collect(),
+            environment_id: environment,
+            environment_version: "1",
+            observation_len: lens[0],
+            action_len: lens[1],
+        };
+        reference.check(&subject).unwrap();
+        assert!(reference.float_noise.is_some());
+        let episodes = reference.instructions.iter().flat_map(|row| &row.episodes);
+        let mut traces = episodes.filter_map(|episode| Some((episode, episode.trace.as_ref()?)));
+        assert!(traces.all(|(episode, trace)| {
+            let encoded = trace.encoded.as_ref().map_or(0, Vec::len);
+            !trace.logits.is_empty() && encoded == episode.steps / reference.horizon
+        }));
+    }
+}
