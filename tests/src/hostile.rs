@@ -6,11 +6,13 @@
 
 use std::sync::OnceLock;
 
-use lads_compiler::{Bundle, CacheFormat, Memory, Options, WeightFormat, compile, compile_with};
-use lads_core::image::{CRC_WORD, crc32};
-use lads_core::{GuardConfig, GuardedController, Instruction, Policy, Tick};
+use lads_compiler::{Bundle, CacheFormat, Image, Options, WeightFormat, compile, compile_with};
+use lads_core::{ChannelId, DType, Data, GuardConfig, GuardedController, Instruction, Policy, Tick};
+use lads_host::Memory;
+use lads_image::format::{CRC_WORD, crc32};
 
-use crate::wire;
+use crate::episode::{FOLDER, KINDS, folder};
+use crate::{compiled, wire};
 
 /// Bytes of one edit.
 const EDIT_BYTES: usize = 8;
@@ -70,10 +72,15 @@ fn script(bytes: &[u8]) -> impl Iterator<Item = Edit> {
 /// The small bundle.
 const TINY: &[u8] = include_bytes!("../../runtime/compiler/tests/data/tiny.onnx");
 
-/// The small bundle's images: exact, and with weights and cache of fewer bits.
-fn tiny_images() -> &'static [Vec<u32>; 2] {
-    static IMAGES: OnceLock<[Vec<u32>; 2]> = OnceLock::new();
+/// The images that are edited: the small bundle's, exact and with weights and cache of fewer bits, and where the parity tests have
+/// made them, one of every family.
+fn images() -> &'static [Vec<u32>] {
+    static IMAGES: OnceLock<Vec<Vec<u32>>> = OnceLock::new();
     IMAGES.get_or_init(|| {
+        let words = |image: &Image| {
+            let (words, _) = image.as_bytes().as_chunks::<4>();
+            words.iter().map(|&word| u32::from_le_bytes(word)).collect()
+        };
         let bundle = Bundle::from_bytes(TINY).expect("the bundle is sound");
         let smaller = Options {
             weights: WeightFormat::Int8,
@@ -82,11 +89,15 @@ fn tiny_images() -> &'static [Vec<u32>; 2] {
             force: true,
             ..Options::default()
         };
-        [Options::default(), smaller].map(|options| {
-            let image = compile_with(&bundle, options).expect("it compiles");
-            let (words, _) = image.as_bytes().as_chunks::<4>();
-            words.iter().map(|&word| u32::from_le_bytes(word)).collect()
-        })
+        let mut images: Vec<Vec<u32>> = [Options::default(), smaller]
+            .iter()
+            .map(|&options| words(&compile_with(&bundle, options).expect("it compiles")))
+            .collect();
+        if std::env::var_os(FOLDER).is_some() {
+            let family = |kind| words(&compiled(&folder().join(format!("{kind}.onnx"))));
+            images.extend(KINDS.into_iter().map(family));
+        }
+        images
     })
 }
 
@@ -96,8 +107,8 @@ fn tiny_images() -> &'static [Vec<u32>; 2] {
 ///
 /// When anything panics, or an action is not finite.
 pub fn image(edits: &[u8]) {
-    let which = edits.len() % 2;
-    let mut words = tiny_images()[which].clone();
+    let images = images();
+    let mut words = images[edits.len() % images.len()].clone();
     let mut len = words.len() * 4;
     for Edit { kind, place, value } in script(edits) {
         // The tables come first: most edits go there.
@@ -126,8 +137,32 @@ pub fn image(edits: &[u8]) {
     open_and_drive(&bytes);
 }
 
+/// The most multiply-adds of a step that these tests wait for; a policy that wants more is refused when it is opened.
+const MOST_WORK: u64 = 1 << 24;
+
+/// The values of an observation channel, in memory of their own.
+enum Values {
+    F32(Vec<f32>),
+    U8(Vec<u8>),
+    I32(Vec<i32>),
+}
+
+impl Values {
+    fn data(&self) -> Data<'_> {
+        match self {
+            Self::F32(values) => Data::F32(values),
+            Self::U8(values) => Data::U8(values),
+            Self::I32(values) => Data::I32(values),
+        }
+    }
+}
+
 /// Opens an image and drives what opens through a guard.
-fn open_and_drive(bytes: &[u8]) {
+///
+/// # Panics
+///
+/// When anything panics, or an action is outside the limits.
+pub fn open_and_drive(bytes: &[u8]) {
     // In memory that is aligned as images have to be, and not a byte longer.
     let mut aligned = vec![0_u64; bytes.len().div_ceil(8)];
     for (to, from) in aligned.iter_mut().zip(bytes.chunks(8)) {
@@ -136,18 +171,17 @@ fn open_and_drive(bytes: &[u8]) {
         *to = u64::from_ne_bytes(word);
     }
     let aligned: &[u8] = bytemuck::cast_slice(&aligned);
-    let Ok(policy) = Policy::new_checked(&aligned[..bytes.len()]) else {
+    let Ok(policy) = Policy::new_within(&aligned[..bytes.len()], MOST_WORK) else {
         return;
     };
     policy.checksum_matches();
     let contract = policy.contract();
-    let elements = contract
-        .observation_len()
-        .saturating_add(contract.action_len());
+    let observed = contract.observations().map(|channel| channel.len());
+    let elements = observed.fold(contract.action_len(), usize::saturating_add);
     let lens = [policy.arena_len(), policy.state_len(), elements];
     if lens.iter().any(|&len| len > MOST_ELEMENTS) {
         let bytes = lens[0].saturating_add(lens[1]).saturating_mul(4);
-        let refused = bytes > Memory::MOST_BYTES;
+        let refused = bytes > Policy::MEMORY_LIMIT;
         assert!(!refused || Memory::of(&policy).is_err(), "{bytes}");
         return;
     }
@@ -161,11 +195,25 @@ fn open_and_drive(bytes: &[u8]) {
     let _ = guarded.self_test();
     guarded.arm_untested();
     let middle = |min: f32, max: f32| min / 2.0 + max / 2.0;
-    let observation: Vec<_> = contract
+    let observations: Vec<(ChannelId, Values)> = contract
         .observations()
-        .map(|e| middle(e.limits.min, e.limits.max))
+        .map(|channel| {
+            let middles = channel
+                .limits()
+                .map(|limits| middle(limits.min, limits.max));
+            let values = match channel.dtype() {
+                DType::F32 => Values::F32(middles.collect()),
+                DType::U8 => Values::U8(middles.map(|x| x as u8).collect()),
+                DType::I32 => Values::I32(middles.map(|x| x as i32).collect()),
+            };
+            (channel.id(), values)
+        })
         .collect();
-    let limits: Vec<_> = contract.actions().collect();
+    let inputs: Vec<(ChannelId, Data)> = observations
+        .iter()
+        .map(|(id, values)| (*id, values.data()))
+        .collect();
+    let limits: Vec<_> = contract.action_limits().collect();
     let mut action = vec![0.0; contract.action_len()];
     for number in 0..2 {
         let _ = guarded.set_instruction(Instruction::Id(number));
@@ -174,15 +222,15 @@ fn open_and_drive(bytes: &[u8]) {
                 timestamp,
                 missed: 0,
             };
-            let _ = guarded.step(
-                &observation,
+            let _ = guarded.step_with(
+                &inputs,
                 Some(tick).filter(|_| number == 0),
                 &mut action,
             );
             let inside = action
                 .iter()
                 .zip(&limits)
-                .all(|(x, e)| x.is_finite() && e.limits.clamp(*x) == *x);
+                .all(|(x, e)| x.is_finite() && e.clamp(*x) == *x);
             assert!(inside, "{action:?}");
             guarded.resume();
         }
