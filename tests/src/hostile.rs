@@ -6,9 +6,10 @@
 
 use std::sync::OnceLock;
 
-use lads_compiler::{Bundle, CacheFormat, Memory, Options, WeightFormat, compile, compile_with};
-use lads_core::image::{CRC_WORD, crc32};
+use lads_compiler::{Bundle, CacheFormat, Options, WeightFormat, compile, compile_with};
 use lads_core::{GuardConfig, GuardedController, Instruction, Policy, Tick};
+use lads_host::Memory;
+use lads_image::format::{CRC_WORD, crc32};
 
 use crate::wire;
 
@@ -147,7 +148,7 @@ fn open_and_drive(bytes: &[u8]) {
     let lens = [policy.arena_len(), policy.state_len(), elements];
     if lens.iter().any(|&len| len > MOST_ELEMENTS) {
         let bytes = lens[0].saturating_add(lens[1]).saturating_mul(4);
-        let refused = bytes > Memory::MOST_BYTES;
+        let refused = bytes > Policy::MEMORY_LIMIT;
         assert!(!refused || Memory::of(&policy).is_err(), "{bytes}");
         return;
     }
@@ -161,11 +162,11 @@ fn open_and_drive(bytes: &[u8]) {
     let _ = guarded.self_test();
     guarded.arm_untested();
     let middle = |min: f32, max: f32| min / 2.0 + max / 2.0;
-    let observation: Vec<_> = contract
-        .observations()
-        .map(|e| middle(e.limits.min, e.limits.max))
+    let observation = contract.observation().limits();
+    let observation: Vec<_> = observation
+        .map(|limits| middle(limits.min, limits.max))
         .collect();
-    let limits: Vec<_> = contract.actions().collect();
+    let limits: Vec<_> = contract.action_limits().collect();
     let mut action = vec![0.0; contract.action_len()];
     for number in 0..2 {
         let _ = guarded.set_instruction(Instruction::Id(number));
@@ -182,7 +183,7 @@ fn open_and_drive(bytes: &[u8]) {
             let inside = action
                 .iter()
                 .zip(&limits)
-                .all(|(x, e)| x.is_finite() && e.limits.clamp(*x) == *x);
+                .all(|(x, limits)| x.is_finite() && limits.clamp(*x) == *x);
             assert!(inside, "{action:?}");
             guarded.resume();
         }
