@@ -64,7 +64,7 @@ fn read(file: &Value) -> Reference {
 fn own() -> Replay {
     let replies = (0..STEPS).map(|step| Reply {
         decided: step.is_multiple_of(HORIZON),
-        plan: PLANS[step / HORIZON],
+        plan: Some(PLANS[step / HORIZON]),
         logits: if step.is_multiple_of(HORIZON) {
             LOGITS[step / HORIZON].to_vec()
         } else {
@@ -149,7 +149,7 @@ fn a_consistent_renumbering_of_the_plans_is_harmless() {
     let number = |plan: u32| [2, 0, 1][plan as usize];
     let renumber = |replay: &mut Replay| {
         for reply in &mut replay.replies {
-            reply.plan = number(reply.plan);
+            reply.plan = reply.plan.map(number);
             if let [a, b, c] = reply.logits[..] {
                 reply.logits = vec![b, c, a];
             }

@@ -84,11 +84,7 @@ pub fn check(
     contract: &Contract,
     environment: &dyn Environment,
 ) -> Result<Vec<Vec<usize>>, Misfit> {
-    same_text(
-        "environment.id",
-        &contract.environment.id,
-        environment.id(),
-    )?;
+    same_text("environment.id", &contract.environment.id, environment.id())?;
     same_text(
         "environment.version",
         &contract.environment.version,
