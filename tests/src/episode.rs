@@ -91,11 +91,11 @@ impl Episode {
     ///
     /// When it cannot be read, or misses something.
     pub fn open(path: &Path, policy: &Policy) -> Self {
-        let bytes = std::fs::read(path).unwrap_or_else(|error| panic!("{path:?}: {error}"));
+        let bytes = std::fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
         let tensors = SafeTensors::deserialize(&bytes).expect("it is a safetensors file");
         let tensor = |name: &str| {
             let found = tensors.tensor(name);
-            found.unwrap_or_else(|error| panic!("{path:?}: {name}: {error}"))
+            found.unwrap_or_else(|error| panic!("{}: {name}: {error}", path.display()))
         };
         let channels = policy.contract().observations().map(|channel| {
             let recorded = tensor(&format!("channel.{}", channel.name()));
