@@ -7,7 +7,9 @@
 use std::sync::OnceLock;
 
 use lads_compiler::{Bundle, CacheFormat, Image, Options, WeightFormat, compile, compile_with};
-use lads_core::{ChannelId, DType, Data, GuardConfig, GuardedController, Instruction, Policy, Tick};
+use lads_core::{
+    ChannelId, DType, Data, GuardConfig, GuardedController, Instruction, Policy, Tick,
+};
 use lads_host::Memory;
 use lads_image::format::{CRC_WORD, crc32};
 
@@ -157,12 +159,25 @@ impl Values {
     }
 }
 
-/// Opens an image and drives what opens through a guard.
+/// Opens an image and drives what opens through a guard: the self-test, then steps of two instructions.
 ///
 /// # Panics
 ///
 /// When anything panics, or an action is outside the limits.
 pub fn open_and_drive(bytes: &[u8]) {
+    drive(bytes, true, 12);
+}
+
+/// Opens an image and takes what opens a few steps far, as [`open_and_drive`] does, without the self-test: for very many images.
+///
+/// # Panics
+///
+/// When anything panics, or an action is outside the limits.
+pub fn open_and_step(bytes: &[u8]) {
+    drive(bytes, false, 3);
+}
+
+fn drive(bytes: &[u8], tested: bool, steps: u64) {
     // In memory that is aligned as images have to be, and not a byte longer.
     let mut aligned = vec![0_u64; bytes.len().div_ceil(8)];
     for (to, from) in aligned.iter_mut().zip(bytes.chunks(8)) {
@@ -192,7 +207,9 @@ pub fn open_and_drive(bytes: &[u8]) {
         .expect("there is as much as it asks for");
     let mut guarded = GuardedController::new(controller, &GuardConfig::default(), &mut guard)
         .expect("the contract's own limits are sound");
-    let _ = guarded.self_test();
+    if tested {
+        let _ = guarded.self_test();
+    }
     guarded.arm_untested();
     let middle = |min: f32, max: f32| min / 2.0 + max / 2.0;
     let observations: Vec<(ChannelId, Values)> = contract
@@ -217,16 +234,12 @@ pub fn open_and_drive(bytes: &[u8]) {
     let mut action = vec![0.0; contract.action_len()];
     for number in 0..2 {
         let _ = guarded.set_instruction(Instruction::Id(number));
-        for timestamp in 0..12 {
+        for timestamp in 0..steps {
             let tick = Tick {
                 timestamp,
                 missed: 0,
             };
-            let _ = guarded.step_with(
-                &inputs,
-                Some(tick).filter(|_| number == 0),
-                &mut action,
-            );
+            let _ = guarded.step_with(&inputs, Some(tick).filter(|_| number == 0), &mut action);
             let inside = action
                 .iter()
                 .zip(&limits)

@@ -86,7 +86,10 @@ fn a_controller_that_was_used_answers_like_a_fresh_one() {
         let mut episode = |controller: &mut lads_core::Controller<'_, '_>| {
             let step = |observation: &&[f32]| {
                 let report = controller.step(observation, &mut action).unwrap();
-                (report.selected.map(|selected| selected.index), action.clone())
+                (
+                    report.selected.map(|selected| selected.index),
+                    action.clone(),
+                )
             };
             observations[..50.min(observations.len())]
                 .iter()

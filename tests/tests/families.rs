@@ -11,7 +11,7 @@ use lads_core::{Isa, Policy};
 use lads_host::Memory;
 use lads_image::format::{CRC_WORD, HEADER_WORDS, TABLE_WORD, Tag, crc32};
 use lads_tests::episode::{Episode, KINDS, folder};
-use lads_tests::hostile::open_and_drive;
+use lads_tests::hostile::{open_and_drive, open_and_step};
 
 #[path = "common/counting.rs"]
 mod counting;
@@ -47,20 +47,25 @@ fn replay(kind: &str) {
     let mut action = vec![0.0; contract.action_len()];
     let mut restarts = 0;
     let inputs = episode.inputs(true);
-    episode.drive(&mut controller, &inputs, &mut action, |step, report, action| {
-        restarts += usize::from(episode.events[step] == -1 && step > 0 && report.timestep == 0);
-        let index = report.selected.map_or(-1, |found| i64::from(found.index));
-        let wanted = episode.selected[step];
-        assert_eq!(index, wanted, "{kind}, step {step}: selected index");
-        let wanted = &episode.actions[step * action.len()..];
-        for (i, (&got, &wanted)) in action.iter().zip(wanted).enumerate() {
-            let near = (got - wanted).abs() <= TOLERANCE;
-            assert!(
-                near,
-                "{kind}, step {step}, element {i}: {got}, ONNX Runtime gives {wanted}"
-            );
-        }
-    });
+    episode.drive(
+        &mut controller,
+        &inputs,
+        &mut action,
+        |step, report, action| {
+            restarts += usize::from(episode.events[step] == -1 && step > 0 && report.timestep == 0);
+            let index = report.selected.map_or(-1, |found| i64::from(found.index));
+            let wanted = episode.selected[step];
+            assert_eq!(index, wanted, "{kind}, step {step}: selected index");
+            let wanted = &episode.actions[step * action.len()..];
+            for (i, (&got, &wanted)) in action.iter().zip(wanted).enumerate() {
+                let near = (got - wanted).abs() <= TOLERANCE;
+                assert!(
+                    near,
+                    "{kind}, step {step}, element {i}: {got}, ONNX Runtime gives {wanted}"
+                );
+            }
+        },
+    );
     assert!(episode.steps() >= 200, "{kind}: {} steps", episode.steps());
     let instructions: HashSet<_> = episode.events.iter().filter(|&&event| event >= 0).collect();
     if contract.instruction_channel().is_some() {
@@ -80,10 +85,15 @@ fn bits(policy: &Policy, isa: Isa, with_noise: bool, episode: &Episode) -> Vec<(
         .expect("it was made for it");
     let mut action = vec![0.0; policy.contract().action_len()];
     let (inputs, mut seen) = (episode.inputs(with_noise), vec![]);
-    episode.drive(&mut controller, &inputs, &mut action, |_, report, action| {
-        let index = report.selected.map_or(-1, |found| i64::from(found.index));
-        seen.push((index, action.iter().map(|x| x.to_bits()).collect()));
-    });
+    episode.drive(
+        &mut controller,
+        &inputs,
+        &mut action,
+        |_, report, action| {
+            let index = report.selected.map_or(-1, |found| i64::from(found.index));
+            seen.push((index, action.iter().map(|x| x.to_bits()).collect()));
+        },
+    );
     seen
 }
 
@@ -157,7 +167,7 @@ fn damaged(kind: &str) {
         let mut bytes = whole.to_vec();
         bytes[at] ^= 1 << (at % 8);
         sealed(&mut bytes);
-        let survived = std::panic::catch_unwind(|| open_and_drive(&bytes));
+        let survived = std::panic::catch_unwind(|| open_and_step(&bytes));
         assert!(survived.is_ok(), "{kind}: byte {at}");
         flipped += 1;
     }

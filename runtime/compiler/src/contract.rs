@@ -333,9 +333,10 @@ impl Contract {
         let channels = self.channels.iter().map(|channel| channel.name.as_str());
         distinct("states", "name", names.clone())?;
         distinct("channels and states", "name", channels.chain(names))?;
+        // Before the context, whose length is a multiple of the family's period.
+        self.family.check(self)?;
         self.check_context()?;
-        self.check_instructions()?;
-        self.family.check(self)
+        self.check_instructions()
     }
 
     fn check_channels(&self) -> Result<(), String> {

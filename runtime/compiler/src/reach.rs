@@ -87,7 +87,10 @@ impl Reach {
 
 fn ring_rows(blueprint: &Blueprint, ring: &str) -> usize {
     let mut states = blueprint.states.iter();
-    match states.find(|state| state.name == ring).map(|state| state.keep) {
+    match states
+        .find(|state| state.name == ring)
+        .map(|state| state.keep)
+    {
         Some(Keep::Ring { rows, .. }) => rows,
         _ => 0,
     }

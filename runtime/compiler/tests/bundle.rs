@@ -110,7 +110,10 @@ fn image_says_what_the_contract_says() {
     assert_eq!(got.context_steps(), Some(context.steps));
     assert_eq!(got.channels().count(), wanted.channels.len());
     for (channel, known) in got.channels().zip(&wanted.channels) {
-        assert_eq!((channel.name(), channel.len()), (known.name.as_str(), known.len()));
+        assert_eq!(
+            (channel.name(), channel.len()),
+            (known.name.as_str(), known.len())
+        );
         assert_eq!(channel.reference(), known.reference);
         assert_eq!(channel.elements().count(), known.elements.len());
         for (element, known) in channel.elements().zip(&known.elements) {
@@ -269,7 +272,11 @@ fn contracts_that_miss_or_contradict_something_are_refused() {
 fn a_channel_of_another_shape_names_itself_and_the_value() {
     refused(
         &edited("\"shape\": [4, 5]", "\"shape\": [4, 6]"),
-        &["trajectory_encoder/encode/observations", "[1, 4, 5]", "[1, 4, 6]"],
+        &[
+            "trajectory_encoder/encode/observations",
+            "[1, 4, 5]",
+            "[4, 6]",
+        ],
     );
 }
 
@@ -290,14 +297,26 @@ fn every_field_is_refused_by_its_name() {
     Contract::parse(&contract().to_string()).expect("the contract itself is sound");
     let broken: &[Broken] = &[
         (|c| c["family"]["kind"] = "lasd".into(), &["lasd"]),
-        (|c| c["family"]["codebook"]["dim"] = 0.into(), &["`family.codebook.dim` is 0"]),
+        (
+            |c| c["family"]["codebook"]["dim"] = 0.into(),
+            &["`family.codebook.dim` is 0"],
+        ),
         (
             |c| c["family"]["decision"]["temperature"] = 0.0.into(),
             &["`family.decision.temperature` is 0"],
         ),
-        (|c| c["family"]["decision"]["rule"] = "guess".into(), &["guess"]),
-        (|c| c["control_period_s"] = 0.0.into(), &["`control_period_s` is 0"]),
-        (|c| c["channels"] = serde_json::json!([]), &["`channels`", "0 observations"]),
+        (
+            |c| c["family"]["decision"]["rule"] = "guess".into(),
+            &["guess"],
+        ),
+        (
+            |c| c["control_period_s"] = 0.0.into(),
+            &["`control_period_s` is 0"],
+        ),
+        (
+            |c| c["channels"] = serde_json::json!([]),
+            &["`channels`", "0 observations"],
+        ),
         (
             |c| drop(c["channels"].as_array_mut().unwrap().pop()),
             &["`channels`", "0 actions"],
@@ -332,11 +351,20 @@ fn every_field_is_refused_by_its_name() {
             |c| c["channels"][4]["elements"][0]["scale"] = 1e39.into(),
             &["channels[4].elements[0]"],
         ),
-        (|c| c["context"]["steps"] = 0.into(), &["`context.steps` is 0"]),
-        (|c| c["context"]["words"] = 7.into(), &["`context.words` is not"]),
+        (
+            |c| c["context"]["steps"] = 0.into(),
+            &["`context.steps` is 0"],
+        ),
+        (
+            |c| c["context"]["words"] = 7.into(),
+            &["`context.words` is not"],
+        ),
         (|c| c["context"]["beyond"] = "stop".into(), &["stop"]),
         (|c| c["context"] = serde_json::Value::Null, &["`context`"]),
-        (|c| c["instructions"] = serde_json::json!([]), &["`instructions` has 0"]),
+        (
+            |c| c["instructions"] = serde_json::json!([]),
+            &["`instructions` has 0"],
+        ),
         (
             |c| c["instructions"][1]["id"] = "dl".into(),
             &["instructions[1].id", "repeats \"dl\""],
@@ -346,11 +374,24 @@ fn every_field_is_refused_by_its_name() {
             &["`instructions[1].text` is empty"],
         ),
         (|c| c["language"] = serde_json::Value::Null, &["`language`"]),
-        (|c| c["language"]["dim"] = 9.into(), &["`language.dim` is 9"]),
-        (|c| c["network"] = serde_json::Value::Null, &["`network`"]),
-        (|c| c["network"]["heads"] = 0.into(), &["`network.heads` is 0"]),
         (
-            |c| drop(c["evaluation"]["instructions"].as_array_mut().unwrap().pop()),
+            |c| c["language"]["dim"] = 9.into(),
+            &["`language.dim` is 9"],
+        ),
+        (|c| c["network"] = serde_json::Value::Null, &["`network`"]),
+        (
+            |c| c["network"]["heads"] = 0.into(),
+            &["`network.heads` is 0"],
+        ),
+        (
+            |c| {
+                drop(
+                    c["evaluation"]["instructions"]
+                        .as_array_mut()
+                        .unwrap()
+                        .pop(),
+                )
+            },
             &["`evaluation.instructions` has 3"],
         ),
         (
@@ -366,10 +407,15 @@ fn every_field_is_refused_by_its_name() {
             &["`states[0].rows` is 0"],
         ),
         (
-            |c| c["states"] = serde_json::json!([{"name": "r", "kind": "ring", "rows": 2, "source": "action"}]),
+            |c| {
+                c["states"] = serde_json::json!([{"name": "r", "kind": "ring", "rows": 2, "source": "action"}])
+            },
             &["`states[0].source` is \"action\""],
         ),
-        (|c| drop(c.as_object_mut().unwrap().remove("provenance")), &["`provenance`"]),
+        (
+            |c| drop(c.as_object_mut().unwrap().remove("provenance")),
+            &["`provenance`"],
+        ),
     ];
     for (number, (edit, parts)) in broken.iter().enumerate() {
         let mut contract = contract();
@@ -379,7 +425,10 @@ fn every_field_is_refused_by_its_name() {
         };
         let message = error.to_string();
         for part in *parts {
-            assert!(message.contains(part), "case {number}: \"{message}\" does not say {part:?}");
+            assert!(
+                message.contains(part),
+                "case {number}: \"{message}\" does not say {part:?}"
+            );
         }
         assert!(!message.contains('\n'), "{message}");
     }
@@ -409,7 +458,9 @@ fn a_context_of_one_step_compiles_and_runs() {
     let (mut arena, mut state) = (vec![0.0; policy.arena_len()], vec![0.0; policy.state_len()]);
     let workspace = Workspace::new(&policy, &mut arena, &mut state).expect("enough memory");
     let mut controller = Controller::new(policy, workspace);
-    controller.set_instruction(Instruction::Id(0)).expect("a known instruction");
+    controller
+        .set_instruction(Instruction::Id(0))
+        .expect("a known instruction");
     let mut action = [0.0; 3];
     for _ in 0..3 {
         let report = controller.step(&[0.1; 5], &mut action).expect("a step");
@@ -422,7 +473,10 @@ fn more_steps_than_the_table_of_timesteps_has_rows_are_refused() {
     let bundle = Bundle::from_bytes(&edited("\"steps\": 24", "\"steps\": 28")).unwrap();
     let message = compile(&bundle).unwrap_err().to_string();
     for part in ["high_level", "timestep", "24 rows", "`context.steps`", "28"] {
-        assert!(message.contains(part), "\"{message}\" does not say {part:?}");
+        assert!(
+            message.contains(part),
+            "\"{message}\" does not say {part:?}"
+        );
     }
     assert!(!message.contains('\n'), "{message}");
 }
@@ -440,7 +494,11 @@ fn a_contract_may_say_which_sentences_are_followed() {
         "similarity": "alignment", "threshold": 0.608, "accepted_known": 0.925, "accepted_other": 0.1125
     });
     let read = with_acceptance(acceptance.clone()).unwrap();
-    let read = read.language.expect("a language").acceptance.expect("it says so");
+    let read = read
+        .language
+        .expect("a language")
+        .acceptance
+        .expect("it says so");
     assert_eq!(read.similarity, Similarity::Alignment);
     assert!((read.threshold - 0.608).abs() < 1e-6 && read.accepted_other < read.accepted_known);
     let none = with_acceptance(serde_json::Value::Null).unwrap();

@@ -6,8 +6,8 @@ use lads_compiler::{
     Bundle, CacheFormat, CompileError, Image, Options, WeightFormat, compile_with,
 };
 use lads_core::{Controller, Instruction, Isa, Policy, SelfTest, SelfTestError, Workspace};
-use lads_image::op::Op;
 use lads_image::Tables;
+use lads_image::op::Op;
 
 fn tiny() -> Bundle {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/tiny.onnx");

@@ -13,7 +13,9 @@ pub enum LanguageError {
     )]
     Name(String),
     /// A policy that takes no instructions.
-    #[error("the policy takes no instructions, so no sentence can be put to it; leave the sentence out")]
+    #[error(
+        "the policy takes no instructions, so no sentence can be put to it; leave the sentence out"
+    )]
     Deaf,
     /// Nothing says where the cache is.
     #[error(

@@ -51,7 +51,10 @@ fn a_policy_that_takes_no_instructions_hears_no_sentence() {
     deaf.channels
         .retain(|channel| channel.role != Role::Instruction);
     let refused = refusal(&tiny(), &deaf);
-    assert!(refused.to_string().contains("takes no instructions"), "{refused}");
+    assert!(
+        refused.to_string().contains("takes no instructions"),
+        "{refused}"
+    );
 }
 
 fn words() -> Contract {

@@ -7,9 +7,9 @@
 use std::collections::{BTreeMap, HashMap};
 
 use lads_core::Isa;
-use lads_image::machine::Machine;
+
 use lads_image::op::{INT_SLOTS, Op, Place};
-use lads_image::{Program, Spaces};
+use lads_image::{Machine, Program, Spaces};
 use prost::Message;
 
 use super::models::ENTRY;
