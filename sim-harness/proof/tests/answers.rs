@@ -221,7 +221,7 @@ fn decisions_off_the_grid_are_judged_where_they_were() {
     let mut replay = own();
     for (step, plan) in [(0, 1), (1, 1), (2, 0), (3, 2), (4, 2), (5, 2)] {
         let reply = &mut replay.replies[step];
-        (reply.plan, reply.decided, reply.logits) = (plan, false, Vec::new());
+        (reply.plan, reply.decided, reply.logits) = (Some(plan), false, Vec::new());
     }
     for (number, step) in [0, 2, 3].into_iter().enumerate() {
         replay.replies[step].decided = true;
