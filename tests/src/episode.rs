@@ -91,7 +91,8 @@ impl Episode {
     ///
     /// When it cannot be read, or misses something.
     pub fn open(path: &Path, policy: &Policy) -> Self {
-        let bytes = std::fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+        let bytes =
+            std::fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
         let tensors = SafeTensors::deserialize(&bytes).expect("it is a safetensors file");
         let tensor = |name: &str| {
             let found = tensors.tensor(name);
