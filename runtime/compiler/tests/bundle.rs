@@ -323,7 +323,7 @@ fn every_field_is_refused_by_its_name() {
         ),
         (
             |c| drop(c["channels"].as_array_mut().unwrap().remove(1)),
-            &["`instructions`", "no channel takes an instruction"],
+            &["`channels` has no instruction", "lads"],
         ),
         (
             |c| c["channels"][1]["name"] = "action".into(),
