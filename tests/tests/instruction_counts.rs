@@ -83,9 +83,9 @@ struct Observed<'p> {
 }
 
 impl<'p> Observed<'p> {
-    fn new(policy: Policy<'p>) -> Self {
+    fn new(policy: &Policy<'p>) -> Self {
         Self {
-            policy,
+            policy: *policy,
             floats: vec![],
             bytes: vec![],
         }
@@ -129,9 +129,9 @@ fn with_image(work: impl FnOnce(Policy<'_>)) {
 }
 
 /// A step of an episode of the kitchen's policy, over and over.
-fn steps((_, decision, before): (WeightFormat, Decision, usize), policy: Policy<'_>) {
-    let mut memory = Memory::of(&policy).expect("there is memory");
-    let mut controller = memory.controller(&policy).unwrap();
+fn steps((_, decision, before): (WeightFormat, Decision, usize), policy: &Policy<'_>) {
+    let mut memory = Memory::of(policy).expect("there is memory");
+    let mut controller = memory.controller(policy).unwrap();
     controller.set_decision(decision);
     let mut action = vec![0.0; policy.contract().action_len()];
     let first = policy.golden().unwrap().step(0).unwrap();
@@ -150,9 +150,9 @@ fn steps((_, decision, before): (WeightFormat, Decision, usize), policy: Policy<
 }
 
 /// The first steps of a random policy's contexts, each with observations of its own.
-fn episodes(policy: Policy<'_>) {
-    let mut memory = Memory::of(&policy).expect("there is memory");
-    let mut controller = memory.controller(&policy).unwrap();
+fn episodes(policy: &Policy<'_>) {
+    let mut memory = Memory::of(policy).expect("there is memory");
+    let mut controller = memory.controller(policy).unwrap();
     let mut action = vec![0.0; policy.contract().action_len()];
     if policy.contract().instruction_channel().is_some() {
         controller.set_instruction(Instruction::Id(0)).unwrap();
@@ -174,7 +174,7 @@ fn a_step_executes_the_same_number_of_instructions_whatever_it_observes() {
     const NAME: &str = "a_step_executes_the_same_number_of_instructions_whatever_it_observes";
     if let Some(case) = std::env::var_os(CHILD) {
         let case: usize = case.to_str().and_then(|case| case.parse().ok()).unwrap();
-        return with_image(|policy| steps(CASES[case], policy));
+        return with_image(|policy| steps(CASES[case], &policy));
     }
     let bundle = Bundle::open(&project_path("models/kitchen.onnx")).unwrap();
     for (number, case) in CASES.iter().enumerate() {
@@ -201,7 +201,7 @@ fn every_place_in_the_schedule_of_every_family_takes_one_number_of_instructions(
     const NAME: &str =
         "every_place_in_the_schedule_of_every_family_takes_one_number_of_instructions";
     if std::env::var_os(CHILD).is_some() {
-        return with_image(episodes);
+        return with_image(|policy| episodes(&policy));
     }
     for (number, kind) in KINDS.iter().enumerate() {
         let bundle = Bundle::open(&folder().join(format!("{kind}.onnx"))).unwrap();

@@ -292,132 +292,134 @@ fn contract() -> serde_json::Value {
 /// What is done to a contract, and what is then said: the field and more.
 type Broken = (fn(&mut serde_json::Value), &'static [&'static str]);
 
+const BROKEN: &[Broken] = &[
+    (|c| c["family"]["kind"] = "lasd".into(), &["lasd"]),
+    (
+        |c| c["family"]["codebook"]["dim"] = 0.into(),
+        &["`family.codebook.dim` is 0"],
+    ),
+    (
+        |c| c["family"]["decision"]["temperature"] = 0.0.into(),
+        &["`family.decision.temperature` is 0"],
+    ),
+    (
+        |c| c["family"]["decision"]["rule"] = "guess".into(),
+        &["guess"],
+    ),
+    (
+        |c| c["control_period_s"] = 0.0.into(),
+        &["`control_period_s` is 0"],
+    ),
+    (
+        |c| c["channels"] = serde_json::json!([]),
+        &["`channels`", "0 observations"],
+    ),
+    (
+        |c| drop(c["channels"].as_array_mut().unwrap().pop()),
+        &["`channels`", "0 actions"],
+    ),
+    (
+        |c| drop(c["channels"].as_array_mut().unwrap().remove(1)),
+        &["`channels` has no instruction", "lads"],
+    ),
+    (
+        |c| c["channels"][1]["name"] = "action".into(),
+        &["channels[4].name", "repeats \"action\""],
+    ),
+    (|c| c["channels"][0]["role"] = "sensor".into(), &["sensor"]),
+    (|c| c["channels"][0]["dtype"] = "f64".into(), &["f64"]),
+    (
+        |c| c["channels"][0]["shape"] = serde_json::json!([6]),
+        &["`channels[0].elements` has 5 elements"],
+    ),
+    (
+        |c| c["channels"][0]["shape"] = serde_json::json!([]),
+        &["`channels[0].shape` is []"],
+    ),
+    (
+        |c| c["channels"][0]["elements"][2]["min"] = 1.0.into(),
+        &["`channels[0].elements[2]` (drawer)", "no range"],
+    ),
+    (
+        |c| c["channels"][4]["dtype"] = "u8".into(),
+        &["`channels[4].elements`", "only vectors of f32"],
+    ),
+    (
+        |c| c["channels"][4]["elements"][0]["scale"] = 1e39.into(),
+        &["channels[4].elements[0]"],
+    ),
+    (
+        |c| c["context"]["steps"] = 0.into(),
+        &["`context.steps` is 0"],
+    ),
+    (
+        |c| c["context"]["words"] = 7.into(),
+        &["`context.words` is not"],
+    ),
+    (|c| c["context"]["beyond"] = "stop".into(), &["stop"]),
+    (|c| c["context"] = serde_json::Value::Null, &["`context`"]),
+    (
+        |c| c["instructions"] = serde_json::json!([]),
+        &["`instructions` has 0"],
+    ),
+    (
+        |c| c["instructions"][1]["id"] = "dl".into(),
+        &["instructions[1].id", "repeats \"dl\""],
+    ),
+    (
+        |c| c["instructions"][1]["text"] = " ".into(),
+        &["`instructions[1].text` is empty"],
+    ),
+    (|c| c["language"] = serde_json::Value::Null, &["`language`"]),
+    (
+        |c| c["language"]["dim"] = 9.into(),
+        &["`language.dim` is 9"],
+    ),
+    (|c| c["network"] = serde_json::Value::Null, &["`network`"]),
+    (
+        |c| c["network"]["heads"] = 0.into(),
+        &["`network.heads` is 0"],
+    ),
+    (
+        |c| {
+            drop(
+                c["evaluation"]["instructions"]
+                    .as_array_mut()
+                    .unwrap()
+                    .pop(),
+            );
+        },
+        &["`evaluation.instructions` has 3"],
+    ),
+    (
+        |c| c["evaluation"]["instructions"][0]["split"] = "".into(),
+        &["`evaluation.instructions[0].split` is empty"],
+    ),
+    (
+        |c| c["states"] = serde_json::json!([{"name": "h", "kind": "plain", "shape": [0]}]),
+        &["`states[0].shape` is [0]"],
+    ),
+    (
+        |c| c["states"] = serde_json::json!([{"name": "r", "kind": "ring", "rows": 0}]),
+        &["`states[0].rows` is 0"],
+    ),
+    (
+        |c| {
+            c["states"] =
+                serde_json::json!([{"name": "r", "kind": "ring", "rows": 2, "source": "action"}]);
+        },
+        &["`states[0].source` is \"action\""],
+    ),
+    (
+        |c| drop(c.as_object_mut().unwrap().remove("provenance")),
+        &["`provenance`"],
+    ),
+];
+
 #[test]
 fn every_field_is_refused_by_its_name() {
     Contract::parse(&contract().to_string()).expect("the contract itself is sound");
-    let broken: &[Broken] = &[
-        (|c| c["family"]["kind"] = "lasd".into(), &["lasd"]),
-        (
-            |c| c["family"]["codebook"]["dim"] = 0.into(),
-            &["`family.codebook.dim` is 0"],
-        ),
-        (
-            |c| c["family"]["decision"]["temperature"] = 0.0.into(),
-            &["`family.decision.temperature` is 0"],
-        ),
-        (
-            |c| c["family"]["decision"]["rule"] = "guess".into(),
-            &["guess"],
-        ),
-        (
-            |c| c["control_period_s"] = 0.0.into(),
-            &["`control_period_s` is 0"],
-        ),
-        (
-            |c| c["channels"] = serde_json::json!([]),
-            &["`channels`", "0 observations"],
-        ),
-        (
-            |c| drop(c["channels"].as_array_mut().unwrap().pop()),
-            &["`channels`", "0 actions"],
-        ),
-        (
-            |c| drop(c["channels"].as_array_mut().unwrap().remove(1)),
-            &["`channels` has no instruction", "lads"],
-        ),
-        (
-            |c| c["channels"][1]["name"] = "action".into(),
-            &["channels[4].name", "repeats \"action\""],
-        ),
-        (|c| c["channels"][0]["role"] = "sensor".into(), &["sensor"]),
-        (|c| c["channels"][0]["dtype"] = "f64".into(), &["f64"]),
-        (
-            |c| c["channels"][0]["shape"] = serde_json::json!([6]),
-            &["`channels[0].elements` has 5 elements"],
-        ),
-        (
-            |c| c["channels"][0]["shape"] = serde_json::json!([]),
-            &["`channels[0].shape` is []"],
-        ),
-        (
-            |c| c["channels"][0]["elements"][2]["min"] = 1.0.into(),
-            &["`channels[0].elements[2]` (drawer)", "no range"],
-        ),
-        (
-            |c| c["channels"][4]["dtype"] = "u8".into(),
-            &["`channels[4].elements`", "only vectors of f32"],
-        ),
-        (
-            |c| c["channels"][4]["elements"][0]["scale"] = 1e39.into(),
-            &["channels[4].elements[0]"],
-        ),
-        (
-            |c| c["context"]["steps"] = 0.into(),
-            &["`context.steps` is 0"],
-        ),
-        (
-            |c| c["context"]["words"] = 7.into(),
-            &["`context.words` is not"],
-        ),
-        (|c| c["context"]["beyond"] = "stop".into(), &["stop"]),
-        (|c| c["context"] = serde_json::Value::Null, &["`context`"]),
-        (
-            |c| c["instructions"] = serde_json::json!([]),
-            &["`instructions` has 0"],
-        ),
-        (
-            |c| c["instructions"][1]["id"] = "dl".into(),
-            &["instructions[1].id", "repeats \"dl\""],
-        ),
-        (
-            |c| c["instructions"][1]["text"] = " ".into(),
-            &["`instructions[1].text` is empty"],
-        ),
-        (|c| c["language"] = serde_json::Value::Null, &["`language`"]),
-        (
-            |c| c["language"]["dim"] = 9.into(),
-            &["`language.dim` is 9"],
-        ),
-        (|c| c["network"] = serde_json::Value::Null, &["`network`"]),
-        (
-            |c| c["network"]["heads"] = 0.into(),
-            &["`network.heads` is 0"],
-        ),
-        (
-            |c| {
-                drop(
-                    c["evaluation"]["instructions"]
-                        .as_array_mut()
-                        .unwrap()
-                        .pop(),
-                )
-            },
-            &["`evaluation.instructions` has 3"],
-        ),
-        (
-            |c| c["evaluation"]["instructions"][0]["split"] = "".into(),
-            &["`evaluation.instructions[0].split` is empty"],
-        ),
-        (
-            |c| c["states"] = serde_json::json!([{"name": "h", "kind": "plain", "shape": [0]}]),
-            &["`states[0].shape` is [0]"],
-        ),
-        (
-            |c| c["states"] = serde_json::json!([{"name": "r", "kind": "ring", "rows": 0}]),
-            &["`states[0].rows` is 0"],
-        ),
-        (
-            |c| {
-                c["states"] = serde_json::json!([{"name": "r", "kind": "ring", "rows": 2, "source": "action"}])
-            },
-            &["`states[0].source` is \"action\""],
-        ),
-        (
-            |c| drop(c.as_object_mut().unwrap().remove("provenance")),
-            &["`provenance`"],
-        ),
-    ];
-    for (number, (edit, parts)) in broken.iter().enumerate() {
+    for (number, (edit, parts)) in BROKEN.iter().enumerate() {
         let mut contract = contract();
         edit(&mut contract);
         let Err(error) = Contract::parse(&contract.to_string()) else {

@@ -23,13 +23,17 @@ fn options(weights: WeightFormat, tolerance: f32) -> Options {
 }
 
 /// Puts a policy to work in memory of its own.
-fn at_work<T>(policy: Policy, isa: Isa, work: impl FnOnce(&mut Controller) -> T) -> T {
+fn at_work<T>(policy: &Policy, isa: Isa, work: impl FnOnce(&mut Controller) -> T) -> T {
     let (mut arena, mut state) = (vec![0.0; policy.arena_len()], vec![0.0; policy.state_len()]);
-    let workspace = Workspace::new(&policy, &mut arena, &mut state).unwrap();
-    work(&mut Controller::with_isa(policy, workspace, isa))
+    let workspace = Workspace::new(policy, &mut arena, &mut state).unwrap();
+    work(&mut Controller::with_isa(*policy, workspace, isa))
 }
 
-fn self_test(policy: Policy) -> Result<SelfTest, SelfTestError> {
+#[expect(
+    clippy::redundant_closure_for_method_calls,
+    reason = "the method alone is not general enough in its lifetimes"
+)]
+fn self_test(policy: &Policy) -> Result<SelfTest, SelfTestError> {
     at_work(policy, Isa::detect(), |controller| controller.self_test())
 }
 
@@ -37,7 +41,7 @@ fn self_test(policy: Policy) -> Result<SelfTest, SelfTestError> {
 fn replayed(image: &Image, isa: Isa) -> (Vec<f32>, Vec<f32>) {
     let policy = Policy::new_checked(image.as_bytes()).unwrap();
     let golden = policy.golden().unwrap();
-    at_work(policy, isa, |controller| {
+    at_work(&policy, isa, |controller| {
         let instruction = golden.instruction().map(Instruction::Id).unwrap();
         controller.set_instruction(instruction).unwrap();
         let mut action = vec![0.0; policy.contract().action_len()];
@@ -91,7 +95,7 @@ fn fewer_bits_are_admitted_inside_a_tolerance() {
         let image = compile_with(&bundle, options(format, tolerance)).unwrap();
         let policy = Policy::new_checked(image.as_bytes()).unwrap();
         assert_eq!(policy.golden().unwrap().tolerance(), tolerance);
-        let passed = self_test(policy).unwrap();
+        let passed = self_test(&policy).unwrap();
         assert!(
             passed.largest_error > tolerance / 20.0,
             "{passed:?} says nothing"
@@ -150,7 +154,7 @@ fn what_changes_the_policy_is_refused_unless_forced() {
     };
     let image = compile_with(&bundle, forced).unwrap();
     let policy = Policy::new_checked(image.as_bytes()).unwrap();
-    assert!(self_test(policy).is_err());
+    assert!(self_test(&policy).is_err());
 }
 
 /// The cache is in no action, and of the weights only the low level's are: what is rounded may only change which plan is chosen.

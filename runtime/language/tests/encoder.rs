@@ -128,11 +128,15 @@ fn a_missing_encoder_is_refused() {
 #[test]
 fn another_encoder_is_refused() {
     let mut other = words();
-    other.language.sha256 = "0123456789abcdef".repeat(4);
+    other
+        .language
+        .as_mut()
+        .expect("it takes instructions")
+        .sha256 = "0123456789abcdef".repeat(4);
     let error = refusal(&tiny(), &other);
     one_line(&error, &["tiny-encoder", "51acd264e5af", "0123456789ab"]);
     let mut wide = words();
-    wide.language.dim = 9;
+    wide.language.as_mut().expect("it takes instructions").dim = 9;
     one_line(&refusal(&tiny(), &wide), &["language.dim", "9", "8"]);
     for layer in [3, -4, i32::MAX, i32::MIN] {
         let error = refusal(&tiny(), &contract(layer, Pooling::None, 8));
