@@ -6,6 +6,7 @@ VENV   := .venv
 PY     := $(VENV)/bin/python
 MODEL  ?= models/kitchen.onnx
 ARGS   ?=
+JOB    ?=
 ENV    ?= kitchen
 DATA   ?= data/$(ENV).safetensors
 COLLECT_kitchen := --episodes-per-instruction 50
@@ -22,10 +23,10 @@ PREFIX  ?= /usr/local
 # Says before a build that takes long what it takes, where nothing of it is there yet: $(call first-build,a crate of it,what,minutes)
 first-build = @ls target/release/deps/lib$(1)-*.rlib >/dev/null 2>&1 || echo "The first build of $(2) takes some $(3) minutes of one core; later ones take seconds."
 
-## run: the shipped policy over the paper's seen and unseen instructions
+## run: the shipped policy over the paper's seen and unseen instructions; another job of lads-run by JOB, such as JOB="replay flight.mcap"
 run: setup
 	$(call first-build,lads_sim,the simulator,2)
-	cargo run --release -p lads-sim --bin lads-run -- --model $(MODEL) $(ARGS)
+	cargo run --release -p lads-sim --bin lads-run -- $(JOB) --model $(MODEL) $(ARGS)
 
 ## report: the same with charts, as one HTML page
 report: setup
@@ -35,12 +36,12 @@ report: setup
 ## record: the first episode of an instruction as episode.gif; ARGS="--instruction kbls"
 record: setup
 	$(call first-build,gif,the pictures,4)
-	cargo run --release -p lads-sim --features report,record --bin lads-run -- --model $(MODEL) --episodes 1 --record episode.gif $(ARGS)
+	cargo run --release -p lads-sim --features report,record --bin lads-run -- record episode.gif --model $(MODEL) --episodes 1 $(ARGS)
 
 ## viewer: the policy at real time in a window (X display); ARGS="--instruction kbls --episodes 3"
 viewer: setup
 	$(call first-build,winit,the window,5)
-	cargo run --release -p lads-sim --features viewer --bin lads-run -- --model $(MODEL) --viewer $(ARGS)
+	cargo run --release -p lads-sim --features viewer --bin lads-run -- view --model $(MODEL) $(ARGS)
 
 ## language: the language encoder into the user's cache, once, for `make say`; ENCODER=FOLDER for another BERT-family model
 language: $(VENV)/stamp
@@ -120,13 +121,13 @@ train: $(VENV)/stamp
 export: $(VENV)/stamp
 	$(PY) -m lads_exporter export --run runs/$(ENV) -o models/$(ENV).onnx
 
-## reference: the policy of $(MODEL) in PyTorch and the official environment, 20 episodes of each instruction, for `lads-run --verify`
+## reference: the policy of $(MODEL) in PyTorch and the official environment, 20 episodes of each instruction, for `lads-run verify`
 reference: $(VENV)/stamp
 	$(PY) -m lads_exporter reference --model $(MODEL) -o $(MODEL:.onnx=.reference.json)
 
-## verify: is the compiled policy the reference's? Fails unless EQUIVALENT; `lads-run --verify` itself exits with 0, 1 DIFFERENT or 3 INCONCLUSIVE
+## verify: is the compiled policy the reference's? Fails unless EQUIVALENT; `lads-run verify` itself exits with 0, 1 DIFFERENT or 3 INCONCLUSIVE
 verify: setup
-	cargo run --release -p lads-sim --bin lads-run -- --model $(MODEL) --verify $(ARGS)
+	cargo run --release -p lads-sim --bin lads-run -- verify --model $(MODEL) $(ARGS)
 
 ## mutate: changes of every kind to $(MODEL), what each moves and what its verification says; minutes
 mutate: setup

@@ -139,11 +139,11 @@ def _reference(arguments):
         from . import questions
 
         questions.complete(arguments.model, arguments.output, arguments.run)
-        print(f"{arguments.output}: completed; next: lads-run --model {arguments.model} --verify {arguments.output}")
+        print(f"{arguments.output}: completed; next: lads-run verify --model {arguments.model} --reference {arguments.output}")
         return
     chosen = {key: getattr(arguments, key) for key in ("run", "episodes", "traced", "seed", "noise")}
     reference.write(arguments.model, arguments.output, **chosen)
-    print(f"{arguments.output}: written; next: lads-run --model {arguments.model} --verify {arguments.output}")
+    print(f"{arguments.output}: written; next: lads-run verify --model {arguments.model} --reference {arguments.output}")
 
 
 def _upgrade(arguments):
@@ -213,7 +213,7 @@ def _parser():
         command.add_argument("--beside", action="append", default=[], metavar="LABEL=FILE", help="results of another run")
         command.set_defaults(run_command=function)
 
-    rollouts = commands.add_parser("reference", help="reference rollouts: PyTorch in the official environment, for lads-run --verify")
+    rollouts = commands.add_parser("reference", help="reference rollouts: PyTorch in the official environment, for lads-run verify")
     rollouts.add_argument("--model", required=True, help="the bundle whose policy is rolled out")
     rollouts.add_argument("-o", "--output", required=True)
     rollouts.add_argument("--run", help="take the weights from this run's checkpoint, not from the bundle's initializers")

@@ -1,4 +1,4 @@
-"""Reference rollouts: the PyTorch policy in the official environment, for `lads-run --verify` to compare with.
+"""Reference rollouts: the PyTorch policy in the official environment, for `lads-run verify` to compare with.
 
 What is independent of what is verified: the network runs as in training, in PyTorch, as a full-sequence forward over the
 whole history at every decision (no KV cache, no ONNX graph, no compiler, no Rust); the physics, the observations and the

@@ -5,6 +5,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Parser;
+use clap::error::{ContextKind, ContextValue};
 use indicatif::{ProgressBar, ProgressStyle};
 
 /// Exit code of everything that was refused.
@@ -12,11 +13,24 @@ pub const REFUSED: u8 = 2;
 
 /// The arguments of command `name`; else the exit code, after one line on stderr, or after the help on stdout.
 pub fn arguments<A: Parser>(name: &str) -> Result<A, ExitCode> {
+    arguments_moved(name, &[])
+}
+
+/// The same, for a command of which `moved` options are now asked for otherwise, and how.
+pub fn arguments_moved<A: Parser>(name: &str, moved: &[(&str, &str)]) -> Result<A, ExitCode> {
     A::try_parse().map_err(|error| {
         if !error.use_stderr() {
             // Help or version; a closed pipe is no failure.
             let _ = error.print();
             return ExitCode::SUCCESS;
+        }
+        let unknown = match error.get(ContextKind::InvalidArg) {
+            Some(ContextValue::String(option)) => option.as_str(),
+            _ => "",
+        };
+        if let Some((option, now)) = moved.iter().find(|(option, _)| *option == unknown) {
+            eprintln!("error: {option} is a command of its own now: {now}; see {name} --help");
+            return ExitCode::from(REFUSED);
         }
         let text = error.to_string();
         // The first paragraph is what is wrong; the rest is the usage.

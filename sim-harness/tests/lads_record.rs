@@ -1,4 +1,4 @@
-//! `lads-run --record`: the pictures, that they change nothing, and that an interrupted film leaves nothing behind.
+//! `lads-run record`: the pictures, that they change nothing, and that an interrupted film leaves nothing behind.
 //!
 //! Where there is no EGL these tests are skipped with a printed line.
 #![cfg(feature = "record")]
@@ -19,8 +19,7 @@ const DRAWER: [&str; 5] = ["--instruction", "open drawer", "--episodes", "2", "-
 
 /// Records; `None`, after a line, where there is no EGL.
 fn recorded(model: &str, arguments: &[&str], out: &Path) -> Option<Output> {
-    let output = lads_run(model, arguments)
-        .arg("--record")
+    let output = lads_run(model, &[&["record"], arguments].concat())
         .arg(out)
         .output()
         .unwrap();
@@ -53,11 +52,7 @@ fn a_film_has_every_step_and_changes_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let [plain, filmed, out] =
         ["plain.json", "filmed.json", "out"].map(|name| folder.path().join(name));
-    let arguments = [
-        &DRAWER[..],
-        &[filmed.to_str().unwrap(), "--record-episode", "1"],
-    ]
-    .concat();
+    let arguments = [&DRAWER[..], &[filmed.to_str().unwrap(), "--episode", "1"]].concat();
     let out_folder = folder.path().join("out/");
     if recorded("lorel.onnx", &arguments, &out_folder).is_none() {
         return;
@@ -102,8 +97,7 @@ fn films_are_files_that_players_know() {
     let ffmpeg = Command::new("ffmpeg").arg("-version").output();
     if ffmpeg.is_err() {
         println!("skipped: ffmpeg is not installed");
-        let refused = lads_run("lorel.onnx", arguments)
-            .arg("--record")
+        let refused = lads_run("lorel.onnx", &[&["record"], arguments].concat())
             .arg(path("a.mp4"))
             .output()
             .unwrap();
@@ -123,7 +117,7 @@ fn films_are_files_that_players_know() {
 #[test]
 fn without_egl_one_line_names_the_remedy() {
     let folder = tempfile::tempdir().unwrap();
-    let output = lads_run("kitchen.onnx", &["--record"])
+    let output = lads_run("kitchen.onnx", &["record"])
         .arg(folder.path().join("a.gif"))
         // The vendor-neutral EGL finds no vendor.
         .env("__EGL_VENDOR_LIBRARY_FILENAMES", "/dev/null")
@@ -145,9 +139,9 @@ fn an_interrupted_film_leaves_nothing() {
     let [out, json] = ["a.gif", "r.json"].map(|name| folder.path().join(name));
     let mut command = lads_run(
         "kitchen.onnx",
-        &["--instruction", "kbls", "--episodes", "1"],
+        &["record", "--instruction", "kbls", "--episodes", "1"],
     );
-    command.arg("--record").arg(&out).arg("--json").arg(&json);
+    command.arg(&out).arg("--json").arg(&json);
     // The film's temporary file is there from the first picture on.
     let begun = || !files(folder.path()).is_empty();
     let Some((code, errors)) = interrupt::when(&mut command, &begun) else {

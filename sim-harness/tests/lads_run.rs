@@ -27,7 +27,12 @@ fn kitchen_bundle() -> PathBuf {
 
 fn lads_run(model: &Path, arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_lads-run"));
-    command.arg("--model").arg(model).args(arguments);
+    // Another job than the main one comes first.
+    let (job, rest) = match arguments {
+        [job, rest @ ..] if !job.starts_with('-') => (Some(job), rest),
+        _ => (None, arguments),
+    };
+    command.args(job).arg("--model").arg(model).args(rest);
     // Whatever the user's own cache has.
     command.env("LADS_CACHE", "/nonexistent");
     command
@@ -178,6 +183,23 @@ fn bad_arguments_are_refused() {
     );
 }
 
+/// Who types what earlier releases took is told in one line what it is called now.
+#[test]
+fn options_that_have_become_jobs_are_named() {
+    for (arguments, now) in [
+        (&["--verify"][..], "lads-run verify"),
+        (&["--verify", "r.json"], "lads-run verify"),
+        (&["--replay", "f.mcap"], "lads-run replay LOG"),
+        (&["--encode", "f.mcap"], "lads-run encode LOG"),
+        (&["--sweep"], "lads-run sweep"),
+        (&["--viewer"], "lads-run view "),
+        (&["--record", "a.gif"], "lads-run record OUT"),
+        (&["--record-episode", "1"], "--episode NUMBER"),
+    ] {
+        refused(&kitchen_bundle(), arguments, &[arguments[0], now]);
+    }
+}
+
 #[test]
 fn sentences_that_nobody_can_hear_are_refused() {
     let model = kitchen_bundle();
@@ -197,8 +219,14 @@ fn sentences_that_nobody_can_hear_are_refused() {
     refused(&model, &["--encode-language"], &["--encode-language", hint]);
     said("mkbs", &["--sub-tasks", "kettle"], &["--sub-tasks", "mkbs"]);
     refused(&model, &["--sub-tasks", "kettle"], &["--sub-tasks"]);
-    for rest in [&["--verify"][..], &["--plans", "p.json"], &["--sweep"]] {
-        said("dance", rest, &[rest[0], "bundle's table"]);
+    said(
+        "dance",
+        &["--plans", "p.json"],
+        &["--plans", "bundle's table"],
+    );
+    for job in ["verify", "sweep"] {
+        let arguments = [job, "--instruction", "dance"];
+        refused(&model, &arguments, &[job, "bundle's table"]);
     }
 }
 
@@ -371,8 +399,8 @@ fn a_log_replays_and_its_plans_run() {
     let text = fs::read_to_string(project_file("sim-harness/proof/results.schema.json")).unwrap();
     let root: Value = serde_json::from_str(&text).unwrap();
     schema::check(&results, &root, &root, "results");
-    assert!(out(&["--replay", log]).starts_with("EQUAL: 1 episodes"));
-    out(&["--encode", log, "--json", plans]);
+    assert!(out(&["replay", log]).starts_with("EQUAL: 1 episodes"));
+    out(&["encode", log, "--json", plans]);
     let table = out(&[&first[..], &["--plans", plans, "--monitor"]].concat());
     assert!(table.contains("mkbs"));
 
@@ -381,11 +409,11 @@ fn a_log_replays_and_its_plans_run() {
     fs::write(log, cut).unwrap();
     refused(
         &kitchen_bundle(),
-        &["--replay", log],
-        &["--replay", "no whole MCAP file"],
+        &["replay", log],
+        &["replay", "no whole MCAP file"],
     );
     refused(&kitchen_bundle(), &["--plans", log], &["--plans", "f.mcap"]);
-    refused(&kitchen_bundle(), &["--replay", "no.mcap"], &["no.mcap"]);
+    refused(&kitchen_bundle(), &["replay", "no.mcap"], &["no.mcap"]);
     refused(
         &kitchen_bundle(),
         &["--log", "/no/such/folder/f.mcap"],
@@ -401,7 +429,7 @@ fn a_log_replays_and_its_plans_run() {
 #[test]
 fn a_sweep_runs_every_level_of_every_fault() {
     let folder = tempfile::tempdir().unwrap();
-    let arguments = ["--sweep", "--episodes", "1", "--instruction", "kbls"];
+    let arguments = ["sweep", "--episodes", "1", "--instruction", "kbls"];
     let (table, sweep) = results(&arguments, &folder.path().join("s.json"));
     let levels = sweep["levels"].as_array().unwrap();
     assert_eq!(levels.len(), 20);
@@ -474,12 +502,12 @@ fn outputs_are_never_what_is_read_nor_each_other() {
     fs::copy(reference, path("kitchen.reference.json")).unwrap();
     refused(
         &model,
-        &["--verify", "--certificate", &said("kitchen.reference.json")],
-        &["--certificate", "--verify reads"],
+        &["verify", "--certificate", &said("kitchen.reference.json")],
+        &["--certificate", "--reference reads"],
     );
     refused(
         &model,
-        &["--verify", "--certificate", &one, "--certificate", &two],
+        &["verify", "--certificate", &one, "--certificate", &two],
         &["--certificate writes the same file"],
     );
     assert_eq!(fs::read(&model).unwrap(), before);
@@ -546,10 +574,16 @@ fn another_mujoco_is_refused_in_one_line() {
 
 #[test]
 fn what_has_no_end_is_not_waited_for() {
-    for option in ["--image", "--replay", "--encode", "--plans", "--verify"] {
+    for arguments in [
+        &["--image"][..],
+        &["--plans"],
+        &["replay"],
+        &["encode"],
+        &["verify", "--reference"],
+    ] {
         refused(
             &kitchen_bundle(),
-            &[option, "/dev/zero"],
+            &[arguments, &["/dev/zero"]].concat(),
             &["/dev/zero", "not a regular file"],
         );
     }

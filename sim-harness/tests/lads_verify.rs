@@ -1,4 +1,4 @@
-//! `lads-run --verify`: the certificate of the shipped policy, its form, its exit codes, and every reference that is refused.
+//! `lads-run verify`: the certificate of the shipped policy, its form, its exit codes, and every reference that is refused.
 
 #[path = "common/interrupt.rs"]
 mod interrupt;
@@ -21,9 +21,8 @@ fn project_file(path: &str) -> PathBuf {
 fn command(arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_lads-run"));
     command
-        .arg("--model")
+        .args(["verify", "--model"])
         .arg(project_file("models/kitchen.onnx"))
-        .arg("--verify")
         .args(arguments);
     command
 }
@@ -132,16 +131,19 @@ fn a_given_image_is_what_is_verified() {
     fs::write(&broken, &bytes).unwrap();
     refused(
         &["--image", &broken],
-        &["broken.lads", "checksum", "lads compile"],
+        &["broken.lads", "checksum", "compile it again"],
     );
     fs::write(&broken, &bytes[..5000]).unwrap();
     refused(
         &["--image", &broken],
-        &["broken.lads", "bytes", "lads compile"],
+        &["broken.lads", "bytes", "compile it again"],
     );
     refused(
         &["--image", "/nowhere/x.lads"],
-        &["/nowhere/x.lads", "name a program image"],
+        &[
+            "/nowhere/x.lads",
+            "name a bundle (.onnx) or a compiled image",
+        ],
     );
 }
 
@@ -200,7 +202,14 @@ fn the_source_of_the_reference_is_printed() {
         1,
     );
     fs::write(&checkpoint, text).unwrap();
-    let output = verify(&[&checkpoint, "--episodes", "1", "--instruction", "kbls"]);
+    let output = verify(&[
+        "--reference",
+        &checkpoint,
+        "--episodes",
+        "1",
+        "--instruction",
+        "kbls",
+    ]);
     let printed = String::from_utf8(output.stdout).unwrap();
     assert!(
         printed.contains("weights from the run's checkpoint") && !printed.contains("note: "),
@@ -219,6 +228,7 @@ fn a_reference_without_a_contract_decides_nothing() {
     let path = folder.path().join("old.json");
     fs::write(&path, file.to_string()).unwrap();
     let few = [
+        "--reference",
         path.to_str().unwrap(),
         "--episodes",
         "1",
@@ -264,7 +274,12 @@ fn references_of_something_else_are_refused_by_name() {
     let check = |from: &str, to: &str, parts: &[&str]| {
         let path = altered(folder, from, to);
         refused(
-            &[&path, "--certificate", certificate.to_str().unwrap()],
+            &[
+                "--reference",
+                &path,
+                "--certificate",
+                certificate.to_str().unwrap(),
+            ],
             parts,
         );
         assert!(!certificate.exists());
@@ -306,11 +321,11 @@ fn references_of_something_else_are_refused_by_name() {
         &["final state"],
     );
     refused(
-        &["no-such-file.json"],
+        &["--reference", "no-such-file.json"],
         &["no-such-file.json", "make reference"],
     );
     refused(
-        &[project_file("README.md").to_str().unwrap()],
+        &["--reference", project_file("README.md").to_str().unwrap()],
         &["not a reference"],
     );
     refused(&["--episodes", "21"], &["--episodes 21", "20"]);

@@ -1,4 +1,4 @@
-//! `lads-run --viewer`: that a window changes nothing, and what is refused.
+//! `lads-run view`: that a window changes nothing, and what is refused.
 //!
 //! The tests that open a window need the X server that needs no screen (Xvfb), and EGL; without them they are skipped with a printed line.
 #![cfg(feature = "viewer")]
@@ -91,9 +91,8 @@ fn an_episode_is_the_same_in_a_window() {
     let [plain, seen] = ["plain.json", "seen.json"].map(|name| folder.path().join(name));
     for (model, instruction) in [("lorel.onnx", "open drawer"), ("kitchen.onnx", "kbls")] {
         let arguments = ["--instruction", instruction, "--episodes", "1", "--json"];
-        let output = lads_run(model, &arguments)
+        let output = lads_run(model, &[&["view"], &arguments[..]].concat())
             .arg(&seen)
-            .arg("--viewer")
             .env("DISPLAY", &display.name)
             .output()
             .unwrap();
@@ -116,7 +115,7 @@ fn an_interrupt_closes_the_window() {
         return;
     };
     let folder = tempfile::tempdir().unwrap();
-    let mut command = lads_run("kitchen.onnx", &["--viewer", "--episodes", "9", "--json"]);
+    let mut command = lads_run("kitchen.onnx", &["view", "--episodes", "9", "--json"]);
     command.arg(folder.path().join("r.json"));
     command.env("DISPLAY", &display.name);
     // In the first of many episodes at real time, however slow the machine is.
@@ -134,11 +133,11 @@ fn an_interrupt_closes_the_window() {
 #[test]
 fn without_a_display_one_line_names_the_remedy() {
     let run = |display: &str| {
-        let mut command = lads_run("kitchen.onnx", &["--viewer"]);
+        let mut command = lads_run("kitchen.onnx", &["view"]);
         command.env("DISPLAY", display).output().unwrap()
     };
-    let none = ["--viewer: no display", "set DISPLAY", "--record"];
-    let output = lads_run("kitchen.onnx", &["--viewer"]).output().unwrap();
+    let none = ["view: no display", "set DISPLAY", "record"];
+    let output = lads_run("kitchen.onnx", &["view"]).output().unwrap();
     assert_refused(&output, &none);
     assert_refused(&run(""), &none);
     // Where no machine listens.
@@ -148,18 +147,10 @@ fn without_a_display_one_line_names_the_remedy() {
 
 #[test]
 fn what_contradicts_a_window_is_refused_by_name() {
-    for other in [
-        &["--verify"][..],
-        &["--sweep"],
-        &["--uniform"],
-        &["--replay", "a.mcap"],
-        &["--encode", "a.mcap"],
-        &["--report", "a.html"],
-        &["--record", "a.gif"],
-    ] {
-        let output = lads_run("kitchen.onnx", other).arg("--viewer").output();
-        assert_refused(&output.unwrap(), &["--viewer", other[0]]);
+    for other in [&["--uniform"][..], &["--report", "a.html"]] {
+        let output = lads_run("kitchen.onnx", &[&["view"], other].concat()).output();
+        assert_refused(&output.unwrap(), &[other[0]]);
     }
-    let output = lads_run("kitchen.onnx", &["--viewer", "--threads", "2"]).output();
-    assert_refused(&output.unwrap(), &["--viewer --threads 2", "leave"]);
+    let output = lads_run("kitchen.onnx", &["view", "--threads", "2"]).output();
+    assert_refused(&output.unwrap(), &["view --threads 2", "leave"]);
 }

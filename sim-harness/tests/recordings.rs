@@ -148,6 +148,35 @@ fn a_log_reads_back_and_replays_bit_for_bit() {
     }
 }
 
+/// Of a policy that selects nothing and draws at random.
+#[test]
+fn a_log_without_plans_reads_back() {
+    let policy = tiny_policy();
+    let mut log = log(
+        &policy,
+        &evaluate(&policy, Decision::Argmax, 1, Setup::default()),
+    );
+    log.origin.period = None;
+    for flight in &mut log.flights {
+        flight.trace.noise_seed = Some(u64::MAX - 7);
+        flight.trace.outcome.plans.clear();
+        for step in &mut flight.trace.steps {
+            (step.plan, step.decided, step.margin) = (None, false, None);
+            step.scores.clear();
+        }
+    }
+    let bytes = bytes(&log);
+    assert_eq!(read(&bytes).unwrap(), log);
+    let plan = br#"{"index":null,"decided":false,"margin":null}"#;
+    assert!(bytes.windows(plan.len()).any(|window| window == plan));
+    let period = tiny_contract().period();
+    let error = replay(&policy, period, Isa::detect(), &log, &|| {}).unwrap_err();
+    assert!(
+        error.to_string().contains("control steps per plan is not"),
+        "{error}"
+    );
+}
+
 #[test]
 fn the_first_step_that_differs_is_named() {
     let policy = tiny_policy();

@@ -88,7 +88,10 @@ fn a_sentence_is_judged_by_the_sub_tasks_that_are_named() {
     let environment = Bench::new(Says::default());
     let judged = sentence(Some(" lamp, drawer,lamp ")).unwrap();
     assert_eq!(judged.asked().sub_tasks, ["lamp", "drawer"]);
-    assert_eq!(judged.assignment(tiny_contract(), &environment).commanded, [1, 0]);
+    assert_eq!(
+        judged.assignment(tiny_contract(), &environment).commanded,
+        [1, 0]
+    );
     assert_eq!(
         sentence(Some(" , ")),
         Err(SubTaskError::None {

@@ -71,7 +71,8 @@ def lads_run(cache, model, *arguments):
     if not program.is_file():
         pytest.skip("lads-run is not built: run `make test-exporter`")
     calibrated = cache / f"{model}.onnx"
-    command = [program, "--model", calibrated if calibrated.is_file() else ROOT / f"models/{model}.onnx", *arguments]
+    job = [arguments[0]] if arguments and arguments[0] == "replay" else []
+    command = [program, *job, "--model", calibrated if calibrated.is_file() else ROOT / f"models/{model}.onnx", *arguments[len(job) :]]
     done = subprocess.run(command, env=os.environ | {"LADS_CACHE": str(cache)}, capture_output=True, text=True, timeout=300)
     if "built without the language encoder" in done.stderr:
         pytest.skip("lads-run is built without the feature `language`: run `make test-exporter`")
@@ -178,7 +179,7 @@ def test_calibrations_can_be_made_again(name):
 def test_a_log_of_a_sentence_replays(cache, tmp_path):
     log = tmp_path / "flight.mcap"
     results(cache, tmp_path, "lorel", "--instruction", "pull the drawer out", "--log", log)
-    code, out, wrong = lads_run(cache, "lorel", "--replay", log)
+    code, out, wrong = lads_run(cache, "lorel", "replay", log)
     assert code == 0 and out.startswith("EQUAL: 1 episodes"), out + wrong
 
 

@@ -1,4 +1,4 @@
-"""`lads-run --verify` calls a damaged policy DIFFERENT.
+"""`lads-run verify` calls a damaged policy DIFFERENT.
 
 Each damage is done to the shipped bundle's ONNX file, and the golden episode is recorded anew with the damaged graph, as an exporter with
 that fault would: the self-test passes, and only the comparison with the reference can see it.
@@ -37,7 +37,7 @@ def lads_run():
 def verify(bundle, folder):
     """-> exit code, certificate."""
     file = folder / "certificate.json"
-    command = [lads_run(), "--model", bundle, "--verify", REFERENCE, "--certificate", file, "--instruction", "kbls", "--episodes", "1"]
+    command = [lads_run(), "verify", "--model", bundle, "--reference", REFERENCE, "--certificate", file, "--instruction", "kbls", "--episodes", "1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode in (EQUIVALENT, DIFFERENT, INCONCLUSIVE), done.stderr
     return done.returncode, json.loads(file.read_text())

@@ -103,7 +103,7 @@ pub struct Controller<'a, 'm> {
 
 impl<'a, 'm> Controller<'a, 'm> {
     /// A controller with the contract's decision rule and no instruction yet, on the widest instructions that this CPU offers.
-    /// The workspace has to be one made for this policy: with that of another policy, calls fail with [`ExecError::Span`].
+    /// The workspace has to be one made for this policy: with that of another policy, calls fail with [`ExecError::Span`](crate::ExecError::Span).
     pub fn new(policy: Policy<'a>, workspace: Workspace<'m>) -> Self {
         Self::with_isa(policy, workspace, Isa::detect())
     }

@@ -1,4 +1,4 @@
-//! Are the plans numbered as the reference's are? The order of a codebook's entries means nothing, if everything that uses it keeps to it.
+//! Are the plans numbered as the reference's are? The order of plans means nothing, if everything that uses it keeps to it.
 //!
 //! Invariant: a numbering is one to one. Nothing here can fail.
 

@@ -267,7 +267,9 @@ impl Reference {
 
     fn consistent(&self) -> Result<(), String> {
         if self.instructions.is_empty() || self.period == Some(0) || self.traced_episodes == 0 {
-            return Err("it has no instruction, no traced episode or decisions every 0 steps".to_owned());
+            return Err(
+                "it has no instruction, no traced episode or decisions every 0 steps".to_owned(),
+            );
         }
         for instruction in &self.instructions {
             let wrong = |what: &str| Err(format!("instruction '{}': {what}", instruction.id));
@@ -305,7 +307,9 @@ impl Reference {
     pub fn decided_at(&self, episode: &Episode) -> Vec<usize> {
         let grid = || {
             let period = self.period.map(|period| period.max(1));
-            period.map_or_else(Vec::new, |period| (0..episode.steps).step_by(period).collect())
+            period.map_or_else(Vec::new, |period| {
+                (0..episode.steps).step_by(period).collect()
+            })
         };
         episode.decided_at.clone().unwrap_or_else(grid)
     }

@@ -64,7 +64,7 @@ fn read(file: &Value) -> Reference {
 fn own() -> Replay {
     let replies = (0..STEPS).map(|step| Reply {
         decided: step.is_multiple_of(HORIZON),
-        plan: PLANS[step / HORIZON],
+        plan: Some(PLANS[step / HORIZON]),
         logits: if step.is_multiple_of(HORIZON) {
             LOGITS[step / HORIZON].to_vec()
         } else {
@@ -149,7 +149,7 @@ fn a_consistent_renumbering_of_the_plans_is_harmless() {
     let number = |plan: u32| [2, 0, 1][plan as usize];
     let renumber = |replay: &mut Replay| {
         for reply in &mut replay.replies {
-            reply.plan = number(reply.plan);
+            reply.plan = reply.plan.map(number);
             if let [a, b, c] = reply.logits[..] {
                 reply.logits = vec![b, c, a];
             }
@@ -221,7 +221,7 @@ fn decisions_off_the_grid_are_judged_where_they_were() {
     let mut replay = own();
     for (step, plan) in [(0, 1), (1, 1), (2, 0), (3, 2), (4, 2), (5, 2)] {
         let reply = &mut replay.replies[step];
-        (reply.plan, reply.decided, reply.logits) = (plan, false, Vec::new());
+        (reply.plan, reply.decided, reply.logits) = (Some(plan), false, Vec::new());
     }
     for (number, step) in [0, 2, 3].into_iter().enumerate() {
         replay.replies[step].decided = true;

@@ -35,7 +35,7 @@ fn shipped_references_are_whole() {
         let mut traces = episodes.filter_map(|episode| Some((episode, episode.trace.as_ref()?)));
         assert!(traces.all(|(episode, trace)| {
             let encoded = trace.encoded.as_ref().map_or(0, Vec::len);
-            !trace.logits.is_empty() && encoded == episode.steps / reference.horizon
+            !trace.logits.is_empty() && encoded == episode.steps / reference.period.unwrap()
         }));
     }
 }

@@ -7,7 +7,8 @@ use std::collections::BTreeMap;
 use lads_compiler::Contract;
 use lads_core::Decision;
 pub use lads_proof::results::{
-    Agreement, DecisionUsed, EnvironmentUsed, FORMAT, FORMAT_VERSION, HeardBy, NearestKnown, Results,
+    Agreement, DecisionUsed, EnvironmentUsed, FORMAT, FORMAT_VERSION, HeardBy, NearestKnown,
+    Results,
 };
 pub use lads_proof::scores::{
     Asked, Completion, InstructionResult, Run, SplitResult, Splits, SubTaskRate,

@@ -121,7 +121,9 @@ impl Caption<'_> {
         let (number, all) = (progress.plans.len(), self.steps);
         let at = number as f64 * self.period_s;
         let state = match progress.stand {
-            Stand::Acting { plan } => plan.map_or_else(String::new, |plan| format!("plan {plan:>3}")),
+            Stand::Acting { plan } => {
+                plan.map_or_else(String::new, |plan| format!("plan {plan:>3}"))
+            }
             Stand::Ended { .. } if self.commanded.is_empty() => "ended".to_owned(),
             Stand::Ended { success: true } => "carried out".to_owned(),
             Stand::Ended { success: false } => "not carried out".to_owned(),

@@ -179,11 +179,7 @@ fn fits(contract: &Contract<'_>, period: Option<usize>, log: &Log) -> Result<(),
 }
 
 /// Number and names of the elements; says the first that differs.
-fn elements(
-    what: &'static str,
-    log: &[String],
-    channel: &Channel<'_>,
-) -> Result<(), ReplayError> {
+fn elements(what: &'static str, log: &[String], channel: &Channel<'_>) -> Result<(), ReplayError> {
     let policy: Vec<&str> = channel.elements().map(|element| element.name).collect();
     let sizes = |log: String, policy: String| Err(ReplayError::Sizes { what, log, policy });
     if log.len() != policy.len() {

@@ -140,7 +140,8 @@ pub fn timelines(report: &Report<'_>) -> Vec<Chart> {
 
 fn timeline(report: &Report<'_>, trace: &Trace) -> Chart {
     let steps = (0..).zip(&trace.steps);
-    let points = steps.filter_map(|(number, step)| Some((f64::from(number), f64::from(step.plan?))));
+    let points =
+        steps.filter_map(|(number, step)| Some((f64::from(number), f64::from(step.plan?))));
     let plots: Vec<Plot> = vec![
         LinePlot::new()
             .with_data(points)
@@ -192,7 +193,9 @@ fn marks(report: &Report<'_>, trace: &Trace) -> Vec<Mark> {
     let known = crate::results::asked(report.contract, trace.instruction as usize);
     let asked = |name: &str| {
         // A sentence outside the table asks for what `--sub-tasks` says, which is not in the contract.
-        known.as_ref().is_none_or(|known| known.sub_tasks.contains(&name))
+        known
+            .as_ref()
+            .is_none_or(|known| known.sub_tasks.contains(&name))
     };
     let mut completions: Vec<_> = trace.outcome.completions.iter().collect();
     completions.sort_by_key(|done| done.step);
@@ -247,11 +250,7 @@ pub fn start_distributions(report: &Report<'_>) -> Vec<Chart> {
         .iter()
         .map(|(&i, row)| (id(i), row.clone()))
         .collect();
-    let mut charts = heat_map(
-        "first decision: mean probability",
-        rows,
-        report.plans,
-    );
+    let mut charts = heat_map("first decision: mean probability", rows, report.plans);
     let words = |i: u32| report.contract.evaluated(i as usize).0;
     for (&composite, line) in &starts {
         let whole = words(composite);

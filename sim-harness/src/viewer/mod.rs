@@ -33,12 +33,12 @@ use crate::rollout::Onlooker;
 pub enum ViewerError {
     /// Nothing says where a window could be.
     #[error(
-        "no display: set DISPLAY to that of an X server (a Wayland desktop brings one, Xwayland), or film an episode with --record"
+        "no display: set DISPLAY to that of an X server (a Wayland desktop brings one, Xwayland), or film an episode with lads-run record"
     )]
     NoDisplay,
     /// The display does not let a window be opened.
     #[error(
-        "no window can be opened on display {display}: {reason}; set DISPLAY to that of a running X server with its client libraries (Debian: apt-get install libx11-6 libx11-xcb1 libxcursor1 libxi6 libxkbcommon-x11-0), or film an episode with --record"
+        "no window can be opened on display {display}: {reason}; set DISPLAY to that of a running X server with its client libraries (Debian: apt-get install libx11-6 libx11-xcb1 libxcursor1 libxi6 libxkbcommon-x11-0), or film an episode with lads-run record"
     )]
     NoWindow {
         /// What `DISPLAY` says.

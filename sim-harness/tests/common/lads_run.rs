@@ -9,6 +9,11 @@ pub fn lads_run(model: &str, arguments: &[&str]) -> Command {
         .join("../models")
         .join(model);
     let mut command = Command::new(env!("CARGO_BIN_EXE_lads-run"));
-    command.arg("--model").arg(model).args(arguments);
+    // Another job than the main one comes first.
+    let (job, rest) = match arguments {
+        [job, rest @ ..] if !job.starts_with('-') => (Some(job), rest),
+        _ => (None, arguments),
+    };
+    command.args(job).arg("--model").arg(model).args(rest);
     command
 }

@@ -11,7 +11,7 @@ use crate::inputs;
 /// The most elements that a channel may have: an image of 4,096 by 4,096 pixels of four colours is within it.
 const MAX_CHANNEL_LEN: u64 = 1 << 26;
 
-/// Which channel of a policy: its position among [`Contract::channels`].
+/// Which channel of a policy: its position among [`Contract::channels`](super::Contract::channels).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct ChannelId(pub u32);
 

@@ -30,7 +30,7 @@ impl Controller<'_, '_> {
     }
 
     /// One control step of any policy: writes the action for the values of all observation channels, in any order. Values for
-    /// the noise channel, [`Policy::noise_len`] of them in the order in which they are used, take the place of the generator's.
+    /// the noise channel, [`Policy::noise_len`](crate::Policy::noise_len) of them in the order in which they are used, take the place of the generator's.
     pub fn step_with(
         &mut self,
         inputs: &[(ChannelId, Data)],

@@ -1,14 +1,95 @@
-//! The command line.
+//! The command line: the main job's options, and the other jobs as subcommands. Options that jobs share stand in groups.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use clap::{Args, Parser};
+use clap::{ArgMatches, Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 use lads_sim::faults::Faults;
+
+/// What is to be done: the main job, or another.
+#[derive(Debug)]
+pub enum Arguments {
+    Run(Run),
+    Other(Job),
+}
+
+impl CommandFactory for Arguments {
+    fn command() -> Command {
+        Job::augment_subcommands(Run::command())
+            .args_conflicts_with_subcommands(true)
+            .subcommand_negates_reqs(true)
+    }
+
+    fn command_for_update() -> Command {
+        Self::command()
+    }
+}
+
+impl FromArgMatches for Arguments {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
+        if matches.subcommand_name().is_some() {
+            Job::from_arg_matches(matches).map(Self::Other)
+        } else {
+            Run::from_arg_matches(matches).map(Self::Run)
+        }
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+        *self = Self::from_arg_matches(matches)?;
+        Ok(())
+    }
+}
+
+impl Parser for Arguments {}
+
+/// Options that have become subcommands, and how these are called.
+pub const MOVED: [(&str, &str); 7] = [
+    ("--verify", "lads-run verify --model MODEL"),
+    ("--replay", "lads-run replay LOG --model MODEL"),
+    ("--encode", "lads-run encode LOG --model MODEL"),
+    ("--sweep", "lads-run sweep --model MODEL"),
+    ("--viewer", "lads-run view --model MODEL"),
+    ("--record", "lads-run record OUT --model MODEL"),
+    (
+        "--record-episode",
+        "lads-run record OUT --model MODEL --episode NUMBER",
+    ),
+];
 
 /// Runs a policy bundle in simulation over its instructions; prints success rates and control-step latency.
 #[derive(Debug, Parser)]
-#[command(version)]
-pub struct Arguments {
+#[command(name = "lads-run", version)]
+pub struct Run {
+    #[command(flatten)]
+    pub rollouts: Rollouts,
+    /// Draw uniform random actions instead of asking the policy: the floor that it is measured against
+    #[arg(long, conflicts_with_all = ["sample", "log", "plans", "monitor", "report", "encode_language"])]
+    pub uniform: bool,
+    /// Write success rates and charts to this file as one HTML page (needs the cargo feature `report`)
+    #[arg(long, value_name = "HTML")]
+    pub report: Option<PathBuf>,
+}
+
+/// The other jobs.
+#[derive(Debug, Subcommand)]
+pub enum Job {
+    /// Run the episodes of a reference and say whether the policy is the reference's: exit code 0 EQUIVALENT, 1 DIFFERENT, 3 INCONCLUSIVE
+    Verify(Verify),
+    /// Compute the actions of a log again and name the first step that differs (exit code 1); runs no episode
+    Replay(Replay),
+    /// Print the plans that the trajectory encoder sees in a log, in the form that --plans takes; runs no episode
+    Encode(Encode),
+    /// Run the benchmark once for each of several levels of each fault and print N-rate against them
+    Sweep(Sweep),
+    /// Open a window in which the policy runs at real time, one episode after the other (needs the cargo feature `viewer`, an X display and
+    /// EGL): mouse for the camera, keys to pause, step, change the speed and start again. Closing it ends the run with what was finished
+    View(Rollouts),
+    /// Run the episodes, and film one of the first instruction (needs the cargo feature `record`, and EGL, which needs no display)
+    Record(Record),
+}
+
+/// Which policy, and how its kernels run.
+#[derive(Debug, Args)]
+pub struct PolicyArguments {
     /// The policy bundle (ONNX)
     #[arg(long)]
     pub model: PathBuf,
@@ -16,12 +97,28 @@ pub struct Arguments {
     /// bundle is compiled with 32-bit weights
     #[arg(long, value_name = "LADS")]
     pub image: Option<PathBuf>,
+    /// Instructions that the kernels run on; left out, the widest of this CPU. The results have the same bits on all
+    #[arg(long)]
+    pub isa: Option<IsaName>,
+}
+
+/// Instruction sets by name.
+#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+pub enum IsaName {
+    Portable,
+    Avx2,
+    Avx512,
+}
+
+/// Which episodes run.
+#[derive(Debug, Args)]
+pub struct EpisodeArguments {
     /// Run only this instruction, by its text or its id; any other sentence goes through the language encoder
     #[arg(long)]
     pub instruction: Option<String>,
-    /// Episodes of each instruction; left out, 2, and with --verify all that the reference has
-    #[arg(long)]
-    pub episodes: Option<u32>,
+    /// Episodes of each instruction
+    #[arg(long, default_value_t = 2)]
+    pub episodes: u32,
     /// Seed of all random streams; the same seed gives the same episodes on any number of threads
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
@@ -34,52 +131,10 @@ pub struct Arguments {
     /// Sample plans from the policy's distribution instead of taking the likeliest
     #[arg(long)]
     pub sample: bool,
-    /// Draw uniform random actions instead of asking the policy: the floor that it is measured against
-    #[arg(long, conflicts_with_all = ["sample", "log", "plans", "monitor", "report", "record", "sweep"])]
-    pub uniform: bool,
-    /// Write the results to this file as JSON (its form: sim-harness/proof/results.schema.json); of --encode, the plans
-    #[arg(long)]
-    pub json: Option<PathBuf>,
-    /// Instructions that the kernels run on; left out, the widest of this CPU. The results have the same bits on all
-    #[arg(long)]
-    pub isa: Option<IsaName>,
-    /// Run the episodes of a reference and say whether the policy is the reference's: exit code 0 EQUIVALENT, 1 DIFFERENT, 3 INCONCLUSIVE.
-    /// Left out, REFERENCE is the file beside the model that ends in .reference.json
-    #[arg(long, value_name = "REFERENCE", num_args = 0..=1, conflicts_with_all = ["seed", "noise", "sample", "uniform", "json", "report", "record", "log", "replay", "encode", "plans", "monitor", "sweep", "delay_steps", "drop_rate", "noise_scale", "action_lag"])]
-    #[expect(
-        clippy::option_option,
-        reason = "clap's form of an option whose value may be left out"
-    )]
-    pub verify: Option<Option<PathBuf>>,
-    /// Write the certificate of --verify to this file, as JSON (its form: sim-harness/proof/certificate.schema.json) or, where it ends in .html, as
-    /// a page; may be given twice
-    #[arg(long, requires = "verify")]
-    pub certificate: Vec<PathBuf>,
-    /// Write success rates and charts to this file as one HTML page (needs the cargo feature `report`)
-    #[arg(long, value_name = "HTML")]
-    pub report: Option<PathBuf>,
-    /// Open a window in which the policy runs at real time, one episode after the other (needs the cargo feature `viewer`, an X display and
-    /// EGL): mouse for the camera, keys to pause, step, change the speed and start again. Closing it ends the run with what was finished
-    #[arg(long, conflicts_with_all = ["uniform", "verify", "sweep", "replay", "encode", "report", "record"])]
-    pub viewer: bool,
-    #[command(flatten)]
-    pub language: LanguageArguments,
-    #[command(flatten)]
-    pub recordings: RecordingArguments,
-    #[command(flatten)]
-    pub faults: FaultArguments,
-}
-
-/// Instruction sets by name.
-#[derive(Debug, Clone, Copy, clap::ValueEnum)]
-pub enum IsaName {
-    Portable,
-    Avx2,
-    Avx512,
 }
 
 /// Words that the bundle does not bring.
-#[derive(Debug, Args)]
+#[derive(Debug, Default, Args)]
 #[command(next_help_heading = "Language (cargo feature `language`)")]
 pub struct LanguageArguments {
     /// What a sentence outside the bundle's table asks for, separated by commas: the episodes start, last and are judged as the benchmark's
@@ -90,39 +145,11 @@ pub struct LanguageArguments {
     #[arg(long, requires = "instruction")]
     pub sentence_anyway: bool,
     /// Take no word embeddings from the bundle's table: the language encoder hears every instruction
-    #[arg(long, conflicts_with_all = ["verify", "replay", "encode", "uniform"])]
+    #[arg(long)]
     pub encode_language: bool,
     /// Folder of the language encoder; left out, where "make language" puts it
     #[arg(long, value_name = "FOLDER")]
     pub encoder: Option<PathBuf>,
-}
-
-/// Episodes on file.
-#[derive(Debug, Args)]
-#[command(next_help_heading = "Recordings and plans")]
-pub struct RecordingArguments {
-    /// Record every control step into this MCAP file, which Foxglove opens
-    #[arg(long)]
-    pub log: Option<PathBuf>,
-    /// Film an episode of the first instruction that runs into this file: .gif, .mp4 (by ffmpeg), or with a slash at its end a folder of
-    /// PNG; needs the cargo feature `record`, and EGL, which needs no display
-    #[arg(long, value_name = "OUT")]
-    pub record: Option<PathBuf>,
-    /// Which of its episodes, from 0
-    #[arg(long, value_name = "NUMBER", default_value_t = 0, requires = "record")]
-    pub record_episode: u32,
-    /// Run nothing: compute the actions of a log again and name the first step that differs (exit code 1)
-    #[arg(long, value_name = "LOG", conflicts_with_all = ["log", "encode", "plans", "monitor", "json", "instruction", "report", "record", "sweep"])]
-    pub replay: Option<PathBuf>,
-    /// Run nothing: print the plans that the trajectory encoder sees in a log, in the form that --plans takes
-    #[arg(long, value_name = "LOG", conflicts_with_all = ["log", "plans", "monitor", "instruction", "report", "record", "sweep"])]
-    pub encode: Option<PathBuf>,
-    /// Run the low level alone on the plans in this file; an episode ends with its plans
-    #[arg(long, value_name = "FILE")]
-    pub plans: Option<PathBuf>,
-    /// Encode every executed segment and report how often it is the plan that was in force
-    #[arg(long)]
-    pub monitor: bool,
 }
 
 /// A real robot's imperfections.
@@ -141,9 +168,6 @@ pub struct FaultArguments {
     /// Time constant of a first-order lag of the actuators, in control steps
     #[arg(long, value_name = "STEPS", default_value_t = 0.0)]
     pub action_lag: f64,
-    /// Run the benchmark once for each of several levels of each fault and print N-rate against them
-    #[arg(long, conflicts_with_all = ["log", "report", "record", "plans", "monitor", "delay_steps", "drop_rate", "noise_scale", "action_lag"])]
-    pub sweep: bool,
 }
 
 impl FaultArguments {
@@ -156,4 +180,131 @@ impl FaultArguments {
             action_lag: self.action_lag,
         }
     }
+}
+
+/// What goes into files, and comes out of them.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Results, recordings and plans")]
+pub struct FileArguments {
+    /// Write the results to this file as JSON (its form: sim-harness/proof/results.schema.json)
+    #[arg(long)]
+    pub json: Option<PathBuf>,
+    /// Record every control step into this MCAP file, which Foxglove opens
+    #[arg(long)]
+    pub log: Option<PathBuf>,
+    /// Let the policy follow the plans in this file instead of its own; an episode ends with its plans
+    #[arg(long, value_name = "FILE")]
+    pub plans: Option<PathBuf>,
+    /// Encode every executed segment and report how often it is the plan that was in force
+    #[arg(long)]
+    pub monitor: bool,
+}
+
+/// Episodes, and everything that may be asked of them.
+#[derive(Debug, Args)]
+pub struct Rollouts {
+    #[command(flatten)]
+    pub policy: PolicyArguments,
+    #[command(flatten)]
+    pub episodes: EpisodeArguments,
+    #[command(flatten)]
+    pub files: FileArguments,
+    #[command(flatten)]
+    pub language: LanguageArguments,
+    #[command(flatten)]
+    pub faults: FaultArguments,
+}
+
+#[derive(Debug, Args)]
+pub struct Verify {
+    #[command(flatten)]
+    pub policy: PolicyArguments,
+    /// The reference; left out, the file beside the model that ends in .reference.json
+    #[arg(long, value_name = "FILE")]
+    pub reference: Option<PathBuf>,
+    /// Write the certificate to this file, as JSON (its form: sim-harness/proof/certificate.schema.json) or, where it ends in .html, as a
+    /// page; may be given twice
+    #[arg(long, value_name = "FILE")]
+    pub certificate: Vec<PathBuf>,
+    /// Run only this instruction, by its text or its id
+    #[arg(long)]
+    pub instruction: Option<String>,
+    /// Episodes of each instruction; left out, all that the reference has
+    #[arg(long)]
+    pub episodes: Option<u32>,
+    /// Threads; left out, one per core
+    #[arg(long)]
+    pub threads: Option<usize>,
+}
+
+impl Verify {
+    /// The reference's file.
+    pub fn reference(&self) -> PathBuf {
+        let beside = || self.policy.model.with_extension("reference.json");
+        self.reference.clone().unwrap_or_else(beside)
+    }
+}
+
+#[derive(Debug, Args)]
+pub struct Replay {
+    /// The log, made with --log
+    pub log: PathBuf,
+    #[command(flatten)]
+    pub policy: PolicyArguments,
+}
+
+#[derive(Debug, Args)]
+pub struct Encode {
+    /// The log, made with --log
+    pub log: PathBuf,
+    #[command(flatten)]
+    pub policy: PolicyArguments,
+    /// Write the plans to this file instead
+    #[arg(long)]
+    pub json: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct Sweep {
+    #[command(flatten)]
+    pub policy: PolicyArguments,
+    #[command(flatten)]
+    pub episodes: EpisodeArguments,
+    /// Write the results to this file as JSON
+    #[arg(long)]
+    pub json: Option<PathBuf>,
+    #[command(flatten)]
+    pub language: LanguageArguments,
+}
+
+#[derive(Debug, Args)]
+pub struct Record {
+    /// The film: .gif, .mp4 (by ffmpeg), or with a slash at its end a folder of PNG
+    pub out: PathBuf,
+    /// Which episode of the first instruction that runs is filmed, from 0
+    #[arg(long, value_name = "NUMBER", default_value_t = 0)]
+    pub episode: u32,
+    #[command(flatten)]
+    pub rollouts: Rollouts,
+}
+
+/// What a job wants of its episodes, whichever job it is.
+pub struct Wanted<'a> {
+    pub policy: &'a PolicyArguments,
+    pub language: &'a LanguageArguments,
+    pub instruction: Option<&'a str>,
+    pub episodes: u32,
+    pub seed: u64,
+    pub noise: Option<&'a str>,
+    pub sample: bool,
+    pub uniform: bool,
+    pub faults: Faults,
+    pub plans: Option<&'a Path>,
+    /// How many episodes of each instruction keep their control steps.
+    pub traced: u32,
+    pub threads: usize,
+    /// The job or option that a sentence outside the bundle's table cannot go with, if there is one.
+    pub of_table: Option<&'static str>,
+    /// Whether a sentence outside the table must say what it is judged by.
+    pub judged: bool,
 }

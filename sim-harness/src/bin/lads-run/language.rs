@@ -6,7 +6,7 @@ use lads_sim::environment::Environment;
 use lads_sim::results::{self, Asked, HeardBy, NearestKnown, Results};
 use lads_sim::spoken::{self, Sentence, Unaccepted, WordBook};
 
-use crate::arguments::Arguments;
+use crate::arguments::Wanted;
 use crate::end::{End, refused};
 
 /// What was asked for.
@@ -21,45 +21,40 @@ pub enum Chosen {
 
 impl Chosen {
     /// Reads `--instruction`, and refuses what cannot go with it.
-    pub fn of(arguments: &Arguments, bundle: &Bundle) -> Result<Self, End> {
-        let language = &arguments.language;
-        let Some(wanted) = &arguments.instruction else {
-            return match language.sub_tasks {
+    pub fn of(wanted: &Wanted<'_>, bundle: &Bundle) -> Result<Self, End> {
+        let language = wanted.language;
+        let Some(text) = wanted.instruction else {
+            return match &language.sub_tasks {
                 None => Ok(Self::All),
                 Some(_) => Err(refused(
                     "--sub-tasks: they judge a sentence; give it with --instruction",
                 )),
             };
         };
-        if wanted.trim().is_empty() {
+        if text.trim().is_empty() {
             return Err(refused(format!(
                 "--instruction '{}': an empty sentence; say what is to be done",
-                wanted.escape_debug()
+                text.escape_debug()
             )));
         }
-        let found = bundle.instruction_indices(wanted);
+        let found = bundle.instruction_indices(text);
         if found.is_empty() {
-            let others = [
-                ("--verify", arguments.verify.is_some()),
-                ("--plans", arguments.recordings.plans.is_some()),
-                ("--report", arguments.report.is_some()),
-            ];
-            if let Some((option, _)) = others.iter().find(|(_, given)| *given) {
+            if let Some(of_table) = wanted.of_table {
                 return Err(refused(format!(
-                    "{option}: for instructions of the bundle's table, and '{wanted}' is none{}; leave {option} out",
-                    nearest_texts(bundle, wanted)
+                    "{of_table}: for instructions of the bundle's table, and '{text}' is none{}",
+                    nearest_texts(bundle, text)
                 )));
             }
-            if arguments.faults.sweep && language.sub_tasks.is_none() {
+            if wanted.judged && language.sub_tasks.is_none() {
                 return Err(refused(
-                    "--sweep: a sentence outside the bundle's table has no N-rate; name what it is judged by with --sub-tasks",
+                    "sweep: a sentence outside the bundle's table has no N-rate; name what it is judged by with --sub-tasks",
                 ));
             }
-            return Ok(Self::Sentence(wanted.clone()));
+            return Ok(Self::Sentence(text.to_owned()));
         }
         if language.sub_tasks.is_some() {
             return Err(refused(format!(
-                "--sub-tasks: '{wanted}' is in the bundle's table, with its own; leave --sub-tasks out"
+                "--sub-tasks: '{text}' is in the bundle's table, with its own; leave --sub-tasks out"
             )));
         }
         Ok(Self::Known(
@@ -79,13 +74,13 @@ impl Chosen {
     /// The sentence outside the table, with what it is judged by.
     pub fn sentence(
         &self,
-        arguments: &Arguments,
+        wanted: &Wanted<'_>,
         environment: &dyn Environment,
     ) -> Result<Option<Sentence>, End> {
         let Self::Sentence(text) = self else {
             return Ok(None);
         };
-        let sub_tasks = arguments.language.sub_tasks.as_deref();
+        let sub_tasks = wanted.language.sub_tasks.as_deref();
         let sentence = Sentence::new(text, sub_tasks, environment);
         sentence
             .map(Some)
@@ -128,14 +123,14 @@ impl Heard<'_> {
 
 /// Lets the language encoder hear what the table does not have, or, with `--encode-language`, everything.
 pub fn hear<'p>(
-    arguments: &Arguments,
+    wanted: &Wanted<'_>,
     bundle: &'p Bundle,
     policy: &Policy<'_>,
     chosen: &Chosen,
 ) -> Result<Heard<'p>, End> {
     match chosen {
-        Chosen::Sentence(text) => hear_sentence(arguments, bundle, policy, text),
-        _ if arguments.language.encode_language => hear_again(arguments, bundle, policy, chosen),
+        Chosen::Sentence(text) => hear_sentence(wanted, bundle, policy, text),
+        _ if wanted.language.encode_language => hear_again(wanted, bundle, policy, chosen),
         _ => Ok(Heard {
             words: WordBook::default(),
             by: None,
@@ -147,7 +142,7 @@ pub fn hear<'p>(
 }
 
 fn hear_sentence<'p>(
-    arguments: &Arguments,
+    wanted: &Wanted<'_>,
     bundle: &'p Bundle,
     policy: &Policy<'_>,
     text: &str,
@@ -158,7 +153,7 @@ fn hear_sentence<'p>(
             nearest_texts(bundle, text)
         )
     };
-    let encoder = encoder::open(arguments, bundle)
+    let encoder = encoder::open(wanted, bundle)
         .map_err(|wrong| refused(format!("{}: {wrong}", not_known())))?;
     let heard = encoder::words(&encoder, text)
         .map_err(|wrong| refused(format!("--instruction {wrong}")))?;
@@ -182,7 +177,7 @@ fn hear_sentence<'p>(
     );
     let first = match accepted {
         Ok(()) => format!("'{shown}': {near}\n\n"),
-        Err(why) if arguments.language.sentence_anyway => {
+        Err(why) if wanted.language.sentence_anyway => {
             format!("'{shown}': {near}; {why}: followed because of --sentence-anyway\n\n")
         }
         Err(why) => {
@@ -214,13 +209,13 @@ fn hear_sentence<'p>(
 }
 
 fn hear_again<'p>(
-    arguments: &Arguments,
+    wanted: &Wanted<'_>,
     bundle: &'p Bundle,
     policy: &Policy<'_>,
     chosen: &Chosen,
 ) -> Result<Heard<'p>, End> {
     let about = |wrong: String| refused(format!("--encode-language: {wrong}"));
-    let encoder = encoder::open(arguments, bundle).map_err(about)?;
+    let encoder = encoder::open(wanted, bundle).map_err(about)?;
     let mut words = WordBook::default();
     let (mut count, mut largest) = (0, 0.0_f32);
     for (instruction, known) in (0..).zip(policy.contract().instructions()) {
@@ -274,11 +269,11 @@ mod encoder {
     pub use lads_language::Encoder;
     use lads_language::default_folder;
 
-    use crate::arguments::Arguments;
+    use crate::arguments::Wanted;
 
-    pub fn open(arguments: &Arguments, bundle: &Bundle) -> Result<Encoder, String> {
+    pub fn open(wanted: &Wanted<'_>, bundle: &Bundle) -> Result<Encoder, String> {
         let contract = bundle.contract();
-        let named = arguments.language.encoder.clone();
+        let named = wanted.language.encoder.clone();
         let language = contract.language.as_ref();
         let language = language.ok_or("the policy takes no instructions in words")?;
         let folder = named.map_or_else(|| default_folder(&language.encoder), Ok);
@@ -296,11 +291,11 @@ mod encoder {
 mod encoder {
     use lads_compiler::Bundle;
 
-    use crate::arguments::Arguments;
+    use crate::arguments::Wanted;
 
     pub enum Encoder {}
 
-    pub fn open(_: &Arguments, _: &Bundle) -> Result<Encoder, String> {
+    pub fn open(_: &Wanted<'_>, _: &Bundle) -> Result<Encoder, String> {
         Err("this lads-run was built without the language encoder; run \"make say\", or build it with \"cargo build --release -p lads-sim --features language\"".to_owned())
     }
 

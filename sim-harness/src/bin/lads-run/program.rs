@@ -3,31 +3,40 @@
 //! What can fail: a bundle that does not compile; an image that cannot be read, is broken or is another bundle's; instructions that this CPU
 //! does not have.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use lads_compiler::Bundle;
 use lads_core::{Isa, Policy};
-use lads_host::Opened;
+use lads_host::{Memory, Opened};
 
-use crate::arguments::{Arguments, IsaName};
+use crate::arguments::{IsaName, PolicyArguments};
 use crate::end::{End, refused};
 
-/// A bundle and the image of it that runs.
+/// A bundle, the image of it that runs, and on which instructions.
 pub struct Program {
     image: Opened,
     bundle: Bundle,
+    model: PathBuf,
+    isa: Isa,
 }
 
 impl Program {
-    pub fn open(arguments: &Arguments) -> Result<Self, End> {
-        let model = &arguments.model;
-        let Some(path) = &arguments.image else {
+    pub fn open(asked: &PolicyArguments) -> Result<Self, End> {
+        let isa = isa(asked.isa)?;
+        let model = &asked.model;
+        let program = |image, bundle| Self {
+            image,
+            bundle,
+            model: model.clone(),
+            isa,
+        };
+        let Some(path) = &asked.image else {
             let image = lads_host::open(model).map_err(refused)?;
             let Some(bundle) = image.bundle().cloned() else {
                 let wrong = "it is a compiled image; name its bundle, and the image with --image";
                 return Err(about(model, &wrong));
             };
-            return Ok(Self { image, bundle });
+            return Ok(program(image, bundle));
         };
         let bundle = Bundle::open(model).map_err(refused)?;
         let image = lads_host::open(path).map_err(refused)?;
@@ -43,12 +52,32 @@ impl Program {
                 ),
             ));
         }
-        Ok(Self { image, bundle })
+        Ok(program(image, bundle))
     }
 
     /// The checked view on the image.
     pub fn policy(&self) -> Policy<'_> {
         self.image.policy()
+    }
+
+    /// The instructions that it runs on.
+    pub fn isa(&self) -> Isa {
+        self.isa
+    }
+
+    /// Replays the bundle's golden episode; a policy that answers differently on this machine is not run.
+    pub fn self_test(&self) -> Result<(), End> {
+        let policy = self.policy();
+        let about = |wrong: &dyn std::fmt::Display| about(&self.model, wrong);
+        let mut memory = Memory::of(&policy).map_err(|error| about(&error))?;
+        let controller = memory.controller_with(&policy, self.isa);
+        let mut controller = controller.map_err(|error| about(&error))?;
+        let tested = controller.self_test().map_err(|error| {
+            about(&format_args!(
+                "the self-test failed: {error}; export the bundle again"
+            ))
+        });
+        tested.map(drop)
     }
 
     /// The bundle that the image is of.
@@ -58,7 +87,7 @@ impl Program {
 }
 
 /// The instructions that were asked for, if this CPU has them.
-pub fn isa(name: Option<IsaName>) -> Result<Isa, End> {
+fn isa(name: Option<IsaName>) -> Result<Isa, End> {
     let Some(name) = name else {
         return Ok(Isa::detect());
     };

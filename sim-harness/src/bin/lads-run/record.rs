@@ -1,4 +1,4 @@
-//! `--record`.
+//! `record`.
 //!
 //! The place, ffmpeg and EGL are looked at before the first episode; filming follows after the last, and is renamed to its place at the end.
 
@@ -23,7 +23,7 @@ mod with {
     use lads_sim::registry::Opener;
     use lads_sim::trace::Trace;
 
-    use crate::arguments::RecordingArguments;
+    use crate::arguments::Record;
     use crate::end::{End, refused};
     use crate::progress_over;
 
@@ -43,7 +43,7 @@ mod with {
     }
 
     fn about(path: &Path, wrong: impl Display) -> End {
-        refused(format!("--record {}: {wrong}", path.display()))
+        refused(format!("record {}: {wrong}", path.display()))
     }
 
     fn failed(path: &Path, error: FilmError) -> End {
@@ -54,26 +54,31 @@ mod with {
     }
 
     /// Whether pictures could be written, before any work.
-    pub fn check(files: &RecordingArguments) -> Result<(), End> {
-        let Some(path) = &files.record else {
+    pub fn check(asked: Option<&Record>) -> Result<(), End> {
+        let Some(Record { out, .. }) = asked else {
             return Ok(());
         };
-        Form::of(path).map(drop).map_err(|error| about(path, error))
+        Form::of(out).map(drop).map_err(|error| about(out, error))
     }
 
-    /// Opens an environment and a camera in it; `None` without `--record`.
+    /// Opens an environment and a camera in it; `None` in other jobs.
     pub fn prepare(
-        files: &RecordingArguments,
+        asked: Option<&Record>,
         evaluation: &Evaluation<'_>,
         open: &Opener,
     ) -> Result<Option<Recording>, End> {
-        let Some(path) = &files.record else {
+        let Some(&Record {
+            out: ref path,
+            episode,
+            ..
+        }) = asked
+        else {
             return Ok(None);
         };
-        let (episode, episodes) = (files.record_episode, evaluation.episodes);
+        let episodes = evaluation.episodes;
         if episode >= episodes {
             return Err(refused(format!(
-                "--record-episode {episode}: there are {episodes} episodes, counted from 0; give more --episodes"
+                "--episode {episode}: there are {episodes} episodes, counted from 0; give more --episodes"
             )));
         }
         let form = Form::of(path).map_err(|error| about(path, error))?;
@@ -149,7 +154,7 @@ mod without {
     use lads_sim::registry::Opener;
     use lads_sim::trace::Trace;
 
-    use crate::arguments::RecordingArguments;
+    use crate::arguments::Record;
     use crate::end::{End, refused};
 
     /// There is none.
@@ -159,11 +164,11 @@ mod without {
     pub enum Film {}
 
     /// Refuses.
-    pub fn check(files: &RecordingArguments) -> Result<(), End> {
-        match &files.record {
+    pub fn check(asked: Option<&Record>) -> Result<(), End> {
+        match asked {
             None => Ok(()),
             Some(_) => Err(refused(
-                "--record: this lads-run was built without pictures; build it with \"cargo build --release -p lads-sim --features record\"",
+                "record: this lads-run was built without pictures; build it with \"cargo build --release -p lads-sim --features record\"",
             )),
         }
     }
@@ -174,7 +179,7 @@ mod without {
         reason = "with pictures there may be no EGL"
     )]
     pub fn prepare(
-        _: &RecordingArguments,
+        _: Option<&Record>,
         _: &Evaluation<'_>,
         _: &Opener,
     ) -> Result<Option<Recording>, End> {

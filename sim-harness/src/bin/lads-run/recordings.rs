@@ -1,11 +1,11 @@
-//! `--log`, `--replay`, `--encode`, `--plans` and `--monitor`.
+//! `replay`, `encode`, `--log`, `--plans` and `--monitor`.
 
 use std::fmt::Write as _;
 use std::path::Path;
 use std::process::ExitCode;
 
 use lads_compiler::Bundle;
-use lads_core::{Channel, Isa, Policy};
+use lads_core::{Channel, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::Evaluation;
 use lads_sim::plans::{self, Agreement, PlanBook, PlanFile, PlanSequence};
@@ -14,8 +14,10 @@ use lads_sim::replay::{self, Difference};
 use lads_sim::trace::Trace;
 use lads_sim::{output, results};
 
+use crate::arguments::{Encode, Replay};
 use crate::end::{End, print, refused, unwritable};
-use crate::progress;
+use crate::program::Program;
+use crate::{given, progress};
 
 /// Exit code of a replay that came out otherwise.
 const DIFFERENT: u8 = 1;
@@ -23,26 +25,27 @@ const DIFFERENT: u8 = 1;
 /// At most so many differences are printed.
 const SHOWN: usize = 10;
 
-fn read(option: &str, path: &Path) -> Result<Log, End> {
-    recorder::read(path).map_err(|error| refused(format!("{option} {}: {error}", path.display())))
+fn read(job: &str, path: &Path) -> Result<Log, End> {
+    recorder::read(path).map_err(|error| refused(format!("{job} {}: {error}", path.display())))
 }
 
 /// Computes a log again.
-pub fn replay(
-    policy: &Policy<'_>,
-    bundle: &Bundle,
-    isa: Isa,
-    path: &Path,
-) -> Result<ExitCode, End> {
-    let log = read("--replay", path)?;
+pub fn replay(asked: &Replay) -> Result<ExitCode, End> {
+    let program = Program::open(&asked.policy)?;
+    program.self_test()?;
+    let (policy, path) = (program.policy(), &asked.log);
+    let log = read("replay", path)?;
     let about = |error: &dyn std::fmt::Display| {
         refused(format!(
-            "--replay {}: {error}; name the bundle that it was recorded with",
+            "replay {}: {error}; name the bundle that it was recorded with",
             path.display()
         ))
     };
     let bar = progress(log.flights.len());
-    let replayed = replay::replay(policy, bundle.contract().period(), isa, &log, &|| bar.inc(1));
+    let replayed = {
+        let period = program.bundle().contract().period();
+        replay::replay(&policy, period, program.isa(), &log, &|| bar.inc(1))
+    };
     bar.finish_and_clear();
     let replayed = replayed.map_err(|error| about(&error))?;
 
@@ -99,15 +102,27 @@ fn said(difference: &Difference) -> String {
 }
 
 /// Prints, or writes, the plans that the encoder sees in a log.
-pub fn encode(policy: &Policy<'_>, path: &Path, json: Option<&Path>) -> Result<ExitCode, End> {
-    let log = read("--encode", path)?;
+pub fn encode(asked: &Encode) -> Result<ExitCode, End> {
+    let (path, json) = (&asked.log, asked.json.as_deref());
+    let inputs = [
+        ("--model", Some(&asked.policy.model)),
+        ("--image", asked.policy.image.as_ref()),
+        ("encode", Some(path)),
+    ];
+    let outputs = given([("--json", asked.json.as_ref())]);
+    output::apart(&given(inputs), &outputs).map_err(refused)?;
+    output::check(&[], &outputs).map_err(refused)?;
+    let program = Program::open(&asked.policy)?;
+    program.self_test()?;
+    let policy = program.policy();
+    let log = read("encode", path)?;
     let about =
-        |error: &dyn std::fmt::Display| refused(format!("--encode {}: {error}", path.display()));
+        |error: &dyn std::fmt::Display| refused(format!("encode {}: {error}", path.display()));
     let recordings = log
         .flights
         .iter()
         .map(|flight| flight.trace.steps.as_slice());
-    let plans = plans::encode(policy, recordings).map_err(|error| about(&error))?;
+    let plans = plans::encode(&policy, recordings).map_err(|error| about(&error))?;
     let sequence = |(flight, plans): (&Flight, Vec<u32>)| PlanSequence {
         instruction: flight.instruction_id.clone(),
         episode: Some(flight.trace.episode),
@@ -115,11 +130,11 @@ pub fn encode(policy: &Policy<'_>, path: &Path, json: Option<&Path>) -> Result<E
     };
     let sequences = log.flights.iter().zip(plans).map(sequence);
     let (sequences, short): (Vec<_>, Vec<_>) = sequences.partition(|it| !it.plans.is_empty());
-    let steps = plans::Segment::of(policy).map_or(0, |segment| segment.steps);
+    let steps = plans::Segment::of(&policy).map_or(0, |segment| segment.steps);
     let file = PlanFile::new(steps, sequences);
     if let Some(first) = short.first() {
         eprintln!(
-            "--encode: {} of {} episodes, {} among them, are shorter than the {} control steps of a plan and have none",
+            "encode: {} of {} episodes, {} among them, are shorter than the {} control steps of a plan and have none",
             short.len(),
             log.flights.len(),
             first.instruction,

@@ -1,4 +1,4 @@
-//! `--sweep`: the benchmark at several levels of each fault, one fault at a time, on the same episodes.
+//! `sweep`: the benchmark at several levels of each fault, one fault at a time, on the same episodes.
 //!
 //! A fault may lead to observations outside the contract, which the controller refuses. Such an episode ends there, as the machine would
 //! stop, and counts as it stands; how many did is told with each level.
@@ -9,7 +9,16 @@ use lads_sim::faults::Faults;
 use lads_sim::results::{Results, Splits};
 use serde::Serialize;
 
-use crate::end::End;
+use std::process::ExitCode;
+use std::sync::atomic::AtomicBool;
+
+use lads_sim::evaluate::Setup;
+use lads_sim::output;
+
+use crate::arguments::{Sweep as Asked, Wanted};
+use crate::bench;
+use crate::end::{End, print, refused, unwritable};
+use crate::{given, some_episodes, threads};
 
 /// Value of the JSON's `format`.
 const FORMAT: &str = "lads-sweep";
@@ -72,11 +81,57 @@ const FAULTS: [(&str, Set, [f64; 5]); 4] = [
     ),
 ];
 
+/// The benchmark once for each level of each fault.
+pub fn run(asked: &Asked, stop: &AtomicBool) -> Result<ExitCode, End> {
+    let episodes = &asked.episodes;
+    some_episodes(Some(episodes.episodes))?;
+    let threads = threads(episodes.threads, false)?;
+    let inputs = [
+        ("--model", Some(&asked.policy.model)),
+        ("--image", asked.policy.image.as_ref()),
+    ];
+    let outputs = given([("--json", asked.json.as_ref())]);
+    output::apart(&given(inputs), &outputs).map_err(refused)?;
+    output::check(&[], &outputs).map_err(refused)?;
+    let wanted = Wanted {
+        policy: &asked.policy,
+        language: &asked.language,
+        instruction: episodes.instruction.as_deref(),
+        episodes: episodes.episodes,
+        seed: episodes.seed,
+        noise: episodes.noise.as_deref(),
+        sample: episodes.sample,
+        uniform: false,
+        faults: Faults::default(),
+        plans: None,
+        traced: 0,
+        threads,
+        of_table: None,
+        judged: true,
+    };
+    bench::with(&wanted, stop, |bench| {
+        // Before the policy moves anything.
+        print(&bench.heard.first)?;
+        let sweep = sweep(|faults, what| {
+            let setup = Setup {
+                faults,
+                stop_where_refused: true,
+                ..bench.evaluation.setup
+            };
+            let (results, evaluated) = bench.run(setup, what)?;
+            Ok((results, evaluated.refused_at))
+        })?;
+        if let Some(path) = &asked.json {
+            output::write_json(&sweep, path).map_err(|error| unwritable("--json", path, &error))?;
+        }
+        print(&sweep.table())?;
+        Ok(ExitCode::SUCCESS)
+    })
+}
+
 /// Runs all levels: `run` runs the benchmark with given faults and says what it came to.
 /// Results come with the control steps at which episodes were refused, in rising order.
-pub fn sweep(
-    run: impl Fn(Faults, &str) -> Result<(Results, Vec<usize>), End>,
-) -> Result<Sweep, End> {
+fn sweep(run: impl Fn(Faults, &str) -> Result<(Results, Vec<usize>), End>) -> Result<Sweep, End> {
     // Without faults all four are the same run.
     let runs = 1 + FAULTS
         .iter()

@@ -1,94 +1,91 @@
-//! `lads-run --verify`: the reference, the certificate, and the verdict as exit code.
+//! `verify`: the reference, the certificate, and the verdict as exit code.
 
 use std::ffi::OsStr;
 use std::fmt;
-use std::path::{Path, PathBuf};
+use std::process::ExitCode;
 use std::sync::atomic::AtomicBool;
 
 use askama::Template as _;
-use lads_compiler::Bundle;
-use lads_sim::evaluate::Evaluation;
+use lads_sim::faults::Faults;
 use lads_sim::output;
-use lads_sim::registry::Opener;
 use lads_sim::results::versions;
 use lads_sim::verify::certificate::Certificate;
 use lads_sim::verify::page::Page;
 use lads_sim::verify::reference::Reference;
 
-use std::process::ExitCode;
+use crate::arguments::{LanguageArguments, Verify, Wanted};
+use crate::bench;
+use crate::end::{End, print, refused, unwritable};
+use crate::{given, progress, some_episodes, threads, unfinished};
 
-use crate::{Arguments, End, print, progress, refused, unfinished, unwritable};
-
-/// The reference that is asked for, read; `None` without `--verify`.
-pub fn reference(arguments: &Arguments) -> Result<Option<Reference>, End> {
-    let Some(named) = &arguments.verify else {
-        return Ok(None);
-    };
-    let path = file(arguments, named.as_deref());
-    Reference::open(&path).map(Some).map_err(refused)
-}
-
-/// The reference's file: the one that is named, else the one beside the model.
-pub fn file(arguments: &Arguments, named: Option<&Path>) -> PathBuf {
-    let beside = || arguments.model.with_extension("reference.json");
-    named.map_or_else(beside, Path::to_owned)
-}
-
-/// Makes `evaluation` the reference's: seed, decision rule, episodes and traces.
-pub fn prepare(
-    evaluation: &mut Evaluation<'_>,
-    reference: &Reference,
-    episodes: Option<u32>,
-) -> Result<(), End> {
+/// Runs the verification, writes and prints the certificate; gives the exit code.
+pub fn run(asked: &Verify, stop: &AtomicBool) -> Result<ExitCode, End> {
+    some_episodes(asked.episodes)?;
+    let threads = threads(asked.threads, false)?;
+    let file = asked.reference();
+    let inputs = [
+        ("--model", Some(&asked.policy.model)),
+        ("--image", asked.policy.image.as_ref()),
+        ("--reference", Some(&file)),
+    ];
+    let certificates = asked.certificate.iter();
+    let outputs = given(certificates.map(|path| ("--certificate", Some(path))));
+    output::apart(&given(inputs), &outputs).map_err(refused)?;
+    output::check(&[], &outputs).map_err(refused)?;
+    let reference = Reference::open(&file).map_err(refused)?;
     let most = reference.episodes_per_instruction;
-    let episodes = episodes.unwrap_or(most);
+    let episodes = asked.episodes.unwrap_or(most);
     if episodes > most {
         return Err(refused(format!(
             "--episodes {episodes}: the reference has {most} of each instruction; give at most that, or make a larger one: make reference"
         )));
     }
-    evaluation.episodes = episodes;
-    evaluation.seed = reference.seed;
-    // The contract's own rule, whatever the reference's was: the certificate compares the two.
-    evaluation.decision = evaluation.policy.contract().decision();
-    evaluation.setup.traced = reference.traced_episodes.min(episodes);
-    Ok(())
-}
-
-/// Runs the verification, writes and prints the certificate; gives the exit code.
-pub fn run(
-    evaluation: &Evaluation<'_>,
-    bundle: &Bundle,
-    reference: &Reference,
-    open: &Opener,
-    certificates: &[PathBuf],
-    stop: &AtomicBool,
-) -> Result<ExitCode, End> {
-    let bar = progress(lads_sim::verify::work(evaluation));
-    let certificate = lads_sim::verify::run(
-        evaluation,
-        bundle,
-        reference,
-        open,
-        versions(),
-        stop,
-        &|| {
-            bar.inc(1);
-        },
-    );
-    bar.finish_and_clear();
-    let certificate = certificate.map_err(unfinished)?;
-    for path in certificates {
-        let written = if path.extension() == Some(OsStr::new("html")) {
-            let page = Page::new(&certificate).render().map_err(refused)?;
-            output::write(path, page.as_bytes())
-        } else {
-            output::write_json(&certificate, path)
-        };
-        written.map_err(|error| unwritable("--certificate", path, &error))?;
-    }
-    print(&Summary(&certificate))?;
-    Ok(ExitCode::from(certificate.verdict.exit_code()))
+    // The decision is by the contract's own rule, whatever the reference's was: the certificate compares the two.
+    let wanted = Wanted {
+        policy: &asked.policy,
+        language: &LanguageArguments::default(),
+        instruction: asked.instruction.as_deref(),
+        episodes,
+        seed: reference.seed,
+        noise: Some(&reference.noise),
+        sample: false,
+        uniform: false,
+        faults: Faults::default(),
+        plans: None,
+        traced: reference.traced_episodes.min(episodes),
+        threads,
+        of_table: Some("verify"),
+        judged: false,
+    };
+    bench::with(&wanted, stop, |bench| {
+        let subject = lads_sim::verify::subject(bench.bundle, bench.environment);
+        reference.check(&subject).map_err(refused)?;
+        let bar = progress(lads_sim::verify::work(&bench.evaluation));
+        let certificate = lads_sim::verify::run(
+            &bench.evaluation,
+            bench.bundle,
+            &reference,
+            bench.open,
+            versions(),
+            stop,
+            &|| {
+                bar.inc(1);
+            },
+        );
+        bar.finish_and_clear();
+        let certificate = certificate.map_err(unfinished)?;
+        for path in &asked.certificate {
+            let written = if path.extension() == Some(OsStr::new("html")) {
+                let page = Page::new(&certificate).render().map_err(refused)?;
+                output::write(path, page.as_bytes())
+            } else {
+                output::write_json(&certificate, path)
+            };
+            written.map_err(|error| unwritable("--certificate", path, &error))?;
+        }
+        print(&Summary(&certificate))?;
+        Ok(ExitCode::from(certificate.verdict.exit_code()))
+    })
 }
 
 /// The certificate on a terminal.

@@ -1,4 +1,4 @@
-//! `--viewer`.
+//! `view`.
 //!
 //! The display and EGL are looked at before the first episode. A window that is closed ends the run with what was finished.
 
@@ -16,7 +16,6 @@ mod with {
     use lads_sim::registry::Opener;
     use lads_sim::viewer::{self, Texts, Viewer as Window, ViewerError};
 
-    use crate::arguments::Arguments;
     use crate::end::{End, refused};
     use crate::{progress, unfinished};
 
@@ -29,25 +28,25 @@ mod with {
     fn about(error: ViewerError) -> End {
         match error {
             ViewerError::Picture(FilmError::Interrupted) => End::Interrupted,
-            error => refused(format!("--viewer: {error}")),
+            error => refused(format!("view: {error}")),
         }
     }
 
     /// Whether there may be a display, before any work.
-    pub fn check(arguments: &Arguments) -> Result<(), End> {
-        if arguments.viewer {
+    pub fn check(asked: bool) -> Result<(), End> {
+        if asked {
             viewer::check().map_err(about)?;
         }
         Ok(())
     }
 
-    /// Connects to the display and opens a camera; `None` without `--viewer`.
+    /// Connects to the display and opens a camera; `None` in other jobs.
     pub fn prepare(
-        arguments: &Arguments,
+        asked: bool,
         evaluation: &Evaluation<'_>,
         open: &Opener,
     ) -> Result<Option<Viewer>, End> {
-        if !arguments.viewer {
+        if !asked {
             return Ok(None);
         }
         let mut environment = open();
@@ -101,19 +100,18 @@ mod without {
     use lads_sim::evaluate::{Evaluated, Evaluation};
     use lads_sim::registry::Opener;
 
-    use crate::arguments::Arguments;
     use crate::end::{End, refused};
 
     /// There is none.
     pub enum Viewer {}
 
     /// Refuses.
-    pub fn check(arguments: &Arguments) -> Result<(), End> {
-        if !arguments.viewer {
+    pub fn check(asked: bool) -> Result<(), End> {
+        if !asked {
             return Ok(());
         }
         Err(refused(
-            "--viewer: this lads-run was built without a window; build it with \"cargo build --release -p lads-sim --features viewer\"",
+            "view: this lads-run was built without a window; build it with \"cargo build --release -p lads-sim --features viewer\"",
         ))
     }
 
@@ -122,7 +120,7 @@ mod without {
         clippy::unnecessary_wraps,
         reason = "with a window there may be no display"
     )]
-    pub fn prepare(_: &Arguments, _: &Evaluation<'_>, _: &Opener) -> Result<Option<Viewer>, End> {
+    pub fn prepare(_: bool, _: &Evaluation<'_>, _: &Opener) -> Result<Option<Viewer>, End> {
         Ok(None)
     }
 
