@@ -250,10 +250,10 @@ fn bad_bundles_are_refused() {
     let newer = altered(
         &tiny_bundle(),
         folder.path(),
-        r#"{"version": 1, "kind""#,
-        r#"{"version": 7, "kind""#,
+        r#"{"version": 2, "family""#,
+        r#"{"version": 7, "family""#,
     );
-    refused(&newer, &[], &["altered.onnx", "version 7", "version 1"]);
+    refused(&newer, &[], &["altered.onnx", "version 7", "version 2"]);
 }
 
 #[test]
