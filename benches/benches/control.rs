@@ -78,7 +78,7 @@ fn entries(criterion: &mut Criterion, controller: &mut Controller<'_, '_>) {
     let steps: Vec<_> = golden.steps().take(period(&policy)).collect();
     let observations: Vec<f32> = steps
         .iter()
-        .flat_map(|step| step.observation())
+        .flat_map(lads_core::GoldenStep::observation)
         .copied()
         .collect();
     let actions: Vec<f32> = steps.iter().flat_map(|step| step.action).copied().collect();

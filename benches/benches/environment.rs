@@ -10,7 +10,6 @@ use lads_core::{Decision, Isa, Policy};
 use lads_sim::assets::vendor_dir;
 use lads_sim::environment::{Environment, EpisodeSeed};
 use lads_sim::evaluate::{Assignment, Evaluation};
-use lads_sim::fit;
 use lads_sim::rollout::Actor;
 
 /// Control steps of an episode.
@@ -51,18 +50,19 @@ fn evaluation(criterion: &mut Criterion) {
     let image = compile(&bundle).expect("it compiles");
     let policy = Policy::new_checked(image.as_bytes()).expect("its image is sound");
     let kitchen: Box<dyn Environment> = open();
-    let commanded = policy.contract().instruction(0).map(|known| {
-        let tasks = fit::sub_tasks(known.sub_tasks);
-        let index = |task| kitchen.sub_tasks().iter().position(|known| *known == task);
-        tasks.filter_map(index).collect()
-    });
+    let (asked, _) = bundle.contract().evaluated(0);
+    let commanded = asked
+        .iter()
+        .filter_map(|task| kitchen.sub_tasks().iter().position(|known| known == task))
+        .collect();
     let assignments = [Assignment {
         instruction: 0,
-        commanded: commanded.expect("the policy knows an instruction"),
+        commanded,
         max_steps: STEPS,
     }];
     let evaluation = Evaluation {
         policy,
+        contract: bundle.contract(),
         assignments: &assignments,
         episodes: 1,
         seed: 0,

@@ -3,7 +3,8 @@
 # usage: runtime/ffi/archive.sh <output file> [<target>]
 # LADS_OPS says which groups of operations a policy needs; without it all are in, and every image runs. It is a list of features of
 # the crate lads-ffi, separated by commas (Cargo.toml names them); an image that needs what was left out is refused when it is opened:
-#     LADS_OPS=attention,layer-norm,softmax runtime/ffi/archive.sh build/liblads.a
+#     LADS_OPS=lads runtime/ffi/archive.sh build/liblads.a                   the family of the shipped policies
+#     LADS_OPS=lads,half-weights,half-cache runtime/ffi/archive.sh ...       the same with 16-bit weights and cache
 # Needs cargo and binutils; for another target set LD, OBJCOPY, AR and NM to its tools, and CARGO_FLAGS to what cargo needs for it.
 set -eu
 output=$1

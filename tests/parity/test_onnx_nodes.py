@@ -8,13 +8,14 @@ import os
 import pathlib
 import re
 import subprocess
+import types
 import warnings
 
 import pytest
 
 np = pytest.importorskip("numpy")
 onnx = pytest.importorskip("onnx")
-from onnx import numpy_helper  # noqa: E402
+from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 # The Makefile's: with another one cargo would build tract once more.
@@ -71,6 +72,25 @@ def write(case, folder):
     return True
 
 
+def gru(linear_before_reset):
+    """A GRU of three steps whose expected outputs are ONNX Runtime's: the package has no case of the variant that PyTorch exports."""
+    ort = pytest.importorskip("onnxruntime")
+    steps, batch, width, hidden = 3, 2, 4, 5
+    shapes = {"X": [steps, batch, width], "W": [1, 3 * hidden, width], "R": [1, 3 * hidden, hidden], "B": [1, 6 * hidden]}
+    random = np.random.default_rng(7 + linear_before_reset)
+    inputs = {name: random.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
+    results = {"Y": [steps, 1, batch, hidden], "Y_h": [1, batch, hidden]}
+    declared = [
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in part.items()] for part in (shapes, results)
+    ]
+    node = helper.make_node("GRU", list(shapes), list(results), hidden_size=hidden, linear_before_reset=linear_before_reset)
+    graph = helper.make_graph([node], "gru", *declared)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    outputs = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"]).run(None, inputs)
+    name = f"gru_linear_before_reset_{linear_before_reset}"
+    return types.SimpleNamespace(name=name, model=model, data_sets=[(list(inputs.values()), outputs)])
+
+
 def test_node_cases(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -79,6 +99,9 @@ def test_node_cases(tmp_path):
         cases = collect_testcases(None)
     written = sum(write(case, tmp_path) for case in cases)
     assert written > 300
+    for case in map(gru, (0, 1)):
+        assert write(case, tmp_path)
+        written += 1
     command = ["cargo", "test", *SELECTION, "--lib", "onnx_node_cases", "--", "--nocapture"]
     done = subprocess.run(command, cwd=ROOT, env=os.environ | {"LADS_ONNX_NODES": str(tmp_path)}, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]

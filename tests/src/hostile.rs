@@ -6,12 +6,15 @@
 
 use std::sync::OnceLock;
 
-use lads_compiler::{Bundle, CacheFormat, Options, WeightFormat, compile, compile_with};
-use lads_core::{GuardConfig, GuardedController, Instruction, Policy, Tick};
+use lads_compiler::{Bundle, CacheFormat, Image, Options, WeightFormat, compile, compile_with};
+use lads_core::{
+    ChannelId, DType, Data, GuardConfig, GuardedController, Instruction, Policy, Tick,
+};
 use lads_host::Memory;
 use lads_image::format::{CRC_WORD, crc32};
 
-use crate::wire;
+use crate::episode::{FOLDER, KINDS, folder};
+use crate::{compiled, wire};
 
 /// Bytes of one edit.
 const EDIT_BYTES: usize = 8;
@@ -71,10 +74,15 @@ fn script(bytes: &[u8]) -> impl Iterator<Item = Edit> {
 /// The small bundle.
 const TINY: &[u8] = include_bytes!("../../runtime/compiler/tests/data/tiny.onnx");
 
-/// The small bundle's images: exact, and with weights and cache of fewer bits.
-fn tiny_images() -> &'static [Vec<u32>; 2] {
-    static IMAGES: OnceLock<[Vec<u32>; 2]> = OnceLock::new();
+/// The images that are edited: the small bundle's, exact and with weights and cache of fewer bits, and where the parity tests have
+/// made them, one of every family.
+fn images() -> &'static [Vec<u32>] {
+    static IMAGES: OnceLock<Vec<Vec<u32>>> = OnceLock::new();
     IMAGES.get_or_init(|| {
+        let words = |image: &Image| {
+            let (words, _) = image.as_bytes().as_chunks::<4>();
+            words.iter().map(|&word| u32::from_le_bytes(word)).collect()
+        };
         let bundle = Bundle::from_bytes(TINY).expect("the bundle is sound");
         let smaller = Options {
             weights: WeightFormat::Int8,
@@ -83,11 +91,15 @@ fn tiny_images() -> &'static [Vec<u32>; 2] {
             force: true,
             ..Options::default()
         };
-        [Options::default(), smaller].map(|options| {
-            let image = compile_with(&bundle, options).expect("it compiles");
-            let (words, _) = image.as_bytes().as_chunks::<4>();
-            words.iter().map(|&word| u32::from_le_bytes(word)).collect()
-        })
+        let mut images: Vec<Vec<u32>> = [Options::default(), smaller]
+            .iter()
+            .map(|&options| words(&compile_with(&bundle, options).expect("it compiles")))
+            .collect();
+        if std::env::var_os(FOLDER).is_some() {
+            let family = |kind| words(&compiled(&folder().join(format!("{kind}.onnx"))));
+            images.extend(KINDS.into_iter().map(family));
+        }
+        images
     })
 }
 
@@ -97,8 +109,8 @@ fn tiny_images() -> &'static [Vec<u32>; 2] {
 ///
 /// When anything panics, or an action is not finite.
 pub fn image(edits: &[u8]) {
-    let which = edits.len() % 2;
-    let mut words = tiny_images()[which].clone();
+    let images = images();
+    let mut words = images[edits.len() % images.len()].clone();
     let mut len = words.len() * 4;
     for Edit { kind, place, value } in script(edits) {
         // The tables come first: most edits go there.
@@ -127,8 +139,45 @@ pub fn image(edits: &[u8]) {
     open_and_drive(&bytes);
 }
 
-/// Opens an image and drives what opens through a guard.
-fn open_and_drive(bytes: &[u8]) {
+/// The most multiply-adds of a step that these tests wait for; a policy that wants more is refused when it is opened.
+const MOST_WORK: u64 = 1 << 24;
+
+/// The values of an observation channel, in memory of their own.
+enum Values {
+    F32(Vec<f32>),
+    U8(Vec<u8>),
+    I32(Vec<i32>),
+}
+
+impl Values {
+    fn data(&self) -> Data<'_> {
+        match self {
+            Self::F32(values) => Data::F32(values),
+            Self::U8(values) => Data::U8(values),
+            Self::I32(values) => Data::I32(values),
+        }
+    }
+}
+
+/// Opens an image and drives what opens through a guard: the self-test, then steps of two instructions.
+///
+/// # Panics
+///
+/// When anything panics, or an action is outside the limits.
+pub fn open_and_drive(bytes: &[u8]) {
+    drive(bytes, true, 12);
+}
+
+/// Opens an image and takes what opens a few steps far, as [`open_and_drive`] does, without the self-test: for very many images.
+///
+/// # Panics
+///
+/// When anything panics, or an action is outside the limits.
+pub fn open_and_step(bytes: &[u8]) {
+    drive(bytes, false, 3);
+}
+
+fn drive(bytes: &[u8], tested: bool, steps: u64) {
     // In memory that is aligned as images have to be, and not a byte longer.
     let mut aligned = vec![0_u64; bytes.len().div_ceil(8)];
     for (to, from) in aligned.iter_mut().zip(bytes.chunks(8)) {
@@ -137,14 +186,13 @@ fn open_and_drive(bytes: &[u8]) {
         *to = u64::from_ne_bytes(word);
     }
     let aligned: &[u8] = bytemuck::cast_slice(&aligned);
-    let Ok(policy) = Policy::new_checked(&aligned[..bytes.len()]) else {
+    let Ok(policy) = Policy::new_within(&aligned[..bytes.len()], MOST_WORK) else {
         return;
     };
     policy.checksum_matches();
     let contract = policy.contract();
-    let elements = contract
-        .observation_len()
-        .saturating_add(contract.action_len());
+    let observed = contract.observations().map(|channel| channel.len());
+    let elements = observed.fold(contract.action_len(), usize::saturating_add);
     let lens = [policy.arena_len(), policy.state_len(), elements];
     if lens.iter().any(|&len| len > MOST_ELEMENTS) {
         let bytes = lens[0].saturating_add(lens[1]).saturating_mul(4);
@@ -159,31 +207,43 @@ fn open_and_drive(bytes: &[u8]) {
         .expect("there is as much as it asks for");
     let mut guarded = GuardedController::new(controller, &GuardConfig::default(), &mut guard)
         .expect("the contract's own limits are sound");
-    let _ = guarded.self_test();
+    if tested {
+        let _ = guarded.self_test();
+    }
     guarded.arm_untested();
     let middle = |min: f32, max: f32| min / 2.0 + max / 2.0;
-    let observation = contract.observation().limits();
-    let observation: Vec<_> = observation
-        .map(|limits| middle(limits.min, limits.max))
+    let observations: Vec<(ChannelId, Values)> = contract
+        .observations()
+        .map(|channel| {
+            let middles = channel
+                .limits()
+                .map(|limits| middle(limits.min, limits.max));
+            let values = match channel.dtype() {
+                DType::F32 => Values::F32(middles.collect()),
+                DType::U8 => Values::U8(middles.map(|x| x as u8).collect()),
+                DType::I32 => Values::I32(middles.map(|x| x as i32).collect()),
+            };
+            (channel.id(), values)
+        })
+        .collect();
+    let inputs: Vec<(ChannelId, Data)> = observations
+        .iter()
+        .map(|(id, values)| (*id, values.data()))
         .collect();
     let limits: Vec<_> = contract.action_limits().collect();
     let mut action = vec![0.0; contract.action_len()];
     for number in 0..2 {
         let _ = guarded.set_instruction(Instruction::Id(number));
-        for timestamp in 0..12 {
+        for timestamp in 0..steps {
             let tick = Tick {
                 timestamp,
                 missed: 0,
             };
-            let _ = guarded.step(
-                &observation,
-                Some(tick).filter(|_| number == 0),
-                &mut action,
-            );
+            let _ = guarded.step_with(&inputs, Some(tick).filter(|_| number == 0), &mut action);
             let inside = action
                 .iter()
                 .zip(&limits)
-                .all(|(x, limits)| x.is_finite() && limits.clamp(*x) == *x);
+                .all(|(x, e)| x.is_finite() && e.clamp(*x) == *x);
             assert!(inside, "{action:?}");
             guarded.resume();
         }

@@ -2,6 +2,7 @@
 #![forbid(unsafe_code)]
 
 pub mod documents;
+pub mod episode;
 pub mod hostile;
 mod wire;
 

@@ -1,20 +1,28 @@
-//! The work of a control step does not depend on what is observed: under `callgrind`, the same number of instructions for a hundred
-//! random observations at the same context, of an ordinary step and of one that decides or draws its plan, with 32-bit weights and
-//! with integers. Skipped where `valgrind` is missing.
+//! The work of a control step does not depend on what is observed: under `callgrind`, the same number of instructions for random
+//! observations at the same place in the schedule. Skipped where `valgrind` is missing.
 //!
-//! The test runs its own binary once more under `callgrind`, which counts what [`one_control_step`] executes and writes one file
+//! The kitchen's policy: an ordinary step and one that decides or draws its plan, with 32-bit weights and with integers. Random policies
+//! of every family, where the parity tests have made them: every step from the start of a context to the second selection and beyond.
+//!
+//! The tests run their own binary once more under `callgrind`, which counts what [`one_control_step`] executes and writes one file
 //! for each call. Valgrind knows no AVX-512, so what is counted are the AVX2 kernels, or on older processors the portable ones.
 #![cfg(target_os = "linux")]
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::hint::black_box;
+use std::path::Path;
 use std::process::Command;
 
-use lads_compiler::{Bundle, Memory, Options, WeightFormat, compile_with};
-use lads_core::{Controller, Decision, Instruction, Policy, StepReport};
+use lads_compiler::{Bundle, Options, WeightFormat, compile_with};
+use lads_core::{ChannelId, Controller, DType, Data, Decision, Instruction, Policy, StepReport};
+use lads_host::{Aligned, Memory};
+use lads_tests::episode::{KINDS, folder};
 use lads_tests::project_path;
 
-/// Names the case to the program under `callgrind`.
+/// Names the image to the program under `callgrind`.
+const IMAGE: &str = "LADS_IMAGE_UNDER_CALLGRIND";
+
+/// Names the number of the case to it.
 const CHILD: &str = "LADS_STEPS_UNDER_CALLGRIND";
 
 /// How plans are drawn, where they are.
@@ -35,6 +43,10 @@ const CASES: [(WeightFormat, Decision, usize); 5] = [
 /// Observations of which the steps are counted.
 const OBSERVATIONS: usize = 100;
 
+/// Episodes of a random policy, and steps of each; no random policy selects more seldom than in every tenth step.
+const EPISODES: usize = 12;
+const STEPS: usize = 22;
+
 /// What is counted; a name that the tool can be told.
 #[inline(never)]
 #[unsafe(no_mangle)]
@@ -44,71 +56,175 @@ const OBSERVATIONS: usize = 100;
 )]
 fn one_control_step(
     controller: &mut Controller<'_, '_>,
-    observation: &[f32],
+    inputs: &[(ChannelId, Data<'_>)],
     action: &mut [f32],
 ) -> StepReport {
-    controller.step(black_box(observation), action).unwrap()
+    controller.step_with(black_box(inputs), action).unwrap()
 }
 
-/// A step of an episode, with observations from all over the contract's limits.
-fn steps((weights, decision, before): (WeightFormat, Decision, usize)) {
-    let bundle = Bundle::open(&project_path("models/kitchen.onnx")).unwrap();
-    let options = Options {
-        weights,
-        tolerance: Some(0.1),
-        ..Options::default()
-    };
-    let image = compile_with(&bundle, options).unwrap();
-    let policy = Policy::new_checked(image.as_bytes()).unwrap();
-    let mut memory = Memory::of(&policy).expect("there is memory");
-    let mut controller = memory.controller(&policy).unwrap();
-    controller.set_decision(decision);
-    let mut action = vec![0.0; policy.contract().action_len()];
-    let (first, _, _) = policy.golden().unwrap().steps().next().unwrap();
-    controller.set_instruction(Instruction::Id(0)).unwrap();
-    let mut state = 1_u64;
-    let mut random = || {
-        state = state
+/// Numbers from 0 to 1, always the same ones.
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> f32 {
+        self.0 = self
+            .0
             .wrapping_mul(6364136223846793005)
             .wrapping_add(1442695040888963407);
-        (state >> 40) as f32 / (1_u64 << 24) as f32
-    };
+        (self.0 >> 40) as f32 / (1_u64 << 24) as f32
+    }
+}
+
+/// Random values of every observation channel, and the steps that see them.
+struct Observed<'p> {
+    policy: Policy<'p>,
+    floats: Vec<(ChannelId, Vec<f32>)>,
+    bytes: Vec<(ChannelId, Vec<u8>)>,
+}
+
+impl<'p> Observed<'p> {
+    fn new(policy: &Policy<'p>) -> Self {
+        Self {
+            policy: *policy,
+            floats: vec![],
+            bytes: vec![],
+        }
+    }
+
+    /// From all over the contract's limits.
+    fn draw(&mut self, random: &mut Random) {
+        self.floats.clear();
+        self.bytes.clear();
+        for channel in self.policy.contract().observations() {
+            // Limits may be as wide as all numbers; a machine's are not.
+            let values = channel.limits().map(|limits| {
+                let (min, max) = (limits.min.max(-10.0), limits.max.min(10.0));
+                min + (max - min) * random.next()
+            });
+            match channel.dtype() {
+                DType::F32 => self.floats.push((channel.id(), values.collect())),
+                DType::U8 => {
+                    let bytes = values.map(|x| x as u8).collect();
+                    self.bytes.push((channel.id(), bytes));
+                }
+                DType::I32 => unreachable!("no policy here observes integers"),
+            }
+        }
+    }
+
+    fn inputs(&self) -> Vec<(ChannelId, Data<'_>)> {
+        let floats = self.floats.iter();
+        let floats = floats.map(|(id, values)| (*id, Data::F32(values)));
+        let bytes = self.bytes.iter();
+        let bytes = bytes.map(|(id, values)| (*id, Data::U8(values)));
+        floats.chain(bytes).collect()
+    }
+}
+
+/// Opens the image that the parent wrote.
+fn with_image(work: impl FnOnce(Policy<'_>)) {
+    let path = std::env::var_os(IMAGE).expect("the parent names it");
+    let image = Aligned::new(&std::fs::read(path).unwrap());
+    work(Policy::new_checked(image.as_bytes()).unwrap());
+}
+
+/// A step of an episode of the kitchen's policy, over and over.
+fn steps((_, decision, before): (WeightFormat, Decision, usize), policy: &Policy<'_>) {
+    let mut memory = Memory::of(policy).expect("there is memory");
+    let mut controller = memory.controller(policy).unwrap();
+    controller.set_decision(decision);
+    let mut action = vec![0.0; policy.contract().action_len()];
+    let first = policy.golden().unwrap().step(0).unwrap();
+    controller.set_instruction(Instruction::Id(0)).unwrap();
+    let (mut random, mut observed) = (Random(1), Observed::new(policy));
     for _ in 0..OBSERVATIONS {
         controller.reset();
         for _ in 0..before {
-            controller.step(first, &mut action).unwrap();
+            controller.step(first.observation(), &mut action).unwrap();
         }
-        // Limits may be as wide as all numbers; a machine's are not.
-        let observation: Vec<f32> = (policy.contract().observations())
-            .map(|element| {
-                let (min, max) = (element.limits.min.max(-10.0), element.limits.max.min(10.0));
-                min + (max - min) * random()
-            })
-            .collect();
-        let report = one_control_step(&mut controller, &observation, &mut action);
-        assert_eq!(report.decided, before % 10 == 0);
+        observed.draw(&mut random);
+        let report = one_control_step(&mut controller, &observed.inputs(), &mut action);
+        let selected = report.selected.expect("it selects plans");
+        assert_eq!(selected.fresh, before % 10 == 0);
+    }
+}
+
+/// The first steps of a random policy's contexts, each with observations of its own.
+fn episodes(policy: &Policy<'_>) {
+    let mut memory = Memory::of(policy).expect("there is memory");
+    let mut controller = memory.controller(policy).unwrap();
+    let mut action = vec![0.0; policy.contract().action_len()];
+    if policy.contract().instruction_channel().is_some() {
+        controller.set_instruction(Instruction::Id(0)).unwrap();
+    }
+    let (mut random, mut observed) = (Random(1), Observed::new(policy));
+    for _ in 0..EPISODES {
+        controller.reset();
+        for step in 0..STEPS {
+            observed.draw(&mut random);
+            let report = one_control_step(&mut controller, &observed.inputs(), &mut action);
+            let context = policy.contract().context_steps().unwrap_or(STEPS);
+            assert_eq!(report.timestep as usize, step % context);
+        }
     }
 }
 
 #[test]
 fn a_step_executes_the_same_number_of_instructions_whatever_it_observes() {
+    const NAME: &str = "a_step_executes_the_same_number_of_instructions_whatever_it_observes";
     if let Some(case) = std::env::var_os(CHILD) {
         let case: usize = case.to_str().and_then(|case| case.parse().ok()).unwrap();
-        return steps(CASES[case]);
+        return with_image(|policy| steps(CASES[case], &policy));
     }
+    let bundle = Bundle::open(&project_path("models/kitchen.onnx")).unwrap();
     for (number, case) in CASES.iter().enumerate() {
-        let Some(different) = counts(number) else {
+        let options = Options {
+            weights: case.0,
+            tolerance: Some(0.1),
+            ..Options::default()
+        };
+        let image = compile_with(&bundle, options).unwrap();
+        let Some(counts) = counts(NAME, number, image.as_bytes()) else {
             println!("skipped: valgrind is not installed");
             return;
         };
+        assert_eq!(counts.len(), OBSERVATIONS);
+        let different: BTreeSet<u64> = counts.into_iter().collect();
         println!("instructions of a step, {case:?}: {different:?}");
         assert_eq!(different.len(), 1, "{case:?}: {different:?}");
     }
 }
 
-/// The numbers of instructions that steps of a case took; `None` without `valgrind`.
-fn counts(case: usize) -> Option<BTreeSet<u64>> {
+#[test]
+#[ignore = "needs random bundles: tests/parity/test_families.py makes them and runs this"]
+fn every_place_in_the_schedule_of_every_family_takes_one_number_of_instructions() {
+    const NAME: &str =
+        "every_place_in_the_schedule_of_every_family_takes_one_number_of_instructions";
+    if std::env::var_os(CHILD).is_some() {
+        return with_image(|policy| episodes(&policy));
+    }
+    for (number, kind) in KINDS.iter().enumerate() {
+        let bundle = Bundle::open(&folder().join(format!("{kind}.onnx"))).unwrap();
+        let image = compile_with(&bundle, Options::default()).unwrap();
+        let Some(counts) = counts(NAME, number, image.as_bytes()) else {
+            println!("skipped: valgrind is not installed");
+            return;
+        };
+        assert_eq!(counts.len(), EPISODES * STEPS, "{kind}");
+        for step in 0..STEPS {
+            let here = counts.iter().skip(step).step_by(STEPS);
+            let different: BTreeSet<u64> = here.copied().collect();
+            assert_eq!(different.len(), 1, "{kind}, step {step}: {different:?}");
+        }
+        println!("instructions of {kind}'s steps: {:?}", &counts[..STEPS]);
+    }
+}
+
+/// The numbers of instructions of all calls in their order; `None` without `valgrind`.
+fn counts(test: &str, case: usize, image: &[u8]) -> Option<Vec<u64>> {
     let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("image");
+    std::fs::write(&path, image).unwrap();
     let counted = Command::new("valgrind")
         .args(["--tool=callgrind", "--toggle-collect=one_control_step"])
         .arg("--dump-after=one_control_step")
@@ -117,26 +233,29 @@ fn counts(case: usize) -> Option<BTreeSet<u64>> {
             folder.path().display()
         ))
         .arg(std::env::current_exe().unwrap())
-        .args([
-            "--exact",
-            "a_step_executes_the_same_number_of_instructions_whatever_it_observes",
-        ])
+        .args(["--exact", test, "--include-ignored"])
         .env(CHILD, case.to_string())
+        .env(IMAGE, &path)
         .output();
     let output = counted.ok()?;
     assert!(output.status.success(), "{output:?}");
-    // One file per call, and a last one when the program ends, in which nothing was counted.
-    let counts: Vec<u64> = std::fs::read_dir(folder.path())
+    // One file per call, numbered from 1, and a last one when the program ends, in which nothing was counted.
+    let counts: BTreeMap<usize, u64> = std::fs::read_dir(folder.path())
         .unwrap()
         .filter_map(|entry| {
-            let text = std::fs::read_to_string(entry.unwrap().path()).unwrap();
-            let line = text
-                .lines()
-                .find_map(|line| line.strip_prefix("totals: "))?;
-            line.trim().parse().ok()
+            let path = entry.unwrap().path();
+            let count = total(&path)?;
+            let number = path.extension()?.to_str()?.parse().ok()?;
+            Some((number, count)).filter(|&(_, count)| count > 0)
         })
-        .filter(|&count| count > 0)
         .collect();
-    assert_eq!(counts.len(), OBSERVATIONS);
-    Some(counts.into_iter().collect())
+    Some(counts.into_values().collect())
+}
+
+/// What a file of `callgrind` counted.
+fn total(path: &Path) -> Option<u64> {
+    let text = String::from_utf8(std::fs::read(path).ok()?).ok()?;
+    let mut lines = text.lines();
+    let total = lines.find_map(|line| line.strip_prefix("totals: "))?;
+    total.trim().parse().ok()
 }

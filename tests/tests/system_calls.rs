@@ -7,8 +7,8 @@
 use std::path::Path;
 use std::process::Command;
 
-use lads_compiler::Memory;
 use lads_core::{Instruction, Policy};
+use lads_host::Memory;
 use lads_tests::{compiled, project_path};
 
 const CHILD: &str = "LADS_STEPS_UNDER_STRACE";
@@ -30,8 +30,8 @@ fn steps() {
     mark(BEGIN);
     controller.set_instruction(Instruction::Id(0)).unwrap();
     controller.warm();
-    for (observation, _, _) in golden.steps() {
-        controller.step(observation, &mut action).unwrap();
+    for step in golden.steps() {
+        controller.step(step.observation(), &mut action).unwrap();
     }
     mark(END);
 }

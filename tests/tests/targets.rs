@@ -6,8 +6,8 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use lads_compiler::Memory;
 use lads_core::{Isa, Policy};
+use lads_host::Memory;
 use lads_tests::{compiled, project_path};
 
 #[test]

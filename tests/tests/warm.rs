@@ -1,16 +1,16 @@
 //! Warming a controller changes nothing, wherever it happens.
 
-use lads_compiler::Memory;
 use lads_core::{Controller, Instruction, Policy};
+use lads_host::Memory;
 use lads_tests::{bundles, compiled};
 
 /// Plans, actions and logits of steps over a context's end, with a second instruction on the way.
-fn episode(policy: &Policy<'_>, warm: bool) -> Vec<(u32, Vec<f32>, Vec<f32>)> {
+fn episode(policy: &Policy<'_>, warm: bool) -> Vec<(Option<u32>, Vec<f32>, Vec<f32>)> {
     let mut memory = Memory::of(policy).expect("there is memory");
     let mut controller = memory.controller(policy).unwrap();
     let mut action = vec![0.0; policy.contract().action_len()];
     let golden = policy.golden().unwrap();
-    let steps = policy.contract().context_steps() + 3;
+    let steps = policy.contract().context_steps().unwrap() + 3;
     let mut seen = Vec::new();
     let pause = |controller: &mut Controller<'_, '_>| {
         if warm {
@@ -23,12 +23,15 @@ fn episode(policy: &Policy<'_>, warm: bool) -> Vec<(u32, Vec<f32>, Vec<f32>)> {
             .set_instruction(Instruction::Id(instruction))
             .unwrap();
         let observations = std::iter::repeat_with(|| golden.steps()).flatten();
-        for (i, (observation, _, _)) in observations.take(steps).enumerate() {
+        for (i, recorded) in observations.take(steps).enumerate() {
             if i % 7 == 0 || i + 5 > steps {
                 pause(&mut controller);
             }
-            let report = controller.step(observation, &mut action).unwrap();
-            seen.push((report.plan.0, action.clone(), controller.logits().to_vec()));
+            let report = controller
+                .step(recorded.observation(), &mut action)
+                .unwrap();
+            let index = report.selected.map(|selected| selected.index);
+            seen.push((index, action.clone(), controller.scores().to_vec()));
         }
     }
     seen

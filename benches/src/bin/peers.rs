@@ -66,7 +66,11 @@ fn run(arguments: &Arguments) -> Result<Report, BenchError> {
         let weights = known.find(|format| format.name() == name);
         let weights = weights.ok_or_else(|| {
             let known = WeightFormat::ALL.map(WeightFormat::name).join(", ");
-            BenchError::new(name, "no format of weights", format_args!("known are {known}"))
+            BenchError::new(
+                name,
+                "no format of weights",
+                format_args!("known are {known}"),
+            )
         })?;
         let opened = lads_host::open_with(path, options(weights));
         let opened = opened.map_err(|error| BenchError::of(&error))?;
@@ -105,7 +109,10 @@ fn run(arguments: &Arguments) -> Result<Report, BenchError> {
     let shown = std::io::stderr().is_terminal();
     let mut progress = |done: usize, of: usize| {
         if shown {
-            eprint!("\rround {done} of {of}{}", if done == of { "\n" } else { "" });
+            eprint!(
+                "\rround {done} of {of}{}",
+                if done == of { "\n" } else { "" }
+            );
         }
     };
     measure(&candidates, &peers, &protocol, &mut progress)

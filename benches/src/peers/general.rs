@@ -8,8 +8,8 @@ use std::collections::BTreeMap;
 
 use super::cut::{Source, Tensor};
 use super::engine::{Engine, Session, failed};
-use lads_pace::contender::{Block, Computed, Contender, Episode, Kind, Sample, Work, measure};
 use lads_pace::BenchError;
+use lads_pace::contender::{Block, Computed, Contender, Episode, Kind, Sample, Work, measure};
 
 /// What a control step at some context starts from.
 #[derive(Debug, Clone)]

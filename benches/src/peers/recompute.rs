@@ -6,8 +6,8 @@ use serde_json::Value;
 
 use super::cut::{Data, Tensor, signature};
 use super::engine::{Engine, Session, failed};
-use lads_pace::contender::{Block, Computed, Contender, Kind, Sample, Work, measure};
 use lads_pace::BenchError;
+use lads_pace::contender::{Block, Computed, Contender, Kind, Sample, Work, measure};
 
 /// A loaded model without a KV cache.
 pub struct Recompute {

@@ -9,7 +9,7 @@ use rten_tensor::prelude::{AsView, Layout};
 use super::cut::{Data, Tensor};
 use super::engine::{Engine, Named, Session, failed, given};
 use lads_pace::BenchError;
-use crate::realtime::Realtime;
+use lads_pace::realtime::Realtime;
 
 const NAME: &str = "rten";
 

@@ -7,9 +7,9 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use serde_json::{Value, json};
 
 use super::engine::failed;
+use lads_pace::BenchError;
 use lads_pace::clock::Pace;
 use lads_pace::contender::{Block, Computed, Contender, Episode, Kind, Sample, Work};
-use lads_pace::BenchError;
 
 /// The contenders that the script knows.
 pub const NAMES: [&str; 2] = ["PyTorch", "OpenVINO"];

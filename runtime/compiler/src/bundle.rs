@@ -177,17 +177,12 @@ impl Bundle {
         Ok(model.encode_to_vec())
     }
 
-    /// Index of the instruction with this id; else of all with this text, up to case and white space. Empty for none.
+    /// Indices of the instructions that a person means, by [the one rule](lads_core::instructions_called). Empty for none.
     pub fn instruction_indices(&self, text_or_id: &str) -> Vec<usize> {
-        let known = &self.contract.instructions;
-        if let Some(index) = known.iter().position(|known| known.id == text_or_id.trim()) {
-            return vec![index];
-        }
-        let wanted = plain(text_or_id);
-        (0..)
-            .zip(known)
-            .filter(|(_, known)| plain(&known.text) == wanted)
-            .map(|(index, _)| index)
+        let known = self.contract.instructions.iter();
+        let known = known.map(|known| (known.id.as_str(), known.text.as_str()));
+        lads_core::instructions_called(known, text_or_id.as_bytes())
+            .map(|index| index as usize)
             .collect()
     }
 

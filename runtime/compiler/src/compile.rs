@@ -16,6 +16,7 @@ use crate::image::{self, Image, Parts};
 use crate::import::Model;
 use crate::lower::{Cache, Weights, lower};
 use crate::plan::{Placed, plan};
+use crate::reach::Reach;
 use crate::report::{CompileReport, ProgramReport};
 use crate::tensor::Tensor;
 use crate::verify::verify;
@@ -83,6 +84,7 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
         entries::signatures(bundle.graph(), contract, &blueprint).map_err(CompileError::Bundle)?;
     let model = Model::new(&bundle.model, bundle.graph())?;
     let caches = caches(bundle, &blueprint, &signatures, options.cache)?;
+    let reach = Reach::new(contract, &blueprint);
     let mut weights = Weights::default();
     let (mut made, mut programs) = (vec![], vec![]);
     // In the order of the blueprint: whole matrices come before the parts of them that other programs need, and what runs in every
@@ -103,6 +105,7 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
             *cache.unwrap_or(&Cache::NONE),
             &mut weights,
         )?;
+        reach.check(contract, &blueprint, entry, &lowered)?;
         let placed = plan(&lowered);
         verify(&lowered, &placed).map_err(|fault| CompileError::Plan {
             program: entry.name.as_str().into(),
@@ -174,8 +177,10 @@ fn gate(policy: &Policy, options: Options, tolerance: f32) -> Result<(), Compile
     bounded(policy.arena_len().saturating_add(policy.state_len()))?;
     let mut arena = vec![0.0; policy.arena_len()];
     let mut state = vec![0.0; policy.state_len()];
-    let workspace = Workspace::new(policy, &mut arena, &mut state).map_err(|small| CompileError::Excessive {
-        bytes: small.needed.saturating_mul(size_of::<f32>()),
+    let workspace = Workspace::new(policy, &mut arena, &mut state).map_err(|small| {
+        CompileError::Excessive {
+            bytes: small.needed.saturating_mul(size_of::<f32>()),
+        }
     })?;
     let replayed = Controller::new(*policy, workspace).self_test();
     replayed.map(|_| ()).map_err(|error| CompileError::Gate {

@@ -3,12 +3,16 @@
 //! [`Contract::parse`] checks it as a whole: every field there, every number in its range, no name twice. Fields that this
 //! version does not know are skipped; a change of meaning changes the version.
 
+mod channel;
+
 use std::collections::HashSet;
 
 use serde::Deserialize;
 
 use crate::error::BundleError;
 use crate::family::Family;
+
+pub use channel::{Channel, DType, Element, QuaternionOrder, Role};
 
 /// Version of the contract that this crate reads.
 pub const CONTRACT_VERSION: u32 = 2;
@@ -20,150 +24,6 @@ pub struct Environment {
     pub id: String,
     /// Version of the environment.
     pub version: String,
-}
-
-/// What a channel is for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Role {
-    /// Given by the caller in every control step.
-    Observation,
-    /// Written by every control step.
-    Action,
-    /// Word embeddings, `[words, elements]`.
-    Instruction,
-    /// Random numbers; the shape is that of one draw.
-    Noise,
-    /// A piece of a demonstration, to be encoded.
-    Demonstration,
-}
-
-/// Type of a channel's elements.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum DType {
-    /// 32-bit floats.
-    F32,
-    /// Bytes.
-    U8,
-    /// Signed 32-bit integers.
-    I32,
-}
-
-/// A value at the policy's edge.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-pub struct Channel {
-    /// Name.
-    pub name: String,
-    /// What it is for.
-    pub role: Role,
-    /// Type of its elements.
-    pub dtype: DType,
-    /// Lengths of its axes, one to four.
-    pub shape: Vec<usize>,
-    /// Order of quaternions in it.
-    #[serde(default)]
-    pub quaternion_order: QuaternionOrder,
-    /// What the values are relative to, in words.
-    #[serde(default)]
-    pub reference: String,
-    /// Its elements; none for images, instructions and the like.
-    #[serde(default)]
-    pub elements: Vec<Element>,
-    /// Smallest value of any element, for a channel without elements of its own.
-    #[serde(default)]
-    pub min: Option<f32>,
-    /// Largest value of any element.
-    #[serde(default)]
-    pub max: Option<f32>,
-}
-
-impl Channel {
-    /// How many elements it has.
-    #[expect(
-        clippy::len_without_is_empty,
-        reason = "a checked channel has an element at least"
-    )]
-    pub fn len(&self) -> usize {
-        self.shape.iter().product()
-    }
-
-    /// The limits of a channel without elements of its own: what was said, or all that the type holds.
-    pub(crate) fn limits(&self) -> (f32, f32) {
-        let (min, max) = match self.dtype {
-            DType::F32 => (f32::MIN, f32::MAX),
-            DType::U8 => (0.0, 255.0),
-            DType::I32 => (i32::MIN as f32, i32::MAX as f32),
-        };
-        (self.min.unwrap_or(min), self.max.unwrap_or(max))
-    }
-
-    fn check(&self, at: &str) -> Result<(), String> {
-        let len = self.shape.iter().try_fold(1_usize, |len, &dim| {
-            len.checked_mul(dim)
-                .filter(|&len| (1..=MAX_CHANNEL_LEN).contains(&len))
-        });
-        if !(1..=4).contains(&self.shape.len()) || len.is_none() {
-            return Err(format!(
-                "field `{at}.shape` is {:?}, it must have one to four axes and 1 to {MAX_CHANNEL_LEN} elements",
-                self.shape
-            ));
-        }
-        let described = matches!(self.role, Role::Observation | Role::Action);
-        let vector = self.dtype == DType::F32 && self.shape.len() == 1;
-        if described && vector && self.elements.len() != self.len() {
-            return Err(format!(
-                "field `{at}.elements` has {} elements, its shape {:?} says {}",
-                self.elements.len(),
-                self.shape,
-                self.len()
-            ));
-        }
-        if !self.elements.is_empty() && (!vector || self.elements.len() != self.len()) {
-            return Err(format!(
-                "field `{at}.elements`: only vectors of f32 have elements, one for each of their length"
-            ));
-        }
-        let (min, max) = self.limits();
-        if !(min.is_finite() && max.is_finite() && min < max) {
-            return Err(format!(
-                "field `{at}` has limits {min} to {max}, which is no range"
-            ));
-        }
-        elements(&format!("{at}.elements"), &self.elements)
-    }
-}
-
-/// One element of a channel.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-pub struct Element {
-    /// Name.
-    pub name: String,
-    /// Unit, `1` for none.
-    pub unit: String,
-    /// Smallest value.
-    pub min: f32,
-    /// Largest value.
-    pub max: f32,
-    /// The joint that it belongs to.
-    #[serde(default)]
-    pub joint: Option<String>,
-    /// What of the joint: position, velocity, effort.
-    #[serde(default)]
-    pub interface: Option<String>,
-    /// Physical value of one unit: physical = reference + offset + scale * value.
-    #[serde(default = "one")]
-    pub scale: f32,
-    /// Physical value of zero, on top of the channel's reference.
-    #[serde(default)]
-    pub offset: f32,
-    /// Unit of the physical value.
-    #[serde(default)]
-    pub physical_unit: Option<String>,
-}
-
-fn one() -> f32 {
-    1.0
 }
 
 /// How a state of a plain policy is kept.
@@ -220,19 +80,6 @@ pub struct State {
     /// What clears it.
     #[serde(default)]
     pub cleared_by: ClearedBy,
-}
-
-/// Order of the components of quaternions in a channel.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum QuaternionOrder {
-    /// There are none.
-    #[default]
-    None,
-    /// Scalar first.
-    Wxyz,
-    /// Scalar last.
-    Xyzw,
 }
 
 /// What happens when the context is full.
@@ -382,9 +229,6 @@ pub struct Contract {
 /// The largest length that a contract may claim. Generous, and small enough that products of a few fit 64 bits.
 pub(crate) const MAX_LEN: usize = 1 << 20;
 
-/// The most elements of a channel.
-const MAX_CHANNEL_LEN: usize = 1 << 26;
-
 impl Contract {
     /// Reads and checks a contract.
     pub fn parse(json: &str) -> Result<Self, BundleError> {
@@ -489,9 +333,10 @@ impl Contract {
         let channels = self.channels.iter().map(|channel| channel.name.as_str());
         distinct("states", "name", names.clone())?;
         distinct("channels and states", "name", channels.chain(names))?;
+        // Before the context, whose length is a multiple of the family's period.
+        self.family.check(self)?;
         self.check_context()?;
-        self.check_instructions()?;
-        self.family.check(self)
+        self.check_instructions()
     }
 
     fn check_channels(&self) -> Result<(), String> {
@@ -658,34 +503,6 @@ impl Acceptance {
         }
         Ok(())
     }
-}
-
-fn elements(field: &str, elements: &[Element]) -> Result<(), String> {
-    for (i, element) in elements.iter().enumerate() {
-        let Element {
-            name,
-            min,
-            max,
-            scale,
-            offset,
-            ..
-        } = element;
-        if !(scale.is_finite() && offset.is_finite()) {
-            return Err(format!(
-                "field `{field}[{i}]` ({name}) has scale {scale} and offset {offset}, which are not numbers"
-            ));
-        }
-        if !(min.is_finite() && max.is_finite() && min < max) {
-            return Err(format!(
-                "field `{field}[{i}]` ({name}) has limits {min} to {max}, which is no range"
-            ));
-        }
-    }
-    distinct(
-        field,
-        "name",
-        elements.iter().map(|element| element.name.as_str()),
-    )
 }
 
 fn distinct<'a>(

@@ -64,7 +64,7 @@ pub(crate) fn signatures(
     };
     let mut all: Vec<Signature> = vec![];
     if let Some(words) = contract.words() {
-        all.push(checker.lookup(graph, words).map_err(refused)?);
+        all.push(lookup(graph, words).map_err(refused)?);
     }
     for entry in &blueprint.entries {
         let Some(name) = entry.graph() else { continue };
@@ -138,39 +138,6 @@ struct Checker<'c> {
 }
 
 impl Checker<'_> {
-    /// The table of instructions.
-    fn lookup(&self, graph: &GraphProto, [words, dim]: [usize; 2]) -> Result<Signature, String> {
-        let wanted = |name: &str, ty, shape: &[usize]| Value {
-            name: name.into(),
-            ty,
-            shape: shape.iter().map(|&dim| Dim::of(dim)).collect(),
-            fields: "the instruction channel".into(),
-        };
-        let signature = Signature {
-            entry: LOOKUP_INSTRUCTION.into(),
-            inputs: vec![wanted("id", Type::I64, &[1])],
-            outputs: vec![
-                wanted("words", Type::F32, &[1, words, dim]),
-                wanted("length", Type::I64, &[1]),
-            ],
-        };
-        for (values, declared, what) in [
-            (&signature.inputs, &graph.input, "input"),
-            (&signature.outputs, &graph.output, "output"),
-        ] {
-            for value in values {
-                let name = format!("{LOOKUP_INSTRUCTION}/{}", value.name);
-                let found = declared.iter().find(|other| other.name == name);
-                let found = found.ok_or_else(|| format!("{what} {name} is missing"))?;
-                let (ty, shape) = declaration(found)?;
-                if ty != value.ty || shape != value.shape {
-                    return Err(differs(&name, &shape, &show(&value.shape), &value.fields));
-                }
-            }
-        }
-        Ok(signature)
-    }
-
     /// A declared value, if it is what the contract says.
     fn value(
         &mut self,
@@ -330,6 +297,39 @@ impl Checker<'_> {
         }
         Ok(())
     }
+}
+
+/// The table of instructions.
+fn lookup(graph: &GraphProto, [words, dim]: [usize; 2]) -> Result<Signature, String> {
+    let wanted = |name: &str, ty, shape: &[usize]| Value {
+        name: name.into(),
+        ty,
+        shape: shape.iter().map(|&dim| Dim::of(dim)).collect(),
+        fields: "the instruction channel".into(),
+    };
+    let signature = Signature {
+        entry: LOOKUP_INSTRUCTION.into(),
+        inputs: vec![wanted("id", Type::I64, &[1])],
+        outputs: vec![
+            wanted("words", Type::F32, &[1, words, dim]),
+            wanted("length", Type::I64, &[1]),
+        ],
+    };
+    for (values, declared, what) in [
+        (&signature.inputs, &graph.input, "input"),
+        (&signature.outputs, &graph.output, "output"),
+    ] {
+        for value in values {
+            let name = format!("{LOOKUP_INSTRUCTION}/{}", value.name);
+            let found = declared.iter().find(|other| other.name == name);
+            let found = found.ok_or_else(|| format!("{what} {name} is missing"))?;
+            let (ty, shape) = declaration(found)?;
+            if ty != value.ty || shape != value.shape {
+                return Err(differs(&name, &shape, &show(&value.shape), &value.fields));
+            }
+        }
+    }
+    Ok(signature)
 }
 
 fn differs(name: &str, found: &[Dim], wanted: &str, fields: &str) -> String {

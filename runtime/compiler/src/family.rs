@@ -1,18 +1,18 @@
 //! Families of policies: which entries a bundle of each has, which states they share, and when each is called.
 //!
-//! A family is one file with the fields of its contract and its [`Blueprint`], and one row of the table below. Nothing else of this
+//! A family is one file with the fields of its contract and its blueprint, and one row of the table below. Nothing else of this
 //! project knows families: the compiler writes the blueprint into the image as states, entries and calls, and the runtime runs
-//! those. What can fail: a contract whose fields make no such policy ([`Kind::check`]).
+//! those. What can fail: a contract whose fields make no such policy (`Kind::check`).
 
 mod blueprint;
-mod history;
-mod lads;
-mod lang_dt;
-mod lcsd;
-mod lisa;
-mod plain;
-mod skilldiffuser;
-mod vae;
+pub mod history;
+pub mod lads;
+pub mod lang_dt;
+pub mod lcsd;
+pub mod lisa;
+pub mod plain;
+pub mod skilldiffuser;
+pub mod vae;
 
 use lads_image::records::{NoiseRule, SelectionRule};
 use serde::Deserialize;

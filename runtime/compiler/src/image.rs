@@ -1,14 +1,15 @@
 //! Writing the program image: the records of [`lads_image::records`] in the sections of [`lads_image::format`].
 
+mod schedule;
+mod states;
+
 use std::collections::HashMap;
 
 use lads_image::codec::{Field, Writer};
 use lads_image::format::{self, CRC_WORD, Layout, SECTIONS, Tag};
-use lads_image::op::{Op, Place, WeightSpan};
+use lads_image::op::WeightSpan;
 use lads_image::records::{
-    self, CallRecord, ChannelRecord, ContractRecord, ElementRecord, EntryRecord, Fill,
-    GoldenRecord, InstructionRecord, NONE, PortRecord, Repeat, Scope, Source, SourceKind,
-    StateKind, StateRecord, Text,
+    self, ChannelRecord, ContractRecord, ElementRecord, GoldenRecord, InstructionRecord, NONE, Text,
 };
 
 use crate::aligned::Aligned;
@@ -16,10 +17,14 @@ use crate::bundle::Bundle;
 use crate::compile::Made;
 use crate::contract::{self, Channel, Contract};
 use crate::error::CompileError;
-use crate::family::{Blueprint, Bound, Call, Keep, Times};
+use crate::family::Blueprint;
 use crate::golden::{Golden, Recorded};
 use crate::lower::Cache;
 use crate::report::CompileReport;
+
+use schedule::{call_words, entry_words};
+pub(crate) use states::rows_len;
+use states::states;
 
 /// A compiled policy.
 #[derive(Debug)]
@@ -93,110 +98,6 @@ pub(crate) struct Parts<'a> {
     pub work: u64,
 }
 
-/// A state that an entry uses, with its place in the image.
-struct Used {
-    /// Index into the blueprint's states.
-    of: usize,
-    record: StateRecord,
-}
-
-/// The states in the image's order, rings and KV caches first; those that nothing uses are left out.
-fn states(parts: &Parts, contract: &Contract, strings: &mut Strings) -> Vec<Used> {
-    let (mut rows, mut plain) = (vec![], vec![]);
-    let (mut row_end, mut bank_end, mut scratch_end) = (0, 0, 0);
-    for (of, state) in parts.blueprint.states.iter().enumerate() {
-        let Some(width) = width(parts, contract, of) else {
-            continue;
-        };
-        let name = strings.add(&state.name);
-        let mut record = StateRecord {
-            name,
-            kind: StateKind::Plain,
-            scope: state.scope,
-            width,
-            rows: 1,
-            fill: Fill::Zero,
-            offset: 0,
-        };
-        match state.keep {
-            Keep::Plain => {
-                let end = if state.scope == Scope::Step {
-                    &mut scratch_end
-                } else {
-                    &mut bank_end
-                };
-                record.offset = *end;
-                *end += width;
-                plain.push(Used { of, record });
-            }
-            Keep::Ring { rows: count, fill } => {
-                (record.kind, record.rows, record.fill) = (StateKind::Ring, count as u32, fill);
-                record.offset = row_end;
-                row_end += width * (count as u32 + 1);
-                rows.push(Used { of, record });
-            }
-            Keep::Kv(_) => {
-                let capacity = parts
-                    .caches
-                    .get(&state.name)
-                    .map_or(0, |cache| cache.capacity);
-                (record.kind, record.rows) = (StateKind::Kv, capacity as u32);
-                record.offset = row_end;
-                let halves = if is_cleared(parts, &state.name) { 2 } else { 1 };
-                row_end += width * halves;
-                rows.push(Used { of, record });
-            }
-        }
-    }
-    rows.into_iter().chain(plain).collect()
-}
-
-/// Whether a call clears a state; its cache then has two halves.
-fn is_cleared(parts: &Parts, name: &str) -> bool {
-    let mut calls = parts.blueprint.calls.iter();
-    calls.any(|call| call.clears.iter().any(|cleared| cleared == name))
-}
-
-/// Elements of a state, or words of a KV cache; `None` when no program uses it.
-fn width(parts: &Parts, contract: &Contract, of: usize) -> Option<u32> {
-    let state = &parts.blueprint.states[of];
-    if let Keep::Kv(_) = state.keep {
-        let used = parts.made.iter().any(|made| {
-            let entry = &parts.blueprint.entries[made.entry];
-            entry.cache.as_ref() == Some(&state.name)
-        });
-        return used.then(|| parts.caches.get(&state.name)?.len()).flatten();
-    }
-    let rows = |bound: Bound, input: bool| match (state.keep, bound) {
-        (Keep::Ring { rows, .. }, Bound::State(_)) if input => rows as u32,
-        _ => 1,
-    };
-    parts.made.iter().find_map(|made| {
-        let entry = &parts.blueprint.entries[made.entry];
-        let ports = [(&made.placed.inputs, true), (&made.placed.outputs, false)];
-        ports.into_iter().find_map(|(ports, input)| {
-            ports.iter().find_map(|(name, place)| {
-                let bound = parts.blueprint.bind(contract, &entry.name, name, input)?;
-                match (bound, place) {
-                    (Bound::State(index) | Bound::Row(index), Place::Span(span)) if index == of => {
-                        Some(span.len / rows(bound, input))
-                    }
-                    _ => None,
-                }
-            })
-        })
-    })
-}
-
-/// 4-byte words of all rings and KV caches.
-pub(crate) fn rows_len(parts: &Parts) -> usize {
-    let words = |(name, cache): (&String, &Cache)| {
-        let halves = if is_cleared(parts, name) { 2 } else { 1 };
-        cache.len().unwrap_or(0) as usize * halves
-    };
-    parts.caches.iter().map(words).sum()
-}
-
 /// Writes an image.
 pub(crate) fn write(
     bundle: &Bundle,
@@ -234,7 +135,7 @@ pub(crate) fn write(
         (Tag::Instructions, instructions),
         (Tag::Strings, strings),
         (Tag::States, state_words),
-        (Tag::Entries, entries.entries),
+        (Tag::Entries, entries.records),
         (Tag::Ports, entries.ports),
         (Tag::Calls, calls),
         (Tag::Clears, clears),
@@ -370,138 +271,6 @@ fn instruction_words(contract: &Contract, parts: &Parts, strings: &mut Strings) 
         put(&mut out, &record);
     }
     out
-}
-
-/// The entries, their ports and their ops.
-#[derive(Default)]
-struct Entries {
-    entries: Vec<u32>,
-    ports: Vec<u32>,
-    ops: Vec<u32>,
-}
-
-fn entry_words(
-    contract: &Contract,
-    parts: &Parts,
-    states: &[Used],
-    strings: &mut Strings,
-) -> Entries {
-    let mut out = Entries::default();
-    let place_of = |of: usize| states.iter().position(|state| state.of == of);
-    let (mut first_op, mut first_port) = (0, 0);
-    for made in parts.made {
-        let entry = &parts.blueprint.entries[made.entry];
-        let mut ports = |ports: &[(String, Place)], input: bool| {
-            let mut count = 0;
-            for (name, place) in ports {
-                let bound = parts.blueprint.bind(contract, &entry.name, name, input);
-                let Some(source) = bound.and_then(|bound| source(parts, bound, &place_of)) else {
-                    continue;
-                };
-                let record = PortRecord {
-                    name: strings.add(name),
-                    source,
-                    place: *place,
-                };
-                put(&mut out.ports, &record);
-                count += 1;
-            }
-            count
-        };
-        let inputs_len = ports(&made.placed.inputs, true);
-        let outputs_len = ports(&made.placed.outputs, false);
-        let cache = entry.cache.as_ref().and_then(|name| {
-            let of = parts
-                .blueprint
-                .states
-                .iter()
-                .position(|state| state.name == *name)?;
-            place_of(of)
-        });
-        let record = EntryRecord {
-            name: strings.add(&entry.name),
-            first_op,
-            ops_len: made.placed.ops.len() as u32,
-            arena_len: made.placed.arena_len,
-            cache: cache.map_or(NONE, |state| state as u32),
-            tokens: made.tokens as u32,
-            first_input: first_port,
-            inputs_len,
-            first_output: first_port + inputs_len,
-            outputs_len,
-        };
-        put(&mut out.entries, &record);
-        out.ops.extend(made.placed.ops.iter().flat_map(Op::encode));
-        first_op += made.placed.ops.len() as u32;
-        first_port += inputs_len + outputs_len;
-    }
-    out
-}
-
-fn source(
-    parts: &Parts,
-    bound: Bound,
-    place_of: &impl Fn(usize) -> Option<usize>,
-) -> Option<Source> {
-    let (kind, of) = match bound {
-        Bound::Channel(index) => (SourceKind::Channel, index),
-        Bound::State(index) => (SourceKind::State, place_of(index)?),
-        Bound::Row(index) => (SourceKind::Row, place_of(index)?),
-        Bound::Timestep => (SourceKind::Timestep, 0),
-        Bound::Phase => (SourceKind::Phase, parts.blueprint.period),
-        Bound::Pass => (SourceKind::Pass, 0),
-        Bound::Selected => (SourceKind::Selected, 0),
-        Bound::Cache => return None,
-    };
-    Some(Source {
-        kind,
-        of: of as u32,
-    })
-}
-
-/// The schedule, by event, and what its calls clear.
-fn call_words(parts: &Parts, states: &[Used]) -> (Vec<u32>, Vec<u32>) {
-    let (mut calls, mut clears) = (vec![], vec![]);
-    let state = |name: &String| {
-        let of = parts
-            .blueprint
-            .states
-            .iter()
-            .position(|state| state.name == *name)?;
-        let found = states.iter().position(|state| state.of == of);
-        found.map(|state| state as u32)
-    };
-    let entry = |call: &Call| {
-        let mut made = parts.made.iter();
-        let found = made.position(|made| parts.blueprint.entries[made.entry].name == call.entry);
-        found.map(|entry| entry as u32)
-    };
-    let mut sorted: Vec<&Call> = parts.blueprint.calls.iter().collect();
-    sorted.sort_by_key(|call| call.event as u32);
-    for call in sorted {
-        // Calls of entries that the bundle leaves out.
-        let Some(entry) = entry(call) else { continue };
-        let cleared: Vec<u32> = call.clears.iter().filter_map(state).collect();
-        let (repeat, count) = match &call.times {
-            Times::Times(count) => (Repeat::Times, *count as u32),
-            Times::Rows(ring) => (Repeat::Rows, state(ring).unwrap_or(NONE)),
-        };
-        let record = CallRecord {
-            event: call.event,
-            when: call.when,
-            every: call.every as u32,
-            otherwise: call.otherwise,
-            entry,
-            repeat,
-            count,
-            select: call.select.as_ref().and_then(state).unwrap_or(NONE),
-            first_clear: clears.len() as u32,
-            clears_len: cleared.len() as u32,
-        };
-        put(&mut calls, &record);
-        clears.extend(cleared);
-    }
-    (calls, clears)
 }
 
 fn golden_words(golden: &Golden, tolerance: f32) -> Vec<u32> {

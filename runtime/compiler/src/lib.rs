@@ -35,6 +35,7 @@ mod import;
 mod lower;
 mod onnx;
 mod plan;
+mod reach;
 mod report;
 mod survey;
 mod tensor;

@@ -44,14 +44,15 @@ fn models() -> impl Iterator<Item = (&'static str, Bundle, Calibration)> {
 fn the_runtime_accepts_what_the_exporter_counted() {
     for (name, bundle, calibration) in models() {
         let image = compile(&bundle).unwrap();
-        let contract = Policy::new_checked(image.as_bytes()).unwrap().contract();
+        let contract = *Policy::new_checked(image.as_bytes()).unwrap().contract();
         let dim = contract.word_dim();
         let mut splits: BTreeMap<&str, (usize, usize)> = BTreeMap::new();
-        for known in contract.instructions() {
+        for (i, known) in contract.instructions().enumerate() {
+            let (_, split) = bundle.contract().evaluated(i);
             let others = contract.instructions();
             let others = others.filter(|other| other.text != known.text);
             let (_, alike) = nearest(known.words, others.map(|other| other.words), dim).unwrap();
-            let (count, accepted) = splits.entry(known.split).or_default();
+            let (count, accepted) = splits.entry(split).or_default();
             *count += 1;
             *accepted += usize::from(alike >= calibration.acceptance.threshold);
         }
@@ -74,7 +75,7 @@ fn known_instructions_are_like_themselves_and_noise_is_like_none() {
     for (name, bundle, calibration) in models() {
         let threshold = calibration.acceptance.threshold;
         let image = compile(&bundle).unwrap();
-        let contract = Policy::new_checked(image.as_bytes()).unwrap().contract();
+        let contract = *Policy::new_checked(image.as_bytes()).unwrap().contract();
         let dim = contract.word_dim();
         let like = |words: &[f32]| {
             let known = contract.instructions().map(|known| known.words);

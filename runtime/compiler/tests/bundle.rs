@@ -104,10 +104,25 @@ fn image_says_what_the_contract_says() {
     let policy = Policy::new_checked(image.as_bytes()).expect("the image loads");
     let (wanted, got) = (bundle.contract(), policy.contract());
     assert_eq!(got.environment_id(), wanted.environment.id);
-    assert_eq!(got.horizon(), wanted.horizon);
-    assert_eq!(got.codebook_len(), wanted.codebook.size);
-    assert_eq!(got.observation_len(), wanted.observation.len());
-    assert_eq!(got.action_len(), wanted.action.len());
+    assert_eq!(got.family(), wanted.family.name());
+    assert_eq!(policy.index_count(), 5);
+    let context = wanted.context.expect("a context");
+    assert_eq!(got.context_steps(), Some(context.steps));
+    assert_eq!(got.channels().count(), wanted.channels.len());
+    for (channel, known) in got.channels().zip(&wanted.channels) {
+        assert_eq!(
+            (channel.name(), channel.len()),
+            (known.name.as_str(), known.len())
+        );
+        assert_eq!(channel.reference(), known.reference);
+        assert_eq!(channel.elements().count(), known.elements.len());
+        for (element, known) in channel.elements().zip(&known.elements) {
+            assert_eq!(
+                (element.name, element.limits.min, element.limits.max),
+                (known.name.as_str(), known.min, known.max)
+            );
+        }
+    }
     assert_eq!(got.instruction_count(), wanted.instructions.len());
     for (i, known) in wanted.instructions.iter().enumerate() {
         let found = got.instruction(i).expect("an instruction");
@@ -117,13 +132,7 @@ fn image_says_what_the_contract_says() {
         );
         assert!(
             !found.words.is_empty()
-                && found.words.len() <= wanted.context.words * wanted.language.dim
-        );
-    }
-    for (element, known) in got.observations().zip(&wanted.observation) {
-        assert_eq!(
-            (element.name, element.limits.min, element.limits.max),
-            (known.name.as_str(), known.min, known.max)
+                && found.words.len() <= wanted.words().expect("words").iter().product()
         );
     }
 }
@@ -138,16 +147,18 @@ fn every_known_instruction_can_be_followed() {
     let mut controller = Controller::new(policy, workspace);
     let observation: Vec<f32> = bundle
         .contract()
-        .observation
+        .observation()
+        .elements
         .iter()
         .map(|element| f32::midpoint(element.min, element.max))
         .collect();
-    let mut action = vec![0.0; bundle.contract().action.len()];
+    let mut action = vec![0.0; bundle.contract().action().len()];
+    let steps = bundle.contract().context.expect("a context").steps;
     for id in 0..bundle.contract().instructions.len() as u32 {
         controller
             .set_instruction(Instruction::Id(id))
             .expect("a known instruction");
-        for _ in 0..2 * bundle.contract().context.steps {
+        for _ in 0..2 * steps {
             controller.step(&observation, &mut action).expect("a step");
         }
     }
@@ -215,14 +226,7 @@ fn a_model_without_a_contract_is_refused() {
 
 #[test]
 fn another_version_is_refused() {
-    let text = String::from_utf8_lossy(TINY).into_owned();
-    let spelled = if text.contains("\"version\":1,") {
-        "\"version\":1,"
-    } else {
-        "\"version\": 1,"
-    };
-    let other = spelled.replace('1', "7");
-    let Err(error) = Bundle::from_bytes(&edited(spelled, &other)) else {
+    let Err(error) = Bundle::from_bytes(&edited(r#""version": 2,"#, r#""version": 7,"#)) else {
         panic!("it opened")
     };
     assert!(
@@ -230,8 +234,16 @@ fn another_version_is_refused() {
         "{error}"
     );
     assert!(
-        error.to_string().contains("version 7") && error.to_string().contains("version 1"),
+        error.to_string().contains("version 7") && error.to_string().contains("version 2"),
         "{error}"
+    );
+}
+
+#[test]
+fn version_1_is_refused_with_the_command_that_upgrades_it() {
+    refused(
+        &edited(r#""version": 2,"#, r#""version": 1,"#),
+        &["version 1", "python -m lads_exporter upgrade"],
     );
 }
 
@@ -242,48 +254,238 @@ fn contracts_that_miss_or_contradict_something_are_refused() {
         &edited("\"horizon\"", "\"horizom\""),
         &["contract", "horizon"],
     );
-    let text = String::from_utf8_lossy(TINY).into_owned();
-    let with = |name: &str, value: &str| {
-        [
-            format!("\"{name}\":{value}"),
-            format!("\"{name}\": {value}"),
-        ]
-        .into_iter()
-        .find(|spelled| text.contains(spelled))
-        .expect("the field")
-    };
-    let horizon = with("horizon", "4");
     refused(
-        &edited(&horizon, &horizon.replace('4', "5")),
-        &[
-            "trajectory_encoder/encode/observations",
-            "`horizon`",
-            "[1, 5, 5]",
-            "[1, 4, 5]",
-        ],
+        &edited("\"horizon\": 4", "\"horizon\": 0"),
+        &["`family.horizon` is 0"],
     );
     refused(
-        &edited(&horizon, &horizon.replace('4', "0")),
-        &["`horizon` is 0"],
-    );
-    let size = with("size", "5");
-    refused(
-        &edited(&size, &size.replace('5', "6")),
-        &["logits", "`codebook.size`"],
+        &edited("\"size\": 5", "\"size\": 6"),
+        &["logits", "`family.codebook.size`"],
     );
     refused(
         &edited("\"joint2_velocity\"", "\"joint1_velocity\""),
-        &["action[1].name", "repeats"],
+        &["channels[4].elements[1].name", "repeats"],
     );
 }
 
-/// The tiny bundle's contract with this `language.acceptance`.
-fn with_acceptance(acceptance: serde_json::Value) -> Result<Contract, BundleError> {
+#[test]
+fn a_channel_of_another_shape_names_itself_and_the_value() {
+    refused(
+        &edited("\"shape\": [4, 5]", "\"shape\": [4, 6]"),
+        &[
+            "trajectory_encoder/encode/observations",
+            "[1, 4, 5]",
+            "[4, 6]",
+        ],
+    );
+}
+
+/// The tiny bundle's contract as JSON.
+fn contract() -> serde_json::Value {
     let start = br#"{"version""#;
     let at = TINY.windows(start.len()).position(|part| part == start);
     let json = &TINY[at.expect("the contract")..];
     let mut values = serde_json::Deserializer::from_slice(json).into_iter();
-    let mut contract: serde_json::Value = values.next().unwrap().unwrap();
+    values.next().unwrap().unwrap()
+}
+
+/// What is done to a contract, and what is then said: the field and more.
+type Broken = (fn(&mut serde_json::Value), &'static [&'static str]);
+
+const BROKEN: &[Broken] = &[
+    (|c| c["family"]["kind"] = "lasd".into(), &["lasd"]),
+    (
+        |c| c["family"]["codebook"]["dim"] = 0.into(),
+        &["`family.codebook.dim` is 0"],
+    ),
+    (
+        |c| c["family"]["decision"]["temperature"] = 0.0.into(),
+        &["`family.decision.temperature` is 0"],
+    ),
+    (
+        |c| c["family"]["decision"]["rule"] = "guess".into(),
+        &["guess"],
+    ),
+    (
+        |c| c["control_period_s"] = 0.0.into(),
+        &["`control_period_s` is 0"],
+    ),
+    (
+        |c| c["channels"] = serde_json::json!([]),
+        &["`channels`", "0 observations"],
+    ),
+    (
+        |c| drop(c["channels"].as_array_mut().unwrap().pop()),
+        &["`channels`", "0 actions"],
+    ),
+    (
+        |c| drop(c["channels"].as_array_mut().unwrap().remove(1)),
+        &["`channels` has no instruction", "lads"],
+    ),
+    (
+        |c| c["channels"][1]["name"] = "action".into(),
+        &["channels[4].name", "repeats \"action\""],
+    ),
+    (|c| c["channels"][0]["role"] = "sensor".into(), &["sensor"]),
+    (|c| c["channels"][0]["dtype"] = "f64".into(), &["f64"]),
+    (
+        |c| c["channels"][0]["shape"] = serde_json::json!([6]),
+        &["`channels[0].elements` has 5 elements"],
+    ),
+    (
+        |c| c["channels"][0]["shape"] = serde_json::json!([]),
+        &["`channels[0].shape` is []"],
+    ),
+    (
+        |c| c["channels"][0]["elements"][2]["min"] = 1.0.into(),
+        &["`channels[0].elements[2]` (drawer)", "no range"],
+    ),
+    (
+        |c| c["channels"][4]["dtype"] = "u8".into(),
+        &["`channels[4].elements`", "only vectors of f32"],
+    ),
+    (
+        |c| c["channels"][4]["elements"][0]["scale"] = 1e39.into(),
+        &["channels[4].elements[0]"],
+    ),
+    (
+        |c| c["context"]["steps"] = 0.into(),
+        &["`context.steps` is 0"],
+    ),
+    (
+        |c| c["context"]["words"] = 7.into(),
+        &["`context.words` is not"],
+    ),
+    (|c| c["context"]["beyond"] = "stop".into(), &["stop"]),
+    (|c| c["context"] = serde_json::Value::Null, &["`context`"]),
+    (
+        |c| c["instructions"] = serde_json::json!([]),
+        &["`instructions` has 0"],
+    ),
+    (
+        |c| c["instructions"][1]["id"] = "dl".into(),
+        &["instructions[1].id", "repeats \"dl\""],
+    ),
+    (
+        |c| c["instructions"][1]["text"] = " ".into(),
+        &["`instructions[1].text` is empty"],
+    ),
+    (|c| c["language"] = serde_json::Value::Null, &["`language`"]),
+    (
+        |c| c["language"]["dim"] = 9.into(),
+        &["`language.dim` is 9"],
+    ),
+    (|c| c["network"] = serde_json::Value::Null, &["`network`"]),
+    (
+        |c| c["network"]["heads"] = 0.into(),
+        &["`network.heads` is 0"],
+    ),
+    (
+        |c| {
+            drop(
+                c["evaluation"]["instructions"]
+                    .as_array_mut()
+                    .unwrap()
+                    .pop(),
+            );
+        },
+        &["`evaluation.instructions` has 3"],
+    ),
+    (
+        |c| c["evaluation"]["instructions"][0]["split"] = "".into(),
+        &["`evaluation.instructions[0].split` is empty"],
+    ),
+    (
+        |c| c["states"] = serde_json::json!([{"name": "h", "kind": "plain", "shape": [0]}]),
+        &["`states[0].shape` is [0]"],
+    ),
+    (
+        |c| c["states"] = serde_json::json!([{"name": "r", "kind": "ring", "rows": 0}]),
+        &["`states[0].rows` is 0"],
+    ),
+    (
+        |c| {
+            c["states"] =
+                serde_json::json!([{"name": "r", "kind": "ring", "rows": 2, "source": "action"}]);
+        },
+        &["`states[0].source` is \"action\""],
+    ),
+    (
+        |c| drop(c.as_object_mut().unwrap().remove("provenance")),
+        &["`provenance`"],
+    ),
+];
+
+#[test]
+fn every_field_is_refused_by_its_name() {
+    Contract::parse(&contract().to_string()).expect("the contract itself is sound");
+    for (number, (edit, parts)) in BROKEN.iter().enumerate() {
+        let mut contract = contract();
+        edit(&mut contract);
+        let Err(error) = Contract::parse(&contract.to_string()) else {
+            panic!("case {number} is read, though {parts:?}")
+        };
+        let message = error.to_string();
+        for part in *parts {
+            assert!(
+                message.contains(part),
+                "case {number}: \"{message}\" does not say {part:?}"
+            );
+        }
+        assert!(!message.contains('\n'), "{message}");
+    }
+}
+
+#[test]
+fn a_context_that_is_no_multiple_of_the_horizon_is_refused() {
+    refused(
+        &edited("\"steps\": 24", "\"steps\": 22"),
+        &["`context.steps` is 22", "multiple", "4"],
+    );
+    refused(
+        &edited("\"steps\": 24", "\"steps\": 1 "),
+        &["`context.steps` is 1", "multiple", "4"],
+    );
+}
+
+#[test]
+fn a_context_of_one_step_compiles_and_runs() {
+    let short = edited("\"steps\": 24", "\"steps\": 1 ");
+    let at = short.windows(12).position(|part| part == b"\"horizon\": 4");
+    let mut short = short;
+    short[at.expect("the horizon") + 11] = b'1';
+    let bundle = Bundle::from_bytes(&short).unwrap_or_else(|error| panic!("{error}"));
+    let image = compile(&bundle).unwrap_or_else(|error| panic!("{error}"));
+    let policy = Policy::new_checked(image.as_bytes()).expect("the image loads");
+    let (mut arena, mut state) = (vec![0.0; policy.arena_len()], vec![0.0; policy.state_len()]);
+    let workspace = Workspace::new(&policy, &mut arena, &mut state).expect("enough memory");
+    let mut controller = Controller::new(policy, workspace);
+    controller
+        .set_instruction(Instruction::Id(0))
+        .expect("a known instruction");
+    let mut action = [0.0; 3];
+    for _ in 0..3 {
+        let report = controller.step(&[0.1; 5], &mut action).expect("a step");
+        assert_eq!(report.timestep, 0);
+    }
+}
+
+#[test]
+fn more_steps_than_the_table_of_timesteps_has_rows_are_refused() {
+    let bundle = Bundle::from_bytes(&edited("\"steps\": 24", "\"steps\": 28")).unwrap();
+    let message = compile(&bundle).unwrap_err().to_string();
+    for part in ["high_level", "timestep", "24 rows", "`context.steps`", "28"] {
+        assert!(
+            message.contains(part),
+            "\"{message}\" does not say {part:?}"
+        );
+    }
+    assert!(!message.contains('\n'), "{message}");
+}
+
+/// The tiny bundle's contract with this `language.acceptance`.
+fn with_acceptance(acceptance: serde_json::Value) -> Result<Contract, BundleError> {
+    let mut contract = contract();
     contract["language"]["acceptance"] = acceptance;
     Contract::parse(&contract.to_string())
 }
@@ -294,11 +496,15 @@ fn a_contract_may_say_which_sentences_are_followed() {
         "similarity": "alignment", "threshold": 0.608, "accepted_known": 0.925, "accepted_other": 0.1125
     });
     let read = with_acceptance(acceptance.clone()).unwrap();
-    let read = read.language.acceptance.expect("it says so");
+    let read = read
+        .language
+        .expect("a language")
+        .acceptance
+        .expect("it says so");
     assert_eq!(read.similarity, Similarity::Alignment);
     assert!((read.threshold - 0.608).abs() < 1e-6 && read.accepted_other < read.accepted_known);
     let none = with_acceptance(serde_json::Value::Null).unwrap();
-    assert_eq!(none.language.acceptance, None);
+    assert_eq!(none.language.expect("a language").acceptance, None);
     for (part, value) in [
         ("threshold", serde_json::json!(1.5)),
         ("threshold", serde_json::json!(-1.01)),

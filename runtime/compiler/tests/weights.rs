@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use lads_compiler::{
-    Bundle, CacheFormat, CompileError, Image, Memory, Options, WeightFormat, compile_with,
+    Bundle, CacheFormat, CompileError, Image, Options, WeightFormat, compile_with,
 };
-use lads_core::image::ProgramKind;
-use lads_core::{Isa, Policy, SelfTestError};
+use lads_core::{Controller, Instruction, Isa, Policy, SelfTest, SelfTestError, Workspace};
+use lads_image::Tables;
 use lads_image::op::Op;
 
 fn tiny() -> Bundle {
@@ -22,36 +22,54 @@ fn options(weights: WeightFormat, tolerance: f32) -> Options {
     }
 }
 
+/// Puts a policy to work in memory of its own.
+fn at_work<T>(policy: &Policy, isa: Isa, work: impl FnOnce(&mut Controller) -> T) -> T {
+    let (mut arena, mut state) = (vec![0.0; policy.arena_len()], vec![0.0; policy.state_len()]);
+    let workspace = Workspace::new(policy, &mut arena, &mut state).unwrap();
+    work(&mut Controller::with_isa(*policy, workspace, isa))
+}
+
+#[expect(
+    clippy::redundant_closure_for_method_calls,
+    reason = "the method alone is not general enough in its lifetimes"
+)]
+fn self_test(policy: &Policy) -> Result<SelfTest, SelfTestError> {
+    at_work(policy, Isa::detect(), |controller| controller.self_test())
+}
+
 /// Every action of the golden episode, on chosen instructions, and of every decision how clear it was.
 fn replayed(image: &Image, isa: Isa) -> (Vec<f32>, Vec<f32>) {
     let policy = Policy::new_checked(image.as_bytes()).unwrap();
     let golden = policy.golden().unwrap();
-    let mut memory = Memory::of(&policy).expect("there is memory");
-    let mut controller = memory.controller_with(&policy, isa).unwrap();
-    let instruction = lads_core::Instruction::Id(golden.instruction());
-    controller.set_instruction(instruction).unwrap();
-    let mut action = vec![0.0; policy.contract().action_len()];
-    let (mut actions, mut margins) = (vec![], vec![]);
-    for (observation, _, _) in golden.steps() {
-        let report = controller.step(observation, &mut action).unwrap();
-        actions.extend_from_slice(&action);
-        margins.push(report.margin);
-    }
-    (actions, margins)
+    at_work(&policy, isa, |controller| {
+        let instruction = golden.instruction().map(Instruction::Id).unwrap();
+        controller.set_instruction(instruction).unwrap();
+        let mut action = vec![0.0; policy.contract().action_len()];
+        let (mut actions, mut margins) = (vec![], vec![]);
+        for step in golden.steps() {
+            let report = controller.step(step.observation(), &mut action).unwrap();
+            actions.extend_from_slice(&action);
+            margins.push(report.selected.unwrap().margin);
+        }
+        (actions, margins)
+    })
 }
 
 fn actions(image: &Image, isa: Isa) -> Vec<f32> {
     replayed(image, isa).0
 }
 
-/// How the dense layers of a program are stored.
-fn layers(image: &Image, program: ProgramKind) -> Vec<WeightFormat> {
-    let policy = Policy::new_checked(image.as_bytes()).unwrap();
-    let format = |op| match op {
+/// How the dense layers of an entry are stored.
+fn layers(image: &Image, name: &str) -> Vec<WeightFormat> {
+    let tables = Tables::new(image.as_bytes()).unwrap();
+    let mut entries = (0..tables.entries_len()).map(|i| tables.entry(i).unwrap());
+    let entry = entries.find(|entry| tables.text(entry.name) == name);
+    let ops = tables.ops(&entry.expect("an entry of this name"));
+    let format = |words| match Op::decode(words).expect("an op") {
         Op::Linear(op) => Some(op.format),
         _ => None,
     };
-    policy.program(program).ops().filter_map(format).collect()
+    ops.iter().filter_map(format).collect()
 }
 
 fn largest_difference(a: &[f32], b: &[f32]) -> f32 {
@@ -77,8 +95,7 @@ fn fewer_bits_are_admitted_inside_a_tolerance() {
         let image = compile_with(&bundle, options(format, tolerance)).unwrap();
         let policy = Policy::new_checked(image.as_bytes()).unwrap();
         assert_eq!(policy.golden().unwrap().tolerance(), tolerance);
-        let mut memory = Memory::of(&policy).expect("there is memory");
-        let passed = memory.controller(&policy).unwrap().self_test().unwrap();
+        let passed = self_test(&policy).unwrap();
         assert!(
             passed.largest_error > tolerance / 20.0,
             "{passed:?} says nothing"
@@ -98,7 +115,7 @@ fn fewer_bits_are_admitted_inside_a_tolerance() {
             assert!(image.as_bytes().len() < bytes, "{format:?}");
             bytes = image.as_bytes().len();
         }
-        let layers = layers(&image, ProgramKind::Act);
+        let layers = layers(&image, "low_level/act");
         assert_eq!(layers[1..], vec![format; layers.len() - 1]);
         // The first layer weighs sensors of different units, for which one step is too coarse.
         let first = if format.is_scaled() {
@@ -137,8 +154,7 @@ fn what_changes_the_policy_is_refused_unless_forced() {
     };
     let image = compile_with(&bundle, forced).unwrap();
     let policy = Policy::new_checked(image.as_bytes()).unwrap();
-    let mut memory = Memory::of(&policy).expect("there is memory");
-    assert!(memory.controller(&policy).unwrap().self_test().is_err());
+    assert!(self_test(&policy).is_err());
 }
 
 /// The cache is in no action, and of the weights only the low level's are: what is rounded may only change which plan is chosen.
@@ -184,7 +200,7 @@ fn what_only_chooses_plans_may_take_fewer_bits_and_no_tolerance() {
         let layers = layers(&image, program);
         !layers.is_empty() && layers.iter().all(|&found| found == format)
     };
-    assert!(of(ProgramKind::Act, WeightFormat::F32));
-    assert!(of(ProgramKind::StepDecide, WeightFormat::F16));
+    assert!(of("low_level/act", WeightFormat::F32));
+    assert!(of("high_level/step", WeightFormat::F16));
     assert!(image.as_bytes().len() < exact.as_bytes().len());
 }

@@ -6,16 +6,16 @@
 use core::error::Error;
 use core::fmt;
 
-use lads_image::codec::{Field, Reader};
-use lads_image::records::{
-    self, ChannelRecord, ContractRecord, ElementRecord, InstructionRecord, NoiseRule, SelectionRule,
-};
+use lads_image::records::{self, ContractRecord, InstructionRecord, NoiseRule, SelectionRule};
 use lads_image::tables::Tables;
 
+use crate::errors::InputError;
 use crate::inputs::MAX_OBSERVATIONS;
 
-/// The most elements that a channel may have: an image of 4,096 by 4,096 pixels of four colours is within it.
-const MAX_CHANNEL_LEN: u64 = 1 << 26;
+mod channel;
+
+pub(crate) use channel::Bounds;
+pub use channel::{Channel, ChannelId, DType, Element, Interval, QuaternionOrder, Role};
 
 /// The most channels that a policy may have.
 const MAX_CHANNELS: usize = 128;
@@ -28,40 +28,12 @@ pub struct Contract<'a> {
     /// The first observation channel.
     observation: u32,
     observations_len: u32,
+    observation_dtype: DType,
+    observation_bounds: Bounds<'a>,
     action: u32,
-    action_len: u32,
+    action_bounds: Bounds<'a>,
     instruction: Option<u32>,
     noise: Option<u32>,
-}
-
-/// Which channel of a policy: its position among [`Contract::channels`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct ChannelId(pub u32);
-
-/// What a channel is for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Role {
-    /// Given by the caller in every control step.
-    Observation,
-    /// Written by every control step.
-    Action,
-    /// Word embeddings, `[words, elements]`.
-    Instruction,
-    /// Random numbers: each run of a program that reads the channel takes a draw of its own.
-    Noise,
-    /// A piece of a demonstration, given to [`Controller::encode`](crate::Controller::encode).
-    Demonstration,
-}
-
-/// The type of a channel's elements.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum DType {
-    /// 32-bit floats.
-    F32,
-    /// Bytes, such as the pixels of a camera.
-    U8,
-    /// Signed 32-bit integers.
-    I32,
 }
 
 /// What happens when a context has seen as many control steps as the policy was trained on.
@@ -71,66 +43,6 @@ pub enum Beyond {
     Restart,
     /// The step is refused.
     Refuse,
-}
-
-/// Order of the components of the quaternions in a channel.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum QuaternionOrder {
-    /// There are none.
-    None,
-    /// Scalar first.
-    Wxyz,
-    /// Scalar last.
-    Xyzw,
-}
-
-/// One channel: a value at the policy's edge.
-#[derive(Debug, Clone, Copy)]
-pub struct Channel<'a> {
-    tables: Tables<'a>,
-    record: ChannelRecord,
-    id: ChannelId,
-}
-
-/// One element of a channel.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Element<'a> {
-    /// Name.
-    pub name: &'a str,
-    /// Unit, `1` for none.
-    pub unit: &'a str,
-    /// Joint that it belongs to; empty for none.
-    pub joint: &'a str,
-    /// What of the joint: `position`, `velocity`, `effort`; empty where the bundle does not say.
-    pub interface: &'a str,
-    /// Unit of the physical value that the element stands for; empty where the bundle does not say.
-    pub physical_unit: &'a str,
-    /// Physical value of one unit of the element: physical = reference + offset + scale * value.
-    pub scale: f32,
-    /// Physical value of zero, on top of the channel's reference.
-    pub offset: f32,
-    /// What the contract allows.
-    pub limits: Interval,
-}
-
-/// The smallest and the largest value of one element, in its unit.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Interval {
-    /// The smallest value.
-    pub min: f32,
-    /// The largest value.
-    pub max: f32,
-}
-
-impl Interval {
-    /// The value, or the limit beyond which it lies. What is not a number stays so.
-    #[inline]
-    pub fn clamp(self, value: f32) -> f32 {
-        // `f32::clamp` without its panic on limits in the wrong order, which a checked contract does not have; two selections and
-        // no branch, so that a control step takes the same instructions whatever the action.
-        let raised = if value < self.min { self.min } else { value };
-        if raised > self.max { self.max } else { raised }
-    }
 }
 
 /// One instruction that a policy knows.
@@ -186,8 +98,10 @@ impl<'a> Contract<'a> {
             record,
             observation: records::NONE,
             observations_len: 0,
+            observation_dtype: DType::F32,
+            observation_bounds: Bounds::NONE,
             action: records::NONE,
-            action_len: 0,
+            action_bounds: Bounds::NONE,
             instruction: None,
             noise: None,
         };
@@ -202,6 +116,8 @@ impl<'a> Contract<'a> {
                 Role::Observation => {
                     if contract.observations_len == 0 {
                         contract.observation = i;
+                        contract.observation_dtype = channel.dtype();
+                        contract.observation_bounds = channel.bounds();
                     }
                     contract.observations_len = contract.observations_len.saturating_add(1);
                 }
@@ -211,7 +127,7 @@ impl<'a> Contract<'a> {
                         return Err(ContractError::Channels);
                     }
                     contract.action = i;
-                    contract.action_len = channel.len() as u32;
+                    contract.action_bounds = channel.bounds();
                 }
                 Role::Instruction => {
                     let words = channel.dtype() == DType::F32 && channel.shape().len() == 2;
@@ -288,11 +204,8 @@ impl<'a> Contract<'a> {
     /// A channel by its number.
     #[inline]
     pub fn channel(&self, id: ChannelId) -> Option<Channel<'a>> {
-        Some(Channel {
-            tables: self.tables,
-            record: self.tables.channel(id.0 as usize)?,
-            id,
-        })
+        let record = self.tables.channel(id.0 as usize)?;
+        Some(Channel::new(self.tables, record, id))
     }
 
     /// A channel by its name.
@@ -330,22 +243,61 @@ impl<'a> Contract<'a> {
     /// Elements of an action.
     #[inline]
     pub fn action_len(&self) -> usize {
-        self.action_len as usize
+        self.action_bounds.len
+    }
+
+    /// The limits of the action's elements, as a whole.
+    #[inline]
+    pub(crate) fn action_bounds(&self) -> Bounds<'a> {
+        self.action_bounds
+    }
+
+    /// Number of the action channel.
+    #[inline]
+    pub(crate) fn action_id(&self) -> u32 {
+        self.action
+    }
+
+    /// Number of the noise channel.
+    #[inline]
+    pub(crate) fn noise_id(&self) -> Option<u32> {
+        self.noise
+    }
+
+    /// The only observation channel, if it is one of floats.
+    #[inline]
+    pub(crate) fn only_observation(&self) -> Result<ChannelId, InputError> {
+        let id = ChannelId(self.observation);
+        if self.observation_dtype != DType::F32 {
+            return Err(InputError::Type { channel: id.0 });
+        }
+        if self.observations_len > 1 {
+            let other = self
+                .observations()
+                .nth(1)
+                .map_or(id, |channel| channel.id());
+            return Err(InputError::Missing { channel: other.0 });
+        }
+        Ok(id)
+    }
+
+    /// Checks the values of the only observation channel.
+    #[inline]
+    pub(crate) fn check_only(&self, values: &[f32]) -> Result<(), InputError> {
+        self.observation_bounds
+            .check(ChannelId(self.observation), values)
     }
 
     /// The limits of the action's elements.
     #[inline]
     pub fn action_limits(&self) -> impl Iterator<Item = Interval> + use<'a> {
-        self.action().limits()
+        self.action_bounds.iter()
     }
 
     /// A channel that [`new_checked`](Self::new_checked) has found.
     fn known(&self, i: u32) -> Channel<'a> {
-        Channel {
-            tables: self.tables,
-            record: self.tables.channel(i as usize).unwrap_or(EMPTY),
-            id: ChannelId(i),
-        }
+        let record = self.tables.channel(i as usize);
+        Channel::new(self.tables, record.unwrap_or(channel::EMPTY), ChannelId(i))
     }
 
     /// The channel of word embeddings; `None` for a policy that takes no instruction.
@@ -461,207 +413,6 @@ impl<'a> Contract<'a> {
 /// Whether two texts are the same. Byte by byte: comparing slices would call `bcmp`, which not every target has.
 pub(crate) fn same_text(a: &str, b: &str) -> bool {
     a.bytes().eq(b.bytes())
-}
-
-/// Stands for a channel that is not there, which no checked contract asks for.
-const EMPTY: ChannelRecord = ChannelRecord {
-    name: records::Text { offset: 0, len: 0 },
-    role: records::Role::Observation,
-    dtype: records::DType::F32,
-    rank: 1,
-    dims: [0, 1, 1, 1],
-    quaternions: records::QuaternionOrder::None,
-    reference: records::Text { offset: 0, len: 0 },
-    first_element: 0,
-    elements_len: 0,
-    min: 0.0,
-    max: 0.0,
-};
-
-impl Element<'_> {
-    /// Whether another element means the same, limits included.
-    pub(crate) fn is_like(&self, other: &Element) -> bool {
-        fn texts<'e>(element: &Element<'e>) -> [&'e str; 4] {
-            [element.name, element.unit, element.joint, element.interface]
-        }
-        fn numbers(element: &Element) -> [u32; 4] {
-            let Interval { min, max } = element.limits;
-            [element.scale, element.offset, min, max].map(f32::to_bits)
-        }
-        let mut both = texts(self).into_iter().zip(texts(other));
-        both.all(|(a, b)| same_text(a, b)) && numbers(self).iter().eq(&numbers(other))
-    }
-}
-
-impl<'a> Channel<'a> {
-    /// Whether another channel means the same to those who give observations and execute actions.
-    pub(crate) fn is_like(&self, other: &Channel) -> bool {
-        let (mut mine, mut theirs) = (self.elements(), other.elements());
-        let elements = loop {
-            match (mine.next(), theirs.next()) {
-                (None, None) => break true,
-                (Some(a), Some(b)) if a.is_like(&b) => {}
-                _ => break false,
-            }
-        };
-        let alike = |channel: &Channel| [channel.record.min, channel.record.max].map(f32::to_bits);
-        let ([min, max], [their_min, their_max]) = (alike(self), alike(other));
-        elements
-            && self.role() == other.role()
-            && self.dtype() == other.dtype()
-            && self.quaternion_order() == other.quaternion_order()
-            && self.shape().iter().eq(other.shape())
-            && same_text(self.name(), other.name())
-            && same_text(self.reference(), other.reference())
-            && (min == their_min && max == their_max)
-    }
-
-    /// `elements` is the number of element records of the channels before this one.
-    fn check(&self, elements: u32) -> Result<(), ContractError> {
-        let c = &self.record;
-        let shape = self.shape();
-        let len: u64 = shape.iter().fold(1, |len: u64, &dim| {
-            len.saturating_mul(u64::from(dim))
-                .min(MAX_CHANNEL_LEN.saturating_add(1))
-        });
-        let beyond = c.dims.get(shape.len()..).unwrap_or(&[]);
-        let shaped = (1..=4).contains(&c.rank)
-            && (1..=MAX_CHANNEL_LEN).contains(&len)
-            && beyond.iter().all(|&dim| dim == 1);
-        let described = c.elements_len == 0
-            || (c.first_element == elements && u64::from(c.elements_len) == len);
-        if !shaped || !described || self.name().is_empty() {
-            return Err(ContractError::Shape { channel: self.id });
-        }
-        let ordered = |min: f32, max: f32| min.is_finite() && max.is_finite() && min <= max;
-        let limits = ordered(c.min, c.max)
-            && self.elements().all(|element| {
-                ordered(element.limits.min, element.limits.max)
-                    && element.scale.is_finite()
-                    && element.offset.is_finite()
-            });
-        let exact = self.dtype() == DType::F32 || c.elements_len == 0;
-        let others = self.tables.channels_len().min(self.id.0 as usize);
-        let twice = (0..others).any(|i| {
-            self.tables
-                .channel(i)
-                .is_some_and(|other| same_text(self.tables.text(other.name), self.name()))
-        });
-        if !limits || !exact {
-            return Err(ContractError::Limits { channel: self.id });
-        }
-        if twice {
-            return Err(ContractError::Channels);
-        }
-        Ok(())
-    }
-
-    /// Its number.
-    pub fn id(&self) -> ChannelId {
-        self.id
-    }
-
-    /// Name.
-    pub fn name(&self) -> &'a str {
-        self.tables.text(self.record.name)
-    }
-
-    /// What it is for.
-    pub fn role(&self) -> Role {
-        match self.record.role {
-            records::Role::Observation => Role::Observation,
-            records::Role::Action => Role::Action,
-            records::Role::Instruction => Role::Instruction,
-            records::Role::Noise => Role::Noise,
-            records::Role::Demonstration => Role::Demonstration,
-        }
-    }
-
-    /// Type of its elements.
-    pub fn dtype(&self) -> DType {
-        match self.record.dtype {
-            records::DType::F32 => DType::F32,
-            records::DType::U8 => DType::U8,
-            records::DType::I32 => DType::I32,
-        }
-    }
-
-    /// Lengths of its axes, one to four.
-    pub fn shape(&self) -> &[u32] {
-        let rank = self.record.rank as usize;
-        self.record.dims.get(..rank).unwrap_or(&self.record.dims)
-    }
-
-    /// Elements.
-    #[inline]
-    #[expect(
-        clippy::len_without_is_empty,
-        reason = "a channel has an element at least"
-    )]
-    pub fn len(&self) -> usize {
-        let [a, b, c, d] = self.record.dims.map(|dim| dim as usize);
-        a.saturating_mul(b).saturating_mul(c).saturating_mul(d)
-    }
-
-    /// Order of the components of its quaternions.
-    pub fn quaternion_order(&self) -> QuaternionOrder {
-        match self.record.quaternions {
-            records::QuaternionOrder::None => QuaternionOrder::None,
-            records::QuaternionOrder::Wxyz => QuaternionOrder::Wxyz,
-            records::QuaternionOrder::Xyzw => QuaternionOrder::Xyzw,
-        }
-    }
-
-    /// What the values are relative to, in words; empty where the bundle does not say.
-    pub fn reference(&self) -> &'a str {
-        self.tables.text(self.record.reference)
-    }
-
-    /// Its elements with names and units; none for images and the like, whose [`limits`](Self::limits) are alike.
-    pub fn elements(&self) -> impl Iterator<Item = Element<'a>> + use<'a> {
-        let tables = self.tables;
-        tables.elements(&self.record).iter().filter_map(move |row| {
-            let record = ElementRecord::take(&mut Reader::new(row))?;
-            Some(Element {
-                name: tables.text(record.name),
-                unit: tables.text(record.unit),
-                joint: tables.text(record.joint),
-                interface: tables.text(record.interface),
-                physical_unit: tables.text(record.physical_unit),
-                scale: record.scale,
-                offset: record.offset,
-                limits: Interval {
-                    min: record.min,
-                    max: record.max,
-                },
-            })
-        })
-    }
-
-    /// Element `i`.
-    pub fn element(&self, i: usize) -> Option<Element<'a>> {
-        self.elements().nth(i)
-    }
-
-    /// The limits of its elements. Reads no text, so it is what a control step looks at.
-    #[inline]
-    pub fn limits(&self) -> impl Iterator<Item = Interval> + use<'a> {
-        let own = self.tables.elements(&self.record);
-        let alike = Interval {
-            min: self.record.min,
-            max: self.record.max,
-        };
-        // The limits are the last two words of an element's record.
-        own.iter()
-            .map(|&[.., min, max]| Interval {
-                min: f32::from_bits(min),
-                max: f32::from_bits(max),
-            })
-            .chain(core::iter::repeat_n(
-                alike,
-                if own.is_empty() { self.len() } else { 0 },
-            ))
-    }
 }
 
 /// Why a contract was refused.

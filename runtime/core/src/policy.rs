@@ -126,6 +126,8 @@ impl<'a> Policy<'a> {
     }
 
     /// Reads the whole image and compares its checksum: true when not a bit of it has changed since it was compiled.
+    // Goes over all bytes, and the static library builds this crate for size: compiled where it is called.
+    #[inline]
     pub fn checksum_matches(&self) -> bool {
         self.tables().checksum_matches()
     }

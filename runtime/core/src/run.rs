@@ -17,6 +17,7 @@ use crate::contract::ChannelId;
 use crate::errors::RunError;
 use crate::inputs::Data;
 use crate::normal::Normals;
+use crate::policy::Policy;
 use crate::workspace::Workspace;
 
 /// The integers of a program.
@@ -129,6 +130,29 @@ fn part_mut(memory: &mut [f32], at: usize, len: usize) -> Result<&mut [f32], Run
 fn fill(to: &mut [f32], from: &[f32]) {
     assign(to, from);
     to.get_mut(from.len()..).unwrap_or(&mut []).fill(0.0);
+}
+
+impl<'r, 'a, 'm, 'd> Run<'r, 'a, 'm, 'd> {
+    /// Nothing has run yet; noise is zero.
+    pub fn new(
+        policy: &'r Policy<'a>,
+        memory: &'r mut Workspace<'m>,
+        given: &'r [(ChannelId, Data<'d>)],
+        counters: Counters,
+    ) -> Self {
+        let contract = policy.contract();
+        Self {
+            tables: policy.tables(),
+            memory,
+            action: contract.action_id(),
+            given,
+            noise: contract.noise_id(),
+            draws: Draws::Zero,
+            counters,
+            words: 0,
+            given_index: None,
+        }
+    }
 }
 
 impl Run<'_, '_, '_, '_> {

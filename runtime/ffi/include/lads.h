@@ -255,7 +255,7 @@ typedef int32_t lads_status;
 /**
  * Stack that a call of the library takes at most, in bytes: measured on x86-64 with all functions of the archive.
  */
-#define LADS_STACK_BYTES 6224
+#define LADS_STACK_BYTES 10136
 
 /**
  * No channel, element or other number: stands where there is none.
@@ -1007,7 +1007,7 @@ lads_status lads_policy_instruction(const struct lads_policy *policy,
                                     struct lads_instruction *instruction);
 
 /**
- * Finds the number of an instruction by its id or its text, byte for byte.
+ * Finds the number of the instruction with this id, or of the first with this text, up to the case of ASCII letters and white space.
  *
  * # Safety
  * As `lads_policy_contract`; `name` points to `name_len` bytes, no zero needed; `number` may be written.

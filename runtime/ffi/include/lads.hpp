@@ -138,7 +138,7 @@ public:
         known = made<lads_instruction>();
         return lads_policy_instruction(&policy_, number, &known);
     }
-    /** By id or text, byte for byte. */
+    /** By id, or by text up to the case of ASCII letters and white space. */
     Status find_instruction(std::string_view name, std::uint32_t &number) const noexcept {
         return lads_policy_find_instruction(&policy_, name.data(), name.size(), &number);
     }

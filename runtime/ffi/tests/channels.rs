@@ -113,7 +113,7 @@ fn a_camera_is_described_and_checked() {
     assert_eq!(wrong(&unknown), (Status::ChannelType, GEAR, LADS_NONE));
     let bytes = [0_u8; 8];
     let bytes = changed(TICKS, &|input| {
-        (input.dtype, input.data) = (LADS_U8, bytes.as_ptr().cast())
+        (input.dtype, input.data) = (LADS_U8, bytes.as_ptr().cast());
     });
     assert_eq!(wrong(&bytes), (Status::ChannelType, TICKS, LADS_NONE));
     let outside = [0, 5];

@@ -308,6 +308,7 @@ const CRC_TABLE: [u32; 256] = {
 };
 
 /// CRC-32 (IEEE 802.3, the one of zip and PNG) of an image, its checksum word taken as zero.
+#[inline]
 pub fn crc32(image: &[u8]) -> u32 {
     let byte_in = |crc: u32, byte: u8| {
         let index = (crc ^ u32::from(byte)) & 0xff;

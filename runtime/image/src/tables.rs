@@ -198,6 +198,7 @@ impl<'a> Tables<'a> {
     }
 
     /// True when not a bit of the image has changed since it was written: reads all of it.
+    #[inline]
     pub fn checksum_matches(&self) -> bool {
         let stored = self.image.as_chunks::<4>().0.get(CRC_WORD);
         stored.map(|&bytes| u32::from_le_bytes(bytes)) == Some(format::crc32(self.image))

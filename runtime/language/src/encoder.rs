@@ -33,7 +33,9 @@ impl Encoder {
     ///
     /// Takes some seconds: the network is checked against its sha256 and optimised.
     pub fn open(folder: &Path, contract: &Contract) -> Result<Self, LanguageError> {
-        let wanted = &contract.language;
+        let (Some(wanted), Some([most, _])) = (&contract.language, contract.words()) else {
+            return Err(LanguageError::Deaf);
+        };
         let manifest = Manifest::read(folder, wanted)?;
         manifest.check(folder, wanted)?;
         let layer = match wanted.pooling {
@@ -70,7 +72,7 @@ impl Encoder {
             network,
             manifest,
             layer,
-            most: contract.context.words,
+            most,
         })
     }
 

@@ -12,6 +12,11 @@ pub enum LanguageError {
         "the bundle's language encoder is called '{0}', which names no folder; export the bundle again"
     )]
     Name(String),
+    /// A policy that takes no instructions.
+    #[error(
+        "the policy takes no instructions, so no sentence can be put to it; leave the sentence out"
+    )]
+    Deaf,
     /// Nothing says where the cache is.
     #[error(
         "no folder for the language encoder: none of LADS_CACHE, XDG_CACHE_HOME and HOME is set; set LADS_CACHE"

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use lads_compiler::contract::Pooling;
+use lads_compiler::contract::{Pooling, Role};
 use lads_compiler::{Bundle, Contract, sha256};
 use lads_language::{Encoder, LanguageError, default_folder};
 use serde::Deserialize;
@@ -30,13 +30,31 @@ fn contract(layer: i32, pooling: Pooling, most: usize) -> Contract {
     let manifest = fs::read_to_string(tiny().join("manifest.json")).unwrap();
     let manifest: serde_json::Value = serde_json::from_str(&manifest).unwrap();
     let mut contract = bundle.contract().clone();
-    contract.language.encoder = "tiny-encoder".into();
-    contract.language.sha256 = manifest["sha256"].as_str().unwrap().into();
-    contract.language.dim = 8;
-    contract.language.layer = layer;
-    contract.language.pooling = pooling;
-    contract.context.words = most;
+    let language = contract.language.as_mut().unwrap();
+    language.encoder = "tiny-encoder".into();
+    language.sha256 = manifest["sha256"].as_str().unwrap().into();
+    language.dim = 8;
+    language.layer = layer;
+    language.pooling = pooling;
+    let words = contract.channels.iter_mut();
+    let mut words = words.filter(|channel| channel.role == Role::Instruction);
+    words.next().unwrap().shape[0] = most;
     contract
+}
+
+#[test]
+fn a_policy_that_takes_no_instructions_hears_no_sentence() {
+    let mut deaf = words();
+    deaf.language = None;
+    assert!(matches!(refusal(&tiny(), &deaf), LanguageError::Deaf));
+    let mut deaf = words();
+    deaf.channels
+        .retain(|channel| channel.role != Role::Instruction);
+    let refused = refusal(&tiny(), &deaf);
+    assert!(
+        refused.to_string().contains("takes no instructions"),
+        "{refused}"
+    );
 }
 
 fn words() -> Contract {
@@ -110,11 +128,15 @@ fn a_missing_encoder_is_refused() {
 #[test]
 fn another_encoder_is_refused() {
     let mut other = words();
-    other.language.sha256 = "0123456789abcdef".repeat(4);
+    other
+        .language
+        .as_mut()
+        .expect("it takes instructions")
+        .sha256 = "0123456789abcdef".repeat(4);
     let error = refusal(&tiny(), &other);
     one_line(&error, &["tiny-encoder", "51acd264e5af", "0123456789ab"]);
     let mut wide = words();
-    wide.language.dim = 9;
+    wide.language.as_mut().expect("it takes instructions").dim = 9;
     one_line(&refusal(&tiny(), &wide), &["language.dim", "9", "8"]);
     for layer in [3, -4, i32::MAX, i32::MIN] {
         let error = refusal(&tiny(), &contract(layer, Pooling::None, 8));

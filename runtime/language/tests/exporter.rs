@@ -42,7 +42,7 @@ fn embeddings_are_the_exporters() {
         let path = format!("{}/../../models/{name}.onnx", env!("CARGO_MANIFEST_DIR"));
         let bundle = Bundle::open(Path::new(&path)).unwrap();
         let image = compile(&bundle).unwrap();
-        let contract = Policy::new_checked(image.as_bytes()).unwrap().contract();
+        let contract = *Policy::new_checked(image.as_bytes()).unwrap().contract();
         let encoder = Encoder::open(&folder, bundle.contract()).unwrap();
         let (mut compared, mut worst) = (0, 0.0_f32);
         for known in contract.instructions() {

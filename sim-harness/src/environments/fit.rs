@@ -174,7 +174,7 @@ fn same_elements(
         element.name != name && element.joint.as_deref() != Some(name)
     };
     let mut pairs = contract.iter().zip(environment).enumerate();
-    match pairs.find(|(_, (element, name))| differs(element, **name)) {
+    match pairs.find(|(_, (element, name))| differs(element, name)) {
         None => Ok(()),
         Some((index, (element, name))) => Err(Misfit::Name {
             field,

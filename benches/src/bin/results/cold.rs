@@ -4,12 +4,12 @@
 use std::path::Path;
 use std::process::Command;
 
+use lads_core::{Controller, Instruction, Policy};
+use lads_host::Memory;
 use lads_pace::BenchError;
 use lads_pace::clock::now;
 use lads_pace::contender::Episode;
 use lads_pace::stats::{median, quantile};
-use lads_host::Memory;
-use lads_core::{Controller, Instruction, Policy};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 

@@ -2,15 +2,15 @@
 
 use std::path::Path;
 
+use lads_benches::peers::Peers;
+use lads_compiler::{Bundle, compile};
+use lads_core::Policy;
 use lads_pace::BenchError;
 use lads_pace::clock::Pace;
 use lads_pace::contender::{Block, Kind, Work};
 use lads_pace::stats::exponent;
-use lads_benches::peers::Peers;
 use lads_pace::suite::{Candidate, with_contenders};
 use lads_pace::turns::take_turns;
-use lads_compiler::{Bundle, compile};
-use lads_core::Policy;
 use serde::{Deserialize, Serialize};
 
 use crate::Effort;

@@ -20,19 +20,19 @@ use std::process::{Command, ExitCode};
 use std::time::Instant;
 
 use clap::Parser;
-use lads_pace::clock::now;
-use lads_pace::contender::{Contender, Episode};
+use lads_benches::bundle;
+use lads_benches::peers::Peers;
 use lads_benches::peers::onnxruntime::OnnxRuntime;
 use lads_benches::peers::recompute::Recompute;
 use lads_benches::peers::{cut::Source, tract::Tract};
-use lads_pace::stats::{median, quantile};
-use lads_benches::peers::Peers;
-use lads_pace::suite::{Candidate, options, with_contenders};
-use lads_benches::bundle;
-use lads_pace::BenchError;
 use lads_compiler::{Bundle, WeightFormat, compile, compile_with};
 use lads_core::Policy;
 use lads_host::Aligned;
+use lads_pace::BenchError;
+use lads_pace::clock::now;
+use lads_pace::contender::{Contender, Episode};
+use lads_pace::stats::{median, quantile};
+use lads_pace::suite::{Candidate, options, with_contenders};
 use serde_json::{Value, json};
 
 use crate::measure::Bare;
@@ -197,11 +197,8 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
     };
     let mut guests = bare();
     guests.extend(recomputes(arguments, &whole));
-    let (field, hot, paced_all, contexts) = with_contenders(
-        &candidates,
-        &all_peers,
-        guests,
-        |field, contenders| {
+    let (field, hot, paced_all, contexts) =
+        with_contenders(&candidates, &all_peers, guests, |field, contenders| {
             let hot = measure::hot(field, contenders, effort, &mut |_| ())?;
             say("beside all peers: at 50 Hz");
             let rounds = effort.paced_all_rounds;
@@ -212,18 +209,16 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
                 "entrants": field.entrants, "absent": field.absent, "words": field.words,
             });
             Ok((entrants, hot, paced, contexts))
-        },
-    )?;
+        })?;
     let tails = candidates.get(..FOR_TAILS).unwrap_or(&candidates);
     say("beside ONNX Runtime: at 50 Hz, for the tails");
-    let (paced, loaded) =
-        with_contenders(tails, &main_peers, bare(), |field, contenders| {
-            let rounds = effort.paced_rounds;
-            let paced = measure::paced(field, contenders, rounds, 0, &mut |_| ())?;
-            say("the same beside a thread that thrashes the caches");
-            let loaded = measure::paced(field, contenders, effort.load_rounds, 1, &mut |_| ())?;
-            Ok((paced, loaded))
-        })?;
+    let (paced, loaded) = with_contenders(tails, &main_peers, bare(), |field, contenders| {
+        let rounds = effort.paced_rounds;
+        let paced = measure::paced(field, contenders, rounds, 0, &mut |_| ())?;
+        say("the same beside a thread that thrashes the caches");
+        let loaded = measure::paced(field, contenders, effort.load_rounds, 1, &mut |_| ())?;
+        Ok((paced, loaded))
+    })?;
 
     say("growth with the network");
     let folder = arguments.scratch.join("growth");

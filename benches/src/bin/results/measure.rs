@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use lads_benches::sweep::Sweep;
 use lads_pace::BenchError;
 use lads_pace::clock::Pace;
 use lads_pace::contender::{Block, Computed, Contender, Episode, Kind, Sample, Work, measure};
@@ -9,7 +10,6 @@ use lads_pace::load::Load;
 use lads_pace::realtime::Realtime;
 use lads_pace::stats::{Ratio, Rounds};
 use lads_pace::suite::Field;
-use lads_benches::sweep::Sweep;
 use lads_pace::turns::take_turns;
 use serde_json::{Value, json};
 

@@ -297,6 +297,33 @@ impl Blueprint {
     pub fn rows(&self, contract: &Contract, tokens: impl Fn(&Entry) -> usize) -> Vec<usize> {
         let (mut now, mut most) = (vec![0; self.states.len()], vec![0; self.states.len()]);
         let index = |name: &str| self.states.iter().position(|state| state.name == name);
+        self.walk(contract, |call, entry, _| {
+            for state in call.clears.iter().filter_map(|name| index(name)) {
+                now[state] = 0;
+            }
+            let times = match &call.times {
+                Times::Times(times) => *times,
+                Times::Rows(ring) => index(ring).map_or(0, |ring| now[ring]),
+            };
+            if let Some(cache) = entry.cache.as_deref().and_then(index) {
+                now[cache] += times * tokens(entry);
+                most[cache] = most[cache].max(now[cache]);
+            }
+            for output in &entry.outputs {
+                let name = output.strip_prefix("next_").unwrap_or(output);
+                if let Some(state) = index(name)
+                    && let Keep::Ring { rows, .. } = self.states[state].keep
+                {
+                    now[state] = (now[state] + 1).min(rows);
+                }
+            }
+        });
+        most
+    }
+
+    /// Goes through an instruction and all control steps of a context, or one period without a context, and shows each call that runs,
+    /// with its entry and the timestep.
+    pub fn walk(&self, contract: &Contract, mut see: impl FnMut(&Call, &Entry, usize)) {
         let mut run = |event: Event, timestep: usize| {
             let mut taken = false;
             for call in self.calls.iter().filter(|call| call.event == event) {
@@ -308,27 +335,8 @@ impl Blueprint {
                 let runs = due && !(call.otherwise && taken);
                 taken = runs || (call.otherwise && taken);
                 let found = self.entries.iter().find(|entry| entry.name == call.entry);
-                let (Some(entry), true) = (found, runs) else {
-                    continue;
-                };
-                for state in call.clears.iter().filter_map(|name| index(name)) {
-                    now[state] = 0;
-                }
-                let times = match &call.times {
-                    Times::Times(times) => *times,
-                    Times::Rows(ring) => index(ring).map_or(0, |ring| now[ring]),
-                };
-                if let Some(cache) = entry.cache.as_deref().and_then(index) {
-                    now[cache] += times * tokens(entry);
-                    most[cache] = most[cache].max(now[cache]);
-                }
-                for output in &entry.outputs {
-                    let name = output.strip_prefix("next_").unwrap_or(output);
-                    if let Some(state) = index(name)
-                        && let Keep::Ring { rows, .. } = self.states[state].keep
-                    {
-                        now[state] = (now[state] + 1).min(rows);
-                    }
+                if let (Some(entry), true) = (found, runs) {
+                    see(call, entry, timestep);
                 }
             }
         };
@@ -339,6 +347,5 @@ impl Blueprint {
         for timestep in 0..steps {
             run(Event::Step, timestep);
         }
-        most
     }
 }

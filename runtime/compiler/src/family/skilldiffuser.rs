@@ -1,4 +1,4 @@
-//! SkillDiffuser: every `H` steps a chunk of states by denoising and the actions between them, which are then executed open loop.
+//! `SkillDiffuser`: every `H` steps a chunk of states by denoising and the actions between them, which are then executed open loop.
 
 use lads_image::records::Event;
 use serde::Deserialize;

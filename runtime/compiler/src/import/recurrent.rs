@@ -4,7 +4,7 @@
 //! `g = x_t·W^T + h·R^T + Wb + Rb`, `c = sigmoid(g_f) * c + sigmoid(g_i) * tanh(g_c)`, `h = sigmoid(g_o) * tanh(c)`.
 //!
 //! GRU, with the gates in the order z, r, h (Cho et al. 2014): `z = sigmoid(..)`, `r = sigmoid(..)`,
-//! `n = tanh(x_t·W_h^T + Wb_h + (r * h)·R_h^T + Rb_h)`, or with `linear_before_reset`, as PyTorch has it,
+//! `n = tanh(x_t·W_h^T + Wb_h + (r * h)·R_h^T + Rb_h)`, or with `linear_before_reset`, as `PyTorch` has it,
 //! `n = tanh(x_t·W_h^T + Wb_h + r * (h·R_h^T + Rb_h))`; then `h = (1 - z) * n + z * h`.
 //!
 //! The input's share of all steps is one product.
@@ -331,17 +331,13 @@ fn gru_step(
     }
     let candidate = g.unary(Unary::of(UnaryKind::Tanh), candidate)?;
     // (1 - z) * n + z * h = n + z * (h - n)
-    match h {
-        Some(h) => {
-            let rest = g.binary(BinaryKind::Sub, h, candidate)?;
-            let kept = g.binary(BinaryKind::Mul, z, rest)?;
-            g.binary(BinaryKind::Add, candidate, kept)
-        }
-        None => {
-            let lost = g.binary(BinaryKind::Mul, z, candidate)?;
-            g.binary(BinaryKind::Sub, candidate, lost)
-        }
+    if let Some(h) = h {
+        let rest = g.binary(BinaryKind::Sub, h, candidate)?;
+        let kept = g.binary(BinaryKind::Mul, z, rest)?;
+        return g.binary(BinaryKind::Add, candidate, kept);
     }
+    let lost = g.binary(BinaryKind::Mul, z, candidate)?;
+    g.binary(BinaryKind::Sub, candidate, lost)
 }
 
 /// `Y [steps, directions, batch, hidden]`, `Y_h` and `Y_c [directions, batch, hidden]`; with `layout` 1 the batch comes first.

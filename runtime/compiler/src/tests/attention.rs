@@ -2,14 +2,14 @@
 
 use std::collections::HashMap;
 
-use lads_image::op::{CacheFormat, Op, Port};
+use lads_image::op::{CacheFormat, Op};
 use lads_kernels::reference;
 
 use super::machine::Machine;
 use super::models::{Small, int, ints};
 use super::oracle::{Oracle, close, tensor};
 use super::{Compiled, compiled};
-use crate::bundle::Bundle;
+use crate::contract::Network;
 use crate::error::CompileError;
 use crate::graph::{Dim, Type};
 use crate::lower::Cache;
@@ -17,7 +17,8 @@ use crate::lower::Cache;
 const HEADS: usize = 2;
 const DIM: usize = 3;
 const WIDTH: usize = HEADS * DIM;
-const PORTS: [(&str, Port); 2] = [("x", Port::Observation), ("y", Port::Logits)];
+/// Rows of the cache.
+const ROWS: usize = 12;
 
 /// Where a spelling differs from the exporter's.
 #[derive(Clone)]
@@ -170,17 +171,17 @@ impl Spelling {
 
     fn compile(&self) -> Result<Compiled, CompileError> {
         let small = self.model();
-        compiled(&small.model(18), &small.signature, &["y"], &PORTS, cache())
+        compiled(&small.model(18), &small.signature, &["y"], cache())
     }
 }
 
 fn cache() -> Cache {
-    let tiny = Bundle::from_bytes(include_bytes!("../../tests/data/tiny.onnx")).expect("a bundle");
-    let mut contract = tiny.contract().clone();
-    contract.network.layers = 1;
-    contract.network.heads = HEADS;
-    contract.network.head_dim = DIM;
-    Cache::new(&contract, CacheFormat::F32)
+    let network = Network {
+        layers: 1,
+        heads: HEADS,
+        head_dim: DIM,
+    };
+    Cache::new(network, ROWS, CacheFormat::F32)
 }
 
 /// Compiles, runs with some tokens in the cache and compares with tract.
@@ -197,7 +198,7 @@ fn agrees(spelling: &Spelling) -> Compiled {
             &program.weights,
             vec![f32::NAN; cache().len().expect("a size") as usize],
         );
-        machine.set(&program.placed, Port::Observation, &x);
+        machine.set(&program.placed, "x", &x);
         let [key_span, value_span] = cache().spans(0).map(|span| span.offset as usize);
         for (i, (&key, &value)) in keys.iter().zip(&values).enumerate() {
             let (head, row, col) = (i / (past * DIM), i / DIM % past, i % DIM);
@@ -217,7 +218,7 @@ fn agrees(spelling: &Spelling) -> Compiled {
         ]);
         close(
             "y",
-            &machine.output(&program.placed, Port::Logits),
+            &machine.output(&program.placed, "y"),
             &oracle.run(&inputs)["y"],
         );
     }
@@ -261,7 +262,7 @@ fn only_the_last_query_is_computed_if_no_other_is_read() {
 #[test]
 fn only_recording_computes_no_query() {
     let small = Spelling::new(2).model();
-    let program = compiled(&small.model(18), &small.signature, &[], &PORTS, cache())
+    let program = compiled(&small.model(18), &small.signature, &[], cache())
         .unwrap_or_else(|error| panic!("{error}"));
     assert_eq!(queries(&program), [0]);
     assert_eq!(

@@ -1,7 +1,7 @@
 //! A plain interpreter of ops, independent of the core's executor: loops, sums in `f64`.
 
 use lads_image::op::{
-    Activation, INT_SLOTS, Op, Operand, Place, Port, Space, Span, UnaryKind, WeightSpan,
+    Activation, INT_SLOTS, Op, Operand, Place, Space, Span, UnaryKind, WeightSpan,
 };
 use lads_kernels::{PANEL, reference};
 
@@ -42,14 +42,14 @@ impl<'w> Machine<'w> {
         }
     }
 
-    pub fn set(&mut self, program: &Placed, port: Port, values: &[f32]) {
-        for &(found, place) in &program.inputs {
-            match place {
-                Place::Span(span) if found == port => {
+    pub fn set(&mut self, program: &Placed, name: &str, values: &[f32]) {
+        for (found, place) in &program.inputs {
+            match *place {
+                Place::Span(span) if found == name => {
                     assert_eq!(span.len as usize, values.len());
                     self.arena[span.offset as usize..][..values.len()].copy_from_slice(values);
                 }
-                Place::Int(slot) if found == port => {
+                Place::Int(slot) if found == name => {
                     self.ints[usize::from(slot.0)] = values[0] as i64;
                 }
                 _ => {}
@@ -57,11 +57,11 @@ impl<'w> Machine<'w> {
         }
     }
 
-    pub fn output(&self, program: &Placed, port: Port) -> Vec<f32> {
+    pub fn output(&self, program: &Placed, name: &str) -> Vec<f32> {
         let &(_, place) = program
             .outputs
             .iter()
-            .find(|(found, _)| *found == port)
+            .find(|(found, _)| found == name)
             .expect("an output");
         match place {
             Place::Span(span) => self.get(span).to_vec(),

@@ -65,7 +65,7 @@ impl Small {
         Self {
             graph: GraphProto::default(),
             signature: Signature {
-                entry: ENTRY,
+                entry: ENTRY.into(),
                 inputs: vec![],
                 outputs: vec![],
             },
@@ -123,7 +123,7 @@ impl Small {
                 name: name.into(),
                 ty,
                 shape: shape.to_vec(),
-                fields: "test",
+                fields: "test".into(),
             },
         )
     }

@@ -7,32 +7,21 @@
 use std::collections::{BTreeMap, HashMap};
 
 use lads_core::Isa;
-use lads_core::image::{PORTS as MOST, PortRecord, ProgramRecord};
-use lads_image::codec::{Field, Writer};
-use lads_image::op::{Place, Port};
-use lads_image::{Program, Spaces};
+
+use lads_image::op::{INT_SLOTS, Op, Place};
+use lads_image::{Machine, Program, Spaces};
 use prost::Message;
 
 use super::models::ENTRY;
-use super::operators::cache;
 use super::{Compiled, compiled};
 use crate::entries::{Signature, Value};
 use crate::error::CompileError;
 use crate::graph::{Dim, Type};
+use crate::lower::Cache;
 use crate::onnx::ModelProto;
 use crate::tensor::{Data, Tensor};
 
 const FOLDER: &str = "LADS_ONNX_NODES";
-
-const PORTS: [(&str, Port); 7] = [
-    ("a", Port::Observation),
-    ("b", Port::Action),
-    ("c", Port::Plan),
-    ("d", Port::Words),
-    ("y", Port::Logits),
-    ("z", Port::Latent),
-    ("j", Port::PlanIndex),
-];
 
 /// One conformance test.
 struct Case {
@@ -97,12 +86,12 @@ impl Case {
                 Type::I64
             },
             shape: tensor.shape.iter().map(|&dim| Dim::of(dim)).collect(),
-            fields: "test",
+            fields: "test".into(),
         };
         let mut outputs: Vec<&String> = self.expected.keys().collect();
         outputs.sort();
         let signature = Signature {
-            entry: ENTRY,
+            entry: ENTRY.into(),
             inputs: inputs
                 .iter()
                 .map(|&name| value(name, &self.given[name]))
@@ -113,56 +102,45 @@ impl Case {
                 .collect(),
         };
         let names: Vec<&str> = outputs.iter().map(|name| name.as_str()).collect();
-        compiled(&model, &signature, &names, &PORTS, cache())
+        compiled(&model, &signature, &names, Cache::NONE)
     }
 
     /// Runs the program in the core and compares; the tolerance is that of ONNX's own runner.
     fn check(&self, name: &str, program: &Compiled) {
         let placed = &program.placed;
-        let ports = |ports: &[(Port, Place)]| {
-            let mut records = [PortRecord::default(); MOST];
-            for (record, &(port, place)) in records.iter_mut().zip(ports) {
-                *record = PortRecord { port, place };
-            }
-            records
-        };
-        let record = ProgramRecord {
-            first_op: 0,
-            ops_len: placed.ops.len() as u32,
-            arena_len: placed.arena_len,
-            tokens: 0,
-            inputs_len: placed.inputs.len() as u32,
-            inputs: ports(&placed.inputs),
-            outputs_len: placed.outputs.len() as u32,
-            outputs: ports(&placed.outputs),
-        };
-        let mut words = vec![0; ProgramRecord::WORDS];
-        record.put(&mut Writer::new(&mut words));
-        let ops: Vec<_> = placed.ops.iter().map(lads_image::op::Op::encode).collect();
+        let ops: Vec<_> = placed.ops.iter().map(Op::encode).collect();
         let spaces = Spaces {
             weights_len: program.weights.len(),
             cache_len: 0,
-            past_max: 0,
+            rows: 0,
         };
-        let opened = Program::new_checked(&words, &ops, spaces);
+        let places = placed.inputs.iter().chain(&placed.outputs);
+        let places = places.map(|&(_, place)| place);
+        let opened = Program::new_checked(&ops, placed.arena_len, 0, spaces, places);
         let opened = opened.unwrap_or_else(|error| panic!("{name}: {error}"));
-        let given: Vec<(Port, &[f32])> = (PORTS.iter())
-            .filter_map(|&(known, port)| Some((port, self.given.get(known)?.as_f32()?)))
-            .collect();
         for isa in Isa::all() {
             let mut arena = vec![f32::NAN; opened.arena_len()];
-            let ints = opened.run(isa, &program.weights, &mut arena, &given);
-            let ints = ints.unwrap_or_else(|error| panic!("{name}: {error}"));
+            for (input, place) in &placed.inputs {
+                let given = self.given.get(input).and_then(Tensor::as_f32);
+                match (place, given) {
+                    (Place::Span(span), Some(given)) => arena[span.range()].copy_from_slice(given),
+                    _ => panic!("{name}: {input} is no input of floats"),
+                }
+            }
+            let mut machine = Machine {
+                arena: &mut arena,
+                cache: &mut [],
+                ints: [0; INT_SLOTS],
+                past: 0,
+                isa,
+            };
+            let done = opened.run(&program.weights, &mut machine);
+            done.unwrap_or_else(|error| panic!("{name}: {error}"));
+            let ints = machine.ints;
             for (output, expected) in &self.expected {
-                let port = PORTS
-                    .iter()
-                    .find(|(known, _)| known == output)
-                    .expect("a port")
-                    .1;
-                let got: Vec<f32> = match opened.output(port).expect("an output") {
-                    Place::Span(span) => {
-                        arena[span.offset as usize..][..span.len as usize].to_vec()
-                    }
+                let found = placed.outputs.iter().find(|(known, _)| known == output);
+                let got: Vec<f32> = match found.expect("an output").1 {
+                    Place::Span(span) => arena[span.range()].to_vec(),
                     Place::Int(slot) => vec![ints[usize::from(slot.0)] as f32],
                 };
                 let expected: Vec<f32> = match &expected.data {

@@ -2,32 +2,13 @@
 
 use std::collections::HashMap;
 
-use lads_image::op::{CacheFormat, Port};
-
 use super::machine::Machine;
 use super::models::{Small, float, int, ints, text};
 use super::oracle::{Oracle, close, integer, tensor};
 use super::{Compiled, compiled};
-use crate::bundle::Bundle;
 use crate::error::CompileError;
 use crate::graph::{Dim, Type};
 use crate::lower::Cache;
-
-/// The ports that stand for the inputs and outputs of small models.
-pub(super) const PORTS: [(&str, Port); 7] = [
-    ("a", Port::Observation),
-    ("b", Port::Action),
-    ("c", Port::Plan),
-    ("i", Port::Timestep),
-    ("y", Port::Logits),
-    ("z", Port::Latent),
-    ("j", Port::PlanIndex),
-];
-
-pub(super) fn cache() -> Cache {
-    let tiny = Bundle::from_bytes(include_bytes!("../../tests/data/tiny.onnx")).expect("a bundle");
-    Cache::new(tiny.contract(), CacheFormat::F32)
-}
 
 pub(super) fn compile(small: &Small) -> Result<Compiled, CompileError> {
     let outputs: Vec<&str> = small
@@ -36,13 +17,7 @@ pub(super) fn compile(small: &Small) -> Result<Compiled, CompileError> {
         .iter()
         .map(|output| output.name.as_str())
         .collect();
-    compiled(
-        &small.model(18),
-        &small.signature,
-        &outputs,
-        &PORTS,
-        cache(),
-    )
+    compiled(&small.model(18), &small.signature, &outputs, Cache::NONE)
 }
 
 /// Compiles, runs and compares.
@@ -51,32 +26,21 @@ pub(super) fn agrees(mut small: Small) -> Compiled {
     let program = compile(&small).unwrap_or_else(|error| panic!("{error}"));
     let oracle = Oracle::new(&small.bytes(18));
     let mut machine = Machine::new(&program.placed, &program.weights, vec![]);
-    let port = |name: &str| {
-        PORTS
-            .iter()
-            .find(|(known, _)| *known == name)
-            .expect("a port")
-            .1
-    };
     let mut inputs = HashMap::new();
     for input in small.signature.inputs.clone() {
         let shape: Vec<usize> = input.shape.iter().map(|dim| dim.fixed).collect();
         if input.ty == Type::I64 {
-            machine.set(&program.placed, port(&input.name), &[2.0]);
+            machine.set(&program.placed, &input.name, &[2.0]);
             inputs.insert(input.name.clone(), integer(2));
         } else {
             let values = small.numbers(shape.iter().product());
-            machine.set(&program.placed, port(&input.name), &values);
+            machine.set(&program.placed, &input.name, &values);
             inputs.insert(input.name.clone(), tensor(&shape, &values));
         }
     }
     machine.run(&program.placed, 0);
     for (name, wanted) in oracle.run(&inputs) {
-        close(
-            &name,
-            &machine.output(&program.placed, port(&name)),
-            &wanted,
-        );
+        close(&name, &machine.output(&program.placed, &name), &wanted);
     }
     program
 }
@@ -150,17 +114,17 @@ fn unary_operators() {
     };
     for kind in ["none", "tanh"] {
         let small = gelu(kind);
-        let program = compiled(&small.model(20), &small.signature, &["y"], &PORTS, cache())
+        let program = compiled(&small.model(20), &small.signature, &["y"], Cache::NONE)
             .unwrap_or_else(|error| panic!("{error}"));
         let mut machine = Machine::new(&program.placed, &program.weights, vec![]);
         let values = Small::new().numbers(9);
-        machine.set(&program.placed, Port::Observation, &values);
+        machine.set(&program.placed, "a", &values);
         machine.run(&program.placed, 0);
         let inputs = HashMap::from([("a".to_string(), tensor(&[9], &values))]);
         let wanted = Oracle::new(&small.bytes(20)).run(&inputs);
         // tract's own error function is good to 1e-4 only near zero; the exact one is checked in the kernels.
         for (got, wanted) in machine
-            .output(&program.placed, Port::Logits)
+            .output(&program.placed, "y")
             .iter()
             .zip(&wanted["y"])
         {

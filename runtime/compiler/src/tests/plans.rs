@@ -1,37 +1,31 @@
 //! The memory plan and the verifier that does not trust it.
 
-use lads_image::op::{CacheFormat, Copy, Op, Operand, Place, Port, Space, Span, Unary, UnaryKind};
+use lads_image::op::{Copy, Op, Operand, Place, Space, Span, Unary, UnaryKind};
 use proptest::prelude::*;
 
-use super::compiled;
 use crate::bundle::Bundle;
-use crate::compile::RECIPES;
-use crate::entries;
-use crate::lower::{Cache, Lowered};
+use crate::lower::Lowered;
 use crate::plan::{Placed, plan};
 use crate::verify::{PlanFault, verify};
 
 /// All programs of the tiny bundle.
 fn programs() -> Vec<(Lowered, Placed)> {
+    named().into_iter().map(|(_, planned)| planned).collect()
+}
+
+/// All programs of the tiny bundle with their names.
+fn named() -> Vec<(String, (Lowered, Placed))> {
     let bundle =
         Bundle::from_bytes(include_bytes!("../../tests/data/tiny.onnx")).expect("a bundle");
-    let signatures = entries::signatures(bundle.contract());
-    let compile = |recipe: &crate::compile::Recipe| {
-        let signature = signatures
-            .iter()
-            .find(|signature| signature.entry == recipe.entry)
-            .expect("an entry");
-        let program = compiled(
-            &bundle.model,
-            signature,
-            recipe.outputs,
-            recipe.ports,
-            Cache::new(bundle.contract(), CacheFormat::F32),
-        );
-        let program = program.unwrap_or_else(|error| panic!("{error}"));
-        (program.lowered, program.placed)
-    };
-    RECIPES.iter().map(compile).collect()
+    super::programs(&bundle, 64)
+        .into_iter()
+        .map(|program| {
+            let super::Compiled {
+                lowered, placed, ..
+            } = program.compiled;
+            (program.entry.name, (lowered, placed))
+        })
+        .collect()
 }
 
 fn offsets(op: &Op) -> Vec<u32> {
@@ -115,12 +109,11 @@ fn a_changed_op_is_found() {
 
 #[test]
 fn plans_are_near_their_lower_bound() {
-    for (recipe, (_, placed)) in RECIPES.iter().zip(programs()) {
+    for (name, (_, placed)) in named() {
         let (arena, bound) = (placed.arena_len, placed.lower_bound);
         assert!(
             arena >= bound && arena * 10 <= bound * 11,
-            "{}: {arena} elements, at least {bound}",
-            recipe.name
+            "{name}: {arena} elements, at least {bound}"
         );
     }
 }
@@ -141,8 +134,8 @@ fn reads_of_nothing_are_found() {
     let program = |ops: Vec<Op>| Lowered {
         ops,
         buffers: vec![a, b, c],
-        inputs: vec![(Port::Observation, Place::Span(a))],
-        outputs: vec![(Port::Logits, Place::Span(c))],
+        inputs: vec![("a".into(), Place::Span(a))],
+        outputs: vec![("y".into(), Place::Span(c))],
         tokens: 0,
     };
     let sound = program(vec![unary(a, b), unary(b, c)]);
@@ -194,8 +187,8 @@ proptest! {
         let output = buffers[buffers.len() / 2];
         let lowered = Lowered {
             ops,
-            inputs: vec![(Port::Observation, Place::Span(buffers[0]))],
-            outputs: if buffers.len() > 2 { vec![(Port::Logits, Place::Span(output))] } else { vec![] },
+            inputs: vec![("a".into(), Place::Span(buffers[0]))],
+            outputs: if buffers.len() > 2 { vec![("y".into(), Place::Span(output))] } else { vec![] },
             buffers,
             tokens: 0,
         };

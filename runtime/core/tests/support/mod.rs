@@ -4,6 +4,7 @@
 
 pub mod assemble;
 pub mod draft;
+#[path = "../../../image/tests/support/model.rs"]
 pub mod model;
 pub mod shapes;
 pub mod writer;

@@ -216,7 +216,7 @@ pub unsafe extern "C" fn lads_policy_instruction(
     })
 }
 
-/// Finds the number of an instruction by its id or its text, byte for byte.
+/// Finds the number of the instruction with this id, or of the first with this text, up to the case of ASCII letters and white space.
 ///
 /// # Safety
 /// As `lads_policy_contract`; `name` points to `name_len` bytes, no zero needed; `number` may be written.
@@ -230,9 +230,8 @@ pub unsafe extern "C" fn lads_policy_find_instruction(
     // SAFETY: the caller guarantees all three.
     status(unsafe {
         find(policy, name, name_len, number, |contract, name| {
-            let mut all = contract.instructions();
-            let found = all.position(|known| same(known.id, name) || same(known.text, name));
-            found.map_or(Err(Status::UnknownInstruction), |found| Ok(found as u32))
+            let found = contract.instructions_called(name).next();
+            found.ok_or(Status::UnknownInstruction)
         })
     })
 }

@@ -2,7 +2,7 @@
 //!
 //! The pairs that differ are two cells of a multinomial distribution. Where the difference is known, one parameter stays unknown: how many
 //! pairs differ in all. The p-value is the largest probability, over that parameter, of a statistic at least as large as the one seen; the
-//! parameter is looked for inside a confidence set that misses it with [`MISSED`], which is added (Berger and Boos 1994, *JASA* 89:1012). So the
+//! parameter is looked for inside a confidence set that misses it with `MISSED`, which is added (Berger and Boos 1994, *JASA* 89:1012). So the
 //! test holds its level at any number of pairs. Nothing here can fail.
 
 use statrs::distribution::{Beta, Binomial, ContinuousCDF as _, DiscreteCDF as _};
@@ -142,7 +142,7 @@ pub(super) fn likelihood(count: usize, n: usize, share: f64) -> f64 {
     (ln_binomial(n as u64, count as u64) + done * share.ln() + left * (-share).ln_1p()).exp()
 }
 
-/// The exact interval of a proportion that misses it with [`MISSED`] (Clopper and Pearson 1934).
+/// The exact interval of a proportion that misses it with `MISSED` (Clopper and Pearson 1934).
 fn clopper_pearson(count: usize, n: usize) -> Interval {
     let at = |first: usize, second: usize, chance: f64| {
         Beta::new(first as f64, second as f64).map_or(chance, |beta| beta.inverse_cdf(chance))

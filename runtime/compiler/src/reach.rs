@@ -1,0 +1,148 @@
+//! Which rows of its tables an entry can ask for: a timestep, phase or pass beyond the last row would stop the policy in the middle of an
+//! episode, so it is refused here, with the field of the contract that is too large.
+
+use std::collections::HashMap;
+
+use lads_image::op::{IntSlot, Op, Place};
+
+use crate::contract::Contract;
+use crate::error::CompileError;
+use crate::family::{Blueprint, Bound, Entry, Keep, Times};
+use crate::lower::Lowered;
+
+/// The smallest and the largest value of an integer; nothing before the first.
+#[derive(Debug, Clone, Copy, Default)]
+struct Range(Option<(usize, usize)>);
+
+impl Range {
+    fn see(&mut self, value: usize) {
+        let (from, to) = self.0.unwrap_or((value, value));
+        self.0 = Some((from.min(value), to.max(value)));
+    }
+}
+
+/// What the integers of an entry can be.
+#[derive(Debug, Clone, Copy, Default)]
+struct Integers {
+    timestep: Range,
+    phase: Range,
+    pass: Range,
+}
+
+/// What the integers of all entries can be.
+#[derive(Debug)]
+pub(crate) struct Reach {
+    entries: HashMap<String, Integers>,
+}
+
+impl Reach {
+    /// Goes through the schedule of the longest context.
+    pub fn new(contract: &Contract, blueprint: &Blueprint) -> Self {
+        let mut entries: HashMap<String, Integers> = HashMap::new();
+        blueprint.walk(contract, |call, entry, timestep| {
+            let times = match &call.times {
+                Times::Times(times) => *times,
+                Times::Rows(ring) => ring_rows(blueprint, ring),
+            };
+            if !entries.contains_key(&entry.name) {
+                entries.insert(entry.name.clone(), Integers::default());
+            }
+            let Some(integers) = entries.get_mut(&entry.name) else {
+                return;
+            };
+            integers.timestep.see(timestep);
+            integers.phase.see(timestep % blueprint.period.max(1));
+            integers.pass.see(0);
+            integers.pass.see(times.saturating_sub(1));
+        });
+        Self { entries }
+    }
+
+    /// Refuses a table with fewer rows than the schedule asks for.
+    pub fn check(
+        &self,
+        contract: &Contract,
+        blueprint: &Blueprint,
+        entry: &Entry,
+        lowered: &Lowered,
+    ) -> Result<(), CompileError> {
+        let Some(integers) = self.entries.get(&entry.name) else {
+            return Ok(());
+        };
+        for (name, place) in &lowered.inputs {
+            let Place::Int(slot) = *place else { continue };
+            for (rows, shift) in tables(lowered, slot) {
+                let bound = blueprint.bind(contract, &entry.name, name, true);
+                fits(contract, integers, bound, rows, shift).map_err(|problem| {
+                    CompileError::Entry {
+                        entry: entry.name.as_str().into(),
+                        problem: problem.into(),
+                    }
+                })?;
+            }
+        }
+        Ok(())
+    }
+}
+
+fn ring_rows(blueprint: &Blueprint, ring: &str) -> usize {
+    let mut states = blueprint.states.iter();
+    match states
+        .find(|state| state.name == ring)
+        .map(|state| state.keep)
+    {
+        Some(Keep::Ring { rows, .. }) => rows,
+        _ => 0,
+    }
+}
+
+/// Rows of every table that an integer chooses from, and what is added to the integer.
+fn tables(lowered: &Lowered, slot: IntSlot) -> impl Iterator<Item = (i64, i64)> {
+    lowered.ops.iter().filter_map(move |op| match op {
+        Op::GatherRow(op) if op.index == slot => Some((i64::from(op.rows), i64::from(op.shift))),
+        _ => None,
+    })
+}
+
+fn fits(
+    contract: &Contract,
+    integers: &Integers,
+    bound: Option<Bound>,
+    rows: i64,
+    shift: i64,
+) -> Result<(), String> {
+    let (what, range) = match bound {
+        Some(Bound::Timestep) => ("timestep", integers.timestep),
+        Some(Bound::Phase) => ("phase", integers.phase),
+        Some(Bound::Pass) => ("pass", integers.pass),
+        _ => return Ok(()),
+    };
+    let steps = contract.context.map(|context| context.steps);
+    if what == "timestep" && steps.is_none() {
+        return Err(format!(
+            "a table of {rows} rows is read by `timestep`, which has no end without the field `context`"
+        ));
+    }
+    let Some((from, to)) = range.0 else {
+        return Ok(());
+    };
+    let (first, last) = (from as i64 + shift, to as i64 + shift);
+    if first < 0 {
+        return Err(format!(
+            "a table of {rows} rows is read at row {first} when `{what}` is {from}"
+        ));
+    }
+    if last < rows {
+        return Ok(());
+    }
+    let remedy = match steps {
+        Some(steps) if what == "timestep" => format!(
+            ": field `context.steps` is {steps}, for this table it may be {} at most",
+            steps as i64 - (last + 1 - rows)
+        ),
+        _ => String::new(),
+    };
+    Err(format!(
+        "a table of {rows} rows is read at row {last} when `{what}` is {to}{remedy}"
+    ))
+}

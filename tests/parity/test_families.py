@@ -1,0 +1,74 @@
+"""Every family of policies through the runtime, beside ONNX Runtime: random bundles and episodes, made here by the exporter's own twin of the
+schedule, and the ignored tests of `lads-tests` on them (`families`, and the instruction counts where valgrind is installed).
+
+Skipped where the exporter's environment or cargo is missing.
+"""
+
+import os
+import pathlib
+import re
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("onnxruntime")
+pytest.importorskip("lads_exporter.episode")
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+# The Makefile's: with another one cargo would build its dependencies once more.
+SELECTION = ("--workspace", "--features", "lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language")
+KINDS = ("lads", "lang_dt", "lisa", "vae", "lcsd", "skilldiffuser", "history", "plain", "recurrent", "stacked", "camera")
+STEPS = 200
+
+
+def exporter(*arguments):
+    command = [sys.executable, "-m", "lads_exporter", *map(str, arguments)]
+    done = subprocess.run(command, cwd=ROOT / "exporter", capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture(scope="module")
+def families(tmp_path_factory):
+    """-> the folder with a bundle and an episode of each kind."""
+    folder = tmp_path_factory.mktemp("families")
+    for kind in KINDS:
+        exporter("random", "--kind", kind, "-o", folder / f"{kind}.onnx")
+        exporter("episode", folder / f"{kind}.onnx", "--steps", STEPS, "-o", folder / f"{kind}.safetensors")
+    return folder
+
+
+def ignored(target, folder, *names):
+    """-> what the ignored tests of a target printed, and how many passed."""
+    if not shutil.which("cargo"):
+        pytest.skip("cargo is not installed")
+    command = ["cargo", "test", *SELECTION, "--test", target, "--", "--ignored", "--nocapture", *names]
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | {"LADS_FAMILIES": str(folder)}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return done.stdout, sum(map(int, re.findall(r"test result: ok\. (\d+) passed", done.stdout)))
+
+
+def test_every_family_replays(families):
+    _, passed = ignored("families", families)
+    assert passed == 4 * len(KINDS), "beside ONNX Runtime, bits, allocations, damaged images"
+
+
+def test_edited_images(families):
+    """The image fuzz target's function on edit scripts of a seeded generator, on images of every family."""
+    if not shutil.which("cargo"):
+        pytest.skip("cargo is not installed")
+    command = ["cargo", "test", *SELECTION, "--test", "hostile", "--", "--nocapture", "edited_images"]
+    more = {"LADS_FAMILIES": str(families), "LADS_FUZZ_SECONDS": "30"}
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | more, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    scripts = re.search(r"image: \d+ kept scripts, (\d+) generated ones", done.stdout)
+    assert int(scripts[1]) > 100
+
+
+def test_instruction_counts(families):
+    printed, passed = ignored("instruction_counts", families)
+    assert passed == 1
+    if "skipped: valgrind" in printed:
+        pytest.skip("valgrind is not installed")
+    assert re.findall(r"instructions of (\w+)'s steps", printed) == list(KINDS)
