@@ -234,7 +234,7 @@ fn sentences_that_nobody_can_hear_are_refused() {
 fn bad_bundles_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
-    refused(&path("none.onnx"), &[], &["none.onnx", "check the path"]);
+    refused(&path("none.onnx"), &[], &["none.onnx", "name a bundle"]);
     fs::write(path("text.onnx"), "no model at all\n").unwrap();
     refused(&path("text.onnx"), &[], &["text.onnx", "ONNX"]);
     let bytes = fs::read(tiny_bundle()).unwrap();
@@ -250,10 +250,10 @@ fn bad_bundles_are_refused() {
     let newer = altered(
         &tiny_bundle(),
         folder.path(),
-        r#"{"version": 1, "kind""#,
-        r#"{"version": 7, "kind""#,
+        r#"{"version": 2, "family""#,
+        r#"{"version": 7, "family""#,
     );
-    refused(&newer, &[], &["altered.onnx", "version 7", "version 1"]);
+    refused(&newer, &[], &["altered.onnx", "version 7", "version 2"]);
 }
 
 #[test]
@@ -263,7 +263,7 @@ fn a_bundle_that_asks_for_gigabytes_is_refused() {
         &kitchen_bundle(),
         folder.path(),
         r#""context": {"words": 24, "steps": 280, "beyond""#,
-        r#""context":{"words":24,"steps": 1048576,"beyond""#,
+        r#""context":{"words":24,"steps": 1048570,"beyond""#,
     );
     refused(
         &greedy,
