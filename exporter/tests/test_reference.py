@@ -156,7 +156,7 @@ def test_a_completed_reference_is_the_one_that_is_made_whole(bundle, tmp_path):
     whole, old = tmp_path / "whole.json", tmp_path / "old.json"
     reference.write(bundle, whole, episodes=2, traced=1)
     made = json.loads(whole.read_text())
-    assert made["float_noise"]["logit"] > 0 and made["contract"]["decision"]["rule"] == "argmax"
+    assert made["float_noise"]["logit"] > 0 and made["contract"]["family"]["decision"]["rule"] == "argmax"
     stripped = {key: value for key, value in made.items() if key not in ("contract", "float_noise")} | {"format_version": 1}
     traces = [row["trace"] for instruction in stripped["instructions"] for row in instruction["episodes"] if "trace" in row]
     kept = [(trace.pop("logits"), trace.pop("encoded"), trace.pop("encoded_margins")) for trace in traces]

@@ -84,6 +84,7 @@ pub enum Noise {
 
 impl<'a> Contract<'a> {
     /// Checks what the tables say at the policy's edge.
+    #[inline(never)]
     pub(crate) fn new_checked(tables: Tables<'a>) -> Result<Self, ContractError> {
         let record = tables.contract().ok_or(ContractError::Number)?;
         let positive = |x: f32| x.is_finite() && x > 0.0;

@@ -11,20 +11,42 @@ use crate::schedule::Sizes;
 #[derive(Debug, Clone, Copy)]
 pub struct Golden<'a> {
     record: GoldenRecord,
-    /// The values of each observation channel over all steps.
-    observations: [Option<Recorded<'a>>; MAX_OBSERVATIONS],
+    /// The section behind its record.
+    words: &'a [u32],
+    /// Where the values of each observation channel lie. Offsets, not slices: a self-test runs on small stacks.
+    observations: [Option<Recorded>; MAX_OBSERVATIONS],
     selected: &'a [u32],
     noise: &'a [f32],
     actions: &'a [f32],
     action_len: usize,
 }
 
-/// What a channel was over all steps.
+/// What a channel was over all steps: `steps * len` values from word `first` of the section.
 #[derive(Debug, Clone, Copy)]
-struct Recorded<'a> {
+struct Recorded {
     channel: ChannelId,
-    len: usize,
-    data: Data<'a>,
+    dtype: DType,
+    len: u32,
+    first: u32,
+}
+
+impl Recorded {
+    /// Its values at step `i`.
+    fn at<'a>(&self, words: &'a [u32], i: usize) -> Option<Data<'a>> {
+        let words = words.get(self.first as usize..)?;
+        let len = self.len as usize;
+        let start = i.checked_mul(len)?;
+        let range = start..start.checked_add(len)?;
+        Some(match self.dtype {
+            DType::F32 => Data::F32(bytemuck::try_cast_slice(words.get(range)?).ok()?),
+            DType::I32 => Data::I32(bytemuck::try_cast_slice(words.get(range)?).ok()?),
+            DType::U8 => Data::U8(
+                bytemuck::try_cast_slice::<u32, u8>(words)
+                    .ok()?
+                    .get(range)?,
+            ),
+        })
+    }
 }
 
 /// One recorded control step.
@@ -56,6 +78,7 @@ impl<'a> GoldenStep<'a> {
 
 impl<'a> Golden<'a> {
     /// Checks the golden section; `None` when it contradicts the contract.
+    #[inline(never)]
     pub(crate) fn new_checked(contract: &Contract<'a>, sizes: &Sizes) -> Option<Self> {
         let (record, mut rest) = contract
             .tables
@@ -63,6 +86,7 @@ impl<'a> Golden<'a> {
             .split_at_checked(GoldenRecord::WORDS)?;
         let record = GoldenRecord::take(&mut Reader::new(record))?;
         let steps = record.steps as usize;
+        let words = rest;
         let mut take = |words: usize| {
             let (part, behind) = rest.split_at_checked(words)?;
             rest = behind;
@@ -70,22 +94,23 @@ impl<'a> Golden<'a> {
         };
         let mut observations = [None; MAX_OBSERVATIONS];
         let mut places = observations.iter_mut();
+        let mut first = 0_usize;
         for channel in contract.observations() {
             let len = channel.len();
             let all = steps.checked_mul(len)?;
-            let data = match channel.dtype() {
-                DType::F32 => Data::F32(bytemuck::try_cast_slice(take(all)?).ok()?),
-                DType::I32 => Data::I32(bytemuck::try_cast_slice(take(all)?).ok()?),
-                DType::U8 => {
-                    let bytes: &[u8] = bytemuck::try_cast_slice(take(all.div_ceil(4))?).ok()?;
-                    Data::U8(bytes.get(..all)?)
-                }
+            let dtype = channel.dtype();
+            let taken = match dtype {
+                DType::F32 | DType::I32 => all,
+                DType::U8 => all.div_ceil(4),
             };
+            take(taken)?;
             *places.next()? = Some(Recorded {
                 channel: channel.id(),
-                len,
-                data,
+                dtype,
+                len: len as u32,
+                first: first as u32,
             });
+            first = first.checked_add(taken)?;
         }
         let selected = take(if record.selects { steps } else { 0 })?;
         let noise = take(steps.checked_mul(record.noise_len as usize)?)?;
@@ -102,6 +127,7 @@ impl<'a> Golden<'a> {
         let complete = steps > 0 && rest.is_empty() && selects && noisy;
         (known && tolerance && complete).then_some(Self {
             record,
+            words,
             observations,
             selected,
             noise: bytemuck::try_cast_slice(noise).ok()?,
@@ -133,19 +159,36 @@ impl<'a> Golden<'a> {
     /// Recorded step `i`.
     pub fn step(&self, i: usize) -> Option<GoldenStep<'a>> {
         let mut given = Given::default();
-        for recorded in self.observations.iter().flatten() {
-            given.push(recorded.channel, recorded.data.row(i, recorded.len)?);
-        }
-        let row = |values: &'a [f32], len: usize| {
-            let start = i.checked_mul(len)?;
-            values.get(start..start.checked_add(len)?)
-        };
+        self.observe(i, &mut given)?;
         Some(GoldenStep {
             given,
-            selected: self.selected.get(i).copied(),
-            noise: row(self.noise, self.record.noise_len as usize)?,
-            action: row(self.actions, self.action_len)?,
+            selected: self.selected(i),
+            noise: self.noise(i)?,
+            action: self.action(i)?,
         })
+    }
+
+    /// Adds what was observed in step `i`.
+    pub(crate) fn observe(&self, i: usize, given: &mut Given<'a>) -> Option<()> {
+        for recorded in self.observations.iter().flatten() {
+            given.push(recorded.channel, recorded.at(self.words, i)?);
+        }
+        Some(())
+    }
+
+    /// The index in force in step `i`.
+    pub(crate) fn selected(&self, i: usize) -> Option<u32> {
+        self.selected.get(i).copied()
+    }
+
+    /// All draws of step `i`.
+    pub(crate) fn noise(&self, i: usize) -> Option<&'a [f32]> {
+        row(self.noise, i, self.record.noise_len as usize)
+    }
+
+    /// The action of step `i`.
+    pub(crate) fn action(&self, i: usize) -> Option<&'a [f32]> {
+        row(self.actions, i, self.action_len)
     }
 
     /// All recorded steps in order.
@@ -153,4 +196,10 @@ impl<'a> Golden<'a> {
         let golden = *self;
         (0..self.len()).map_while(move |i| golden.step(i))
     }
+}
+
+/// Row `i` of `len` values.
+fn row(values: &[f32], i: usize, len: usize) -> Option<&[f32]> {
+    let start = i.checked_mul(len)?;
+    values.get(start..start.checked_add(len)?)
 }

@@ -7,7 +7,7 @@ use crate::contract::{Channel, ChannelId, Contract, DType, Interval, Role};
 use crate::errors::InputError;
 
 /// The most observation channels of a policy.
-pub const MAX_OBSERVATIONS: usize = 16;
+pub const MAX_OBSERVATIONS: usize = 8;
 
 /// The values of a channel, as many as it has elements, in the order of its shape.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -42,17 +42,6 @@ impl Data<'_> {
             Self::U8(_) => DType::U8,
             Self::I32(_) => DType::I32,
         }
-    }
-
-    /// Row `i` of `len` values.
-    pub(crate) fn row(self, i: usize, len: usize) -> Option<Self> {
-        let start = i.checked_mul(len)?;
-        let range = start..start.checked_add(len)?;
-        Some(match self {
-            Self::F32(values) => Self::F32(values.get(range)?),
-            Self::U8(values) => Self::U8(values.get(range)?),
-            Self::I32(values) => Self::I32(values.get(range)?),
-        })
     }
 }
 

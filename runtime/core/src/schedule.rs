@@ -113,6 +113,7 @@ fn few(tables: &Tables) -> Checked {
 }
 
 /// States lie where their order puts them.
+#[inline(never)]
 fn states(tables: &Tables, sizes: &mut Sizes) -> Checked {
     let count = tables.states_len();
     let (mut rows, mut bank, mut scratch) = (0_u64, 0_u64, 0_u64);
@@ -185,6 +186,7 @@ fn is_instructed(tables: &Tables, state: usize) -> bool {
 }
 
 /// Every entry is a sound program with sound ports, and every KV cache is as large as what the programs use of it.
+#[inline(never)]
 fn entries(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked<Work> {
     let (mut work, mut used) = ([0; MAX_RECORDS], [0; MAX_ROW_STATES]);
     for i in 0..tables.entries_len() {
@@ -308,6 +310,7 @@ fn port_is_sound(tables: &Tables, contract: &Contract, port: &PortRecord, side: 
 }
 
 /// Every call names what there is, and does what its event allows.
+#[inline(never)]
 fn calls(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked {
     let mut first_of = [true; 4];
     let mut last_event = Event::Instruct;
@@ -422,6 +425,7 @@ fn event_reads(event: Event, role: Role) -> bool {
 }
 
 /// Every state is bound to a port of an entry, or is the cache of one.
+#[inline(never)]
 fn used(tables: &Tables) -> Checked {
     for i in 0..tables.states_len() as u32 {
         let mut entries = (0..tables.entries_len()).filter_map(|entry| tables.entry(entry));

@@ -255,7 +255,7 @@ typedef int32_t lads_status;
 /**
  * Stack that a call of the library takes at most, in bytes: measured on x86-64 with all functions of the archive.
  */
-#define LADS_STACK_BYTES 10136
+#define LADS_STACK_BYTES 7896
 
 /**
  * No channel, element or other number: stands where there is none.

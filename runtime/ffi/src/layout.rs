@@ -8,7 +8,7 @@ use lads_core::{GuardedController, Policy};
 pub const LADS_WORKSPACE_ALIGN: usize = 64;
 
 /// Stack that a call of the library takes at most, in bytes: measured on x86-64 with all functions of the archive.
-pub const LADS_STACK_BYTES: usize = 10136;
+pub const LADS_STACK_BYTES: usize = 7896;
 
 /// Offsets in bytes.
 #[derive(Debug, Clone, Copy)]

@@ -14,7 +14,6 @@
 //! lads_set_instruction(controller, 3);
 //! lads_report report = {.struct_bytes = sizeof report};        // which channel and element was refused, what was selected
 //! for (;;) {                                                   // every control period; `action` may be executed, see `lads_step`
-//!     lads_tick tick = {.struct_bytes = sizeof tick, .timestamp = now()};
 //!     status = lads_step(controller, observation, n, &tick, action, m, &report);
 //! }
 //! ```

@@ -71,6 +71,7 @@ fn inside(first: u32, len: u32, count: usize) -> bool {
 
 impl<'a> Tables<'a> {
     /// Opens an image that starts on a 4-byte boundary; bytes after the image's own length are ignored.
+    #[inline(never)]
     pub fn new(image: &'a [u8]) -> Result<Self, TablesError> {
         if cfg!(target_endian = "big") {
             return Err(TablesError::BigEndian);
@@ -111,6 +112,7 @@ impl<'a> Tables<'a> {
         Ok(tables)
     }
 
+    #[inline(never)]
     fn check(&self) -> Result<(), TablesError> {
         let at = |tag, fits: bool| {
             if fits {

@@ -192,6 +192,7 @@ impl Walk<'_, '_> {
 }
 
 /// Goes through every kind of event, and through every step of a context.
+#[inline(never)]
 pub(super) fn go_through(
     tables: &Tables,
     contract: &Contract,
