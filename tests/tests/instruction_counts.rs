@@ -46,7 +46,7 @@ const CASES: [(WeightFormat, Decision, usize); 5] = [
 const OBSERVATIONS: usize = 100;
 
 /// Episodes of a random policy, and steps of each; no random policy selects more seldom than in every tenth step.
-const EPISODES: usize = 12;
+const EPISODES: usize = 4;
 const STEPS: usize = 22;
 
 /// What is counted; a name that the tool can be told.
