@@ -105,7 +105,7 @@ $(VENV)/stamp: exporter/pyproject.toml
 	touch $@
 
 test-exporter: setup $(VENV)/stamp
-	cargo build -p lads-cli -p lads-sim --features $(FEATURES)
+	cargo build $(ALL) --bins
 	$(PY) -m pytest exporter/tests tests/parity
 
 ## collect: demonstrations into data/ENV.safetensors; ENV=kitchen (scripted, of the 22 seen instructions) or ENV=lorel (random, labelled)
