@@ -189,8 +189,8 @@ def test_refusals(cache, tmp_path):
     assert "hears at most 512" in refusal(cache, "lorel", "--instruction", long)
     assert "empty sentence" in refusal(cache, "lorel", "--instruction", "\u200b")
     wrong = refusal(tmp_path / "no", "lorel", "--instruction", "open teh drawer")
-    assert "make language" in wrong and "open drawer" in wrong and str(tmp_path / "no") in wrong
-    assert "make language" in refusal(tmp_path / "no", "lorel", "--encode-language")
+    assert "lads_exporter language" in wrong and "open drawer" in wrong and str(tmp_path / "no") in wrong
+    assert "lads_exporter language" in refusal(tmp_path / "no", "lorel", "--encode-language")
     assert "open drawer, close drawer" in refusal(cache, "lorel", "--instruction", "pull the drawer out", "--sub-tasks", "shut it")
     other = tmp_path / "other"
     other.mkdir()
