@@ -101,9 +101,9 @@ fn the_first_difference_is_named() {
 #[test]
 fn a_changed_weight_is_found() {
     let mut parts = recorded();
-    // What lies behind the words of the instructions takes part in every step.
-    let words = parts.instructions[1].words;
-    for weight in &mut parts.weights[(words.offset + words.len) as usize..] {
+    // What lies before the words of the instructions are the programs' weights.
+    let words = parts.instructions[0].words;
+    for weight in &mut parts.weights[..words.offset as usize] {
         *weight *= 1.01;
     }
     assert!(outcome(&parts).is_err());

@@ -6,6 +6,8 @@ pub mod assemble;
 pub mod draft;
 #[path = "../../../image/tests/support/model.rs"]
 pub mod model;
+#[path = "../../../image/tests/support/assemble.rs"]
+pub mod programs;
 pub mod shapes;
 pub mod writer;
 
