@@ -1,0 +1,213 @@
+//! `lads act`: observations in, actions out, through a pipe.
+
+mod common;
+
+use std::fs;
+use std::io::Write;
+use std::process::{Command, Stdio};
+
+use serde_json::Value;
+
+use common::{act, answer, csv, numbers, refused, tiny, with_golden};
+
+#[test]
+fn act_answers_the_golden_episode_in_either_form() {
+    let model = tiny().to_str().unwrap().to_owned();
+    with_golden(|policy, golden| {
+        let instruction = policy
+            .contract()
+            .instruction(golden.instruction().unwrap() as usize)
+            .unwrap();
+        let arguments = [
+            "act",
+            "--model",
+            &model,
+            "--instruction",
+            instruction.text,
+            "--plans",
+        ];
+        let asked: String = golden.steps().map(|step| csv(step.observation())).collect();
+        let answered = answer(&arguments, &asked);
+        assert_eq!(answered.lines().count(), golden.len());
+        for (line, step) in answered.lines().zip(golden.steps()) {
+            let (got_index, got) = numbers(line)
+                .split_last()
+                .map(|(&index, got)| (index, got.to_vec()))
+                .unwrap();
+            assert_eq!(got_index, step.selected.unwrap() as f32);
+            assert_eq!(got.len(), step.action.len());
+            assert!(
+                got.iter()
+                    .zip(step.action)
+                    .all(|(a, b)| (a - b).abs() <= golden.tolerance()),
+                "{line}"
+            );
+        }
+        let in_json = |lines: &str| format!("[{}]\n", lines.trim().replace('\n', "]\n["));
+        assert_eq!(answer(&arguments, &in_json(&asked)), in_json(&answered));
+    });
+}
+
+#[test]
+fn every_line_is_answered_before_the_next_is_sent() {
+    let model = tiny().to_str().unwrap().to_owned();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_lads"));
+    let mut child = command
+        .args(act(&model, &[]))
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut asked = child.stdin.take().unwrap();
+    let mut answered = std::io::BufReader::new(child.stdout.take().unwrap());
+    for _ in 0..3 {
+        asked.write_all(b"0,0,0,0,0\n").unwrap();
+        let mut line = String::new();
+        std::io::BufRead::read_line(&mut answered, &mut line).unwrap();
+        assert_eq!(numbers(line.trim()).len(), 3);
+    }
+    drop(asked);
+    assert!(child.wait().unwrap().success());
+}
+
+#[test]
+fn an_empty_line_starts_a_new_episode() {
+    let model = tiny().to_str().unwrap().to_owned();
+    let episode = "0,0,0,0,0\n0.1,0,0.2,0,0\n0.2,0,0.3,0.5,0\n";
+    let once = answer(&act(&model, &["--plans"]), episode);
+    let twice = answer(&act(&model, &["--plans"]), &format!("{episode}\n{episode}"));
+    assert_eq!(twice, once.repeat(2));
+    // Without it the episode goes on: three steps are less than a horizon, so the second plan is drawn later.
+    let sample = |seed: u32, asked: &str| {
+        let seed = seed.to_string();
+        answer(
+            &act(&model, &["--plans", "--sample", "--seed", &seed]),
+            asked,
+        )
+    };
+    let two = format!("{episode}\n{episode}");
+    assert!((0..8).any(|seed| sample(seed, &two) != sample(seed, &episode.repeat(2))));
+}
+
+#[test]
+fn sampling_follows_its_seed() {
+    let model = tiny().to_str().unwrap().to_owned();
+    let asked = "0,0,0,0,0\n".repeat(60);
+    let sample = |seed: &str| {
+        answer(
+            &act(&model, &["--plans", "--sample", "--seed", seed]),
+            &asked,
+        )
+    };
+    assert_eq!(sample("3"), sample("3"));
+    assert_ne!(sample("3"), sample("4"));
+}
+
+#[test]
+fn a_compiled_image_does_what_its_bundle_does() {
+    let folder = tempfile::tempdir().unwrap();
+    let (model, image) = (tiny(), folder.path().join("tiny.lads"));
+    let (model, image) = (model.to_str().unwrap(), image.to_str().unwrap());
+    let said = answer(&["compile", model, "-o", image], "");
+    assert!(
+        said.contains("tiny.lads") && said.contains("bytes"),
+        "{said}"
+    );
+    assert_eq!(
+        fs::read_dir(folder.path()).unwrap().count(),
+        1,
+        "no temporary file stays"
+    );
+
+    let asked = "0,0,0,0,0\n0.1,0,0.2,0,0\n";
+    assert_eq!(
+        answer(&act(image, &["--plans"]), asked),
+        answer(&act(model, &["--plans"]), asked)
+    );
+    assert_eq!(
+        answer(&["self-test", image], ""),
+        answer(&["self-test", model], "")
+    );
+    let inspected = |path: &str| {
+        serde_json::from_str::<Value>(&answer(&["inspect", path, "--json"], "")).unwrap()
+    };
+    let (mut of_bundle, mut of_image) = (inspected(model), inspected(image));
+    assert_eq!(
+        (of_bundle["form"].take(), of_image["form"].take()),
+        ("bundle".into(), "image".into())
+    );
+    assert_ne!(of_bundle["file"].take(), of_image["file"].take());
+    assert_eq!(of_bundle, of_image);
+    refused(
+        &["compile", image, "-o", "x.lads"],
+        "",
+        &["tiny.lads", "already", "bundle"],
+    );
+}
+
+#[test]
+fn bad_observations_are_refused_by_line() {
+    let model = tiny().to_str().unwrap().to_owned();
+    let arguments = act(&model, &[]);
+    let good = "0,0,0,0,0\n";
+    for (bad, parts) in [
+        ("0,0,0\n", ["line 3", "3 values", "5 finite"]),
+        ("0,0,0,nan,0\n", ["line 3", "value 4 is 'nan'", "inspect"]),
+        (
+            "[0,0,null,0,0]\n",
+            ["line 3", "value 3 is 'null'", "element 2 `drawer`"],
+        ),
+        ("0,0,0,0,inf\n", ["line 3", "value 5 is 'inf'", "inspect"]),
+        (
+            "0,0,0,99,0\n",
+            [
+                "line 3",
+                "channel `observation`, element 3 `lamp` is 99, its limits are -0.5 to 1.5",
+                "inspect",
+            ],
+        ),
+        ("hello\n", ["line 3", "1 values", "inspect"]),
+    ] {
+        let answered = refused(&arguments, &format!("{good}{good}{bad}{good}"), &parts);
+        assert_eq!(
+            answered.lines().count(),
+            2,
+            "the lines before it are answered"
+        );
+    }
+}
+
+#[test]
+fn unknown_instructions_show_the_nearest() {
+    let model = tiny().to_str().unwrap().to_owned();
+    let arguments = ["act", "--model", &model, "--instruction", "open the drower"];
+    refused(
+        &arguments,
+        "",
+        &["'open the drower'", "nearest", "'open the drawer' (d)"],
+    );
+    // Case and white space do not matter.
+    let arguments = [
+        "act",
+        "--model",
+        &model,
+        "--instruction",
+        " Open  the drawer",
+    ];
+    assert_eq!(answer(&arguments, "0,0,0,0,0\n").lines().count(), 1);
+}
+
+#[test]
+fn observations_of_the_golden_episode_go_through_the_pipe() {
+    let tiny = tiny();
+    let model = tiny.to_str().unwrap();
+    let observations = answer(&["inspect", model, "--observations"], "");
+    with_golden(|_, golden| {
+        let written: String = golden.steps().map(|step| csv(step.observation())).collect();
+        assert_eq!(observations, written);
+        assert_eq!(
+            answer(&act(model, &[]), &observations).lines().count(),
+            golden.len()
+        );
+    });
+}
