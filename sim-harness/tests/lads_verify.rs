@@ -106,6 +106,10 @@ fn a_given_image_is_what_is_verified() {
         found["setting"]["image_sha256"],
         lads_compiler::sha256(&bytes)
     );
+    assert_eq!(
+        found["setting"]["image_stored"],
+        "f16 and f32 weights, f16 cache"
+    );
     // The low level's bits are those of the exact policy.
     let (_, exact) = certificate(&few, folder.path());
     assert_eq!(

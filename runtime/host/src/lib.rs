@@ -4,7 +4,7 @@
 //!   policy that was checked; [`Opened::load`] gives it memory, and [`Loaded::controller`] puts it to work.
 //! - [`Memory`] and [`Aligned`] are memory in large pages, where the operating system has them.
 //! - [`instruction`] finds a known instruction by what a person wrote.
-//! - [`schedule`] says which programs run at which step, and what that costs.
+//! - [`schedule`] says which programs run at which step, and what that costs; [`stored()`] in which formats weights and caches lie.
 //! - [`output`] is the one place where a command writes a file, [`input`] the one where it reads a whole one that a person named.
 //!
 //! Needs `std` and may allocate; what it opens may be hostile, so every error is a value that names the thing and the remedy. The
@@ -30,9 +30,11 @@ mod open;
 pub mod output;
 mod pages;
 pub mod schedule;
+mod stored;
 
 pub use aligned::Aligned;
 pub use memory::{Memory, MemoryError};
 pub use open::{Loaded, OpenError, Opened, Problem, from_bytes, open};
 #[cfg(feature = "compile")]
 pub use open::{from_bytes_with, open_with};
+pub use stored::stored;

@@ -104,6 +104,8 @@ pub struct Setting {
     pub bundle_sha256: String,
     /// SHA-256 of the program image that ran: what may be put into the machine.
     pub image_sha256: String,
+    /// How its weights and caches are stored.
+    pub image_stored: String,
     /// The rule that decided plans, the contract's.
     pub decision: String,
     /// The instruction set that the kernels ran on.

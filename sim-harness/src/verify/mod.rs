@@ -79,6 +79,7 @@ pub fn run(
         environment: environment.id().to_owned(),
         bundle_sha256: contract.bundle_sha256().to_owned(),
         image_sha256: lads_compiler::sha256(evaluation.policy.image()),
+        image_stored: lads_host::stored(&evaluation.policy),
         decision: contract::rule(contract),
         isa: evaluation.isa.name().to_owned(),
         seed: evaluation.seed,

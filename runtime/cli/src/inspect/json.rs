@@ -16,6 +16,7 @@ impl Report<'_> {
             "file": self.model.path.display().to_string(),
             "form": self.form(),
             "bundle_sha256": contract.bundle_sha256(),
+            "stored": lads_host::stored(&self.policy),
             "contract": self.contract_json(),
             "states": self.states().map(|state| state_json(&state)).collect::<Vec<_>>(),
             "entries": self.entries().map(|entry| self.entry_json(&entry)).collect::<Vec<_>>(),

@@ -45,6 +45,7 @@ impl Display for Report<'_> {
                 "language        {encoder}, up to {words} words of {dim} elements"
             )?;
         }
+        writeln!(f, "stored          {}", lads_host::stored(&self.policy))?;
         match self.policy.golden() {
             Some(golden) => writeln!(
                 f,

@@ -61,6 +61,7 @@ fn judged(policy: Answers, environment: Physics, outcome: [usize; 4]) -> Certifi
         environment: "tiny-bench".to_owned(),
         bundle_sha256: String::new(),
         image_sha256: String::new(),
+        image_stored: String::new(),
         decision: "argmax".to_owned(),
         isa: "portable".to_owned(),
         seed: 0,
