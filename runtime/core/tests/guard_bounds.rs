@@ -4,30 +4,8 @@ mod support;
 
 use lads_core::{Fallback, GuardConfig, GuardError, GuardedController, Instruction, Limits, Tick};
 use proptest::prelude::*;
-use support::assemble::parts;
-use support::{Image, Memory, Model, Spec};
-
-/// In seconds, as the test policy's contract has it.
-const PERIOD: f32 = 0.08;
-
-fn image() -> Image {
-    parts(&Model::random(Spec::TINY, 11))
-        .with_golden(12)
-        .image()
-}
-
-/// Runs `f` on a guarded controller in memory full of what must not matter.
-fn guarded<T>(
-    config: &GuardConfig,
-    f: impl FnOnce(&mut GuardedController) -> T,
-) -> Result<T, GuardError> {
-    let image = image();
-    let policy = image.policy();
-    let mut memory = Memory::for_policy(&policy);
-    let mut guard = vec![f32::NAN; GuardedController::memory_len(&policy)];
-    let mut guarded = GuardedController::new(memory.controller(&policy), config, &mut guard)?;
-    Ok(f(&mut guarded))
-}
+use support::Memory;
+use support::guarding::{PERIOD, guarded, image};
 
 #[test]
 fn configurations_that_contradict_the_contract_are_refused() {

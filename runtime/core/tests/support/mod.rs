@@ -4,6 +4,7 @@
 
 pub mod assemble;
 pub mod draft;
+pub mod guarding;
 #[path = "../../../image/tests/support/model.rs"]
 pub mod model;
 #[path = "../../../image/tests/support/assemble.rs"]
