@@ -1,8 +1,8 @@
 //! How the weights and the KV caches of an image are stored.
 
 use lads_core::Policy;
-use lads_image::op::{CacheFormat, Op, WeightFormat};
 use lads_image::Tables;
+use lads_image::op::{CacheFormat, Op, WeightFormat};
 
 /// The formats that a policy's programs read, for example `f16 and f32 weights, f16 cache`; a policy without dense layers or without a
 /// cache names none of them.
