@@ -1,5 +1,5 @@
-//! Which rows of its tables an entry can ask for: a timestep, phase or pass beyond the last row would stop the policy in the middle of an
-//! episode, so it is refused here, with the field of the contract that is too large.
+//! Which rows of its tables an entry can ask for: a timestep, a phase, a pass, a selected index or an integer of the caller beyond the
+//! last row would stop the policy in the middle of an episode, so it is refused here, with the field of the contract that is too large.
 
 use std::collections::HashMap;
 
@@ -12,10 +12,11 @@ use crate::lower::Lowered;
 
 /// The smallest and the largest value of an integer; nothing before the first.
 #[derive(Debug, Clone, Copy, Default)]
-struct Range(Option<(usize, usize)>);
+struct Range(Option<(i64, i64)>);
 
 impl Range {
     fn see(&mut self, value: usize) {
+        let value = value as i64;
         let (from, to) = self.0.unwrap_or((value, value));
         self.0 = Some((from.min(value), to.max(value)));
     }
@@ -71,13 +72,14 @@ impl Reach {
         };
         for (name, place) in &lowered.inputs {
             let Place::Int(slot) = *place else { continue };
+            let bound = blueprint.bind(contract, &entry.name, name, true);
+            let Some(chosen) = chooser(contract, blueprint, integers, bound) else {
+                continue;
+            };
             for (rows, shift) in tables(lowered, slot) {
-                let bound = blueprint.bind(contract, &entry.name, name, true);
-                fits(contract, integers, bound, rows, shift).map_err(|problem| {
-                    CompileError::Entry {
-                        entry: entry.name.as_str().into(),
-                        problem: problem.into(),
-                    }
+                fits(contract, &chosen, rows, shift).map_err(|problem| CompileError::Entry {
+                    entry: entry.name.as_str().into(),
+                    problem: problem.into(),
                 })?;
             }
         }
@@ -104,21 +106,49 @@ fn tables(lowered: &Lowered, slot: IntSlot) -> impl Iterator<Item = (i64, i64)> 
     })
 }
 
-fn fits(
+/// What chooses a row, in words, and what it can be; `None` for what chooses none.
+fn chooser(
     contract: &Contract,
+    blueprint: &Blueprint,
     integers: &Integers,
     bound: Option<Bound>,
+) -> Option<(String, Range)> {
+    Some(match bound? {
+        Bound::Timestep => ("`timestep`".into(), integers.timestep),
+        Bound::Phase => ("`phase`".into(), integers.phase),
+        Bound::Pass => ("`pass`".into(), integers.pass),
+        Bound::Selected => {
+            let scores = blueprint
+                .calls
+                .iter()
+                .find_map(|call| call.select.as_ref())?;
+            let state = blueprint
+                .states
+                .iter()
+                .find(|state| state.name == *scores)?;
+            let (width, field) = state.width.as_ref()?;
+            let what = format!("the selected index (field `{field}`)");
+            (what, Range(Some((0, *width as i64 - 1))))
+        }
+        Bound::Channel(index) => {
+            let channel = &contract.channels[index];
+            let (min, max) = channel.limits();
+            let what = format!("channel `{}` (fields `min` and `max`)", channel.name);
+            (what, Range(Some((min.ceil() as i64, max.floor() as i64))))
+        }
+        Bound::State(_) | Bound::Row(_) | Bound::Cache => return None,
+    })
+}
+
+fn fits(
+    contract: &Contract,
+    (what, range): &(String, Range),
     rows: i64,
     shift: i64,
 ) -> Result<(), String> {
-    let (what, range) = match bound {
-        Some(Bound::Timestep) => ("timestep", integers.timestep),
-        Some(Bound::Phase) => ("phase", integers.phase),
-        Some(Bound::Pass) => ("pass", integers.pass),
-        _ => return Ok(()),
-    };
+    let timestep = what == "`timestep`";
     let steps = contract.context.map(|context| context.steps);
-    if what == "timestep" && steps.is_none() {
+    if timestep && steps.is_none() {
         return Err(format!(
             "a table of {rows} rows is read by `timestep`, which has no end without the field `context`"
         ));
@@ -126,23 +156,23 @@ fn fits(
     let Some((from, to)) = range.0 else {
         return Ok(());
     };
-    let (first, last) = (from as i64 + shift, to as i64 + shift);
+    let (first, last) = (from + shift, to + shift);
     if first < 0 {
         return Err(format!(
-            "a table of {rows} rows is read at row {first} when `{what}` is {from}"
+            "a table of {rows} rows is read at row {first} when {what} is {from}"
         ));
     }
     if last < rows {
         return Ok(());
     }
     let remedy = match steps {
-        Some(steps) if what == "timestep" => format!(
+        Some(steps) if timestep => format!(
             ": field `context.steps` is {steps}, for this table it may be {} at most",
             steps as i64 - (last + 1 - rows)
         ),
         _ => String::new(),
     };
     Err(format!(
-        "a table of {rows} rows is read at row {last} when `{what}` is {to}{remedy}"
+        "a table of {rows} rows is read at row {last} when {what} is {to}{remedy}"
     ))
 }

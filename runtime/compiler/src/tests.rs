@@ -10,6 +10,7 @@ mod operators;
 mod oracle;
 mod plans;
 mod programs;
+mod reach;
 
 use std::collections::HashMap;
 
