@@ -1,8 +1,11 @@
-//! Passes over the graph, each of which makes a new graph: attention over the cache, rows that nobody reads, linear layers.
+//! Passes over the graph, each of which makes a new graph: attention over the cache, channels of images, convolutions, rows that
+//! nobody reads, linear layers.
 //!
 //! A pass changes how a value is computed, never which value it is, up to the rounding of folded scales.
 
 mod attention;
+mod conv;
+mod images;
 mod linear;
 mod rows;
 
@@ -71,6 +74,8 @@ pub(crate) fn fuse(
         .filter(|(_, live)| !live)
         .map(|(layer, _)| layer.record)
         .collect();
+    let fused = images::channels_to_the_end(fused).map_err(refused)?;
+    let fused = conv::fuse(fused).map_err(refused)?;
     let fused = rows::narrow(fused).map_err(refused)?;
     let fused = linear::fuse(fused).map_err(refused)?;
     attention::no_past_left(&fused, name)?;

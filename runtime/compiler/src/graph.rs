@@ -11,6 +11,7 @@
 
 mod build;
 mod eval;
+mod images;
 mod rewrite;
 
 use std::collections::HashMap;
@@ -18,13 +19,14 @@ use std::fmt;
 use std::hash::{Hash, Hasher};
 use std::sync::Arc;
 
-use lads_image::op::{BinaryKind, ReduceKind, UnaryKind};
+use lads_image::op::{BinaryKind, PoolKind, ReduceKind, UnaryKind};
 
 use crate::tensor::{Data, Tensor};
 
 #[cfg(test)]
 pub(crate) use eval::apply;
 pub(crate) use eval::{MAX_FOLDING, cost, evaluate};
+pub(crate) use images::{ConvOp, Windows, channels_first, channels_last};
 pub(crate) use rewrite::{Rewriter, topological};
 
 /// Length of an axis: `fixed`, or `P + fixed`.
@@ -95,6 +97,12 @@ impl Hash for Kind<BinaryKind> {
 }
 
 impl Hash for Kind<ReduceKind> {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        (self.0 as u32).hash(state);
+    }
+}
+
+impl Hash for Kind<PoolKind> {
     fn hash<H: Hasher>(&self, state: &mut H) {
         (self.0 as u32).hash(state);
     }
@@ -172,6 +180,13 @@ pub(crate) enum Op {
         heads: usize,
         scale: u32,
     },
+    /// Convolution of images `x [N, rows, columns, C]` or sequences `[N, columns, C]`: operands `x`, `W [kernel * C / groups, n]`, `b [n]`,
+    /// then the padding's pixel `[C]` if `fill`, then what is added before the activation if `residual`.
+    Conv(ConvOp),
+    /// Windows over images or sequences, channels last.
+    Pool(Kind<PoolKind>, Windows),
+    /// Images `[N, rows, columns, C]` in another size, operands `x`, tables `[rows, 3]` and `[columns, 3]`.
+    Resize,
     /// Appends `k, v [tokens, w]` to the cache of a layer; gives nothing.
     Record { layer: usize, heads: usize },
 }

@@ -5,6 +5,7 @@
 //! the context length.
 
 mod attributes;
+mod images;
 mod operators;
 mod recurrent;
 mod shapes;

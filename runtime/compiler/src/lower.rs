@@ -8,6 +8,7 @@
 
 mod cached;
 mod compute;
+mod images;
 mod view;
 mod weights;
 
@@ -112,6 +113,7 @@ pub(crate) fn lower(
     let mut lowering = Lowering::new(fused, &order, cache, weights);
     lowering.place_concatenations(&order);
     lowering.place_residuals(&order);
+    lowering.plan_borders(&order);
     lowering.inputs(&order, fused);
     for &id in &order {
         lowering.node(id).map_err(|problem| {
@@ -180,6 +182,10 @@ struct Lowering<'a> {
     residents: Vec<Vec<Id>>,
     /// Values that are computed inside a concatenation: buffer and offset.
     placed: HashMap<Id, (usize, usize)>,
+    /// Rows above, columns to the left, rows below and columns to the right that the readers of an image want around it.
+    wanted: HashMap<Id, [usize; 4]>,
+    /// Those that there are.
+    borders: HashMap<Id, [usize; 4]>,
     input_ports: Vec<(String, Place)>,
     output_ports: Vec<(String, Place)>,
 }
@@ -206,6 +212,8 @@ impl<'a> Lowering<'a> {
             pending,
             residents: vec![],
             placed: HashMap::new(),
+            wanted: HashMap::new(),
+            borders: HashMap::new(),
             input_ports: vec![],
             output_ports: vec![],
         }

@@ -16,12 +16,18 @@
 mod arg;
 mod attention;
 mod binary;
+mod border;
+mod conv;
 mod copy;
+mod depthwise;
 mod gather_row;
 mod layer_norm;
 mod linear;
 mod matmul;
+mod picture;
+mod pool;
 mod reduce;
+mod resize;
 mod softmax;
 mod unary;
 
@@ -34,12 +40,18 @@ pub use crate::place::{INT_SLOTS, IntSlot, Operand, Place, Space, Span, StateSpa
 pub use arg::{ArgMax, ArgMin};
 pub use attention::{Attention, CacheFormat};
 pub use binary::{Binary, BinaryKind};
+pub use border::Border;
+pub use conv::Conv;
 pub use copy::Copy;
+pub use depthwise::Depthwise;
 pub use gather_row::GatherRow;
 pub use layer_norm::LayerNorm;
 pub use linear::{Activation, Linear, WeightFormat};
 pub use matmul::MatMul;
+pub use picture::{Pair, Picture, Window};
+pub use pool::{Pool, PoolKind};
 pub use reduce::{Reduce, ReduceKind};
+pub use resize::Resize;
 pub use softmax::Softmax;
 pub use unary::{Unary, UnaryKind};
 
@@ -249,6 +261,11 @@ ops! {
     Copy = 10,
     ArgMin = 11 if "arg",
     ArgMax = 12 if "arg",
+    Conv = 13 if "conv",
+    Depthwise = 14 if "conv",
+    Border = 15 if "conv",
+    Pool = 16 if "pool",
+    Resize = 17 if "resize",
 }
 
 #[cfg(test)]

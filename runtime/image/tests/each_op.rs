@@ -4,12 +4,13 @@ use std::collections::BTreeSet;
 
 use lads_image::codec::Field;
 use lads_image::op::{
-    Activation, ArgMax, ArgMin, Attention, Binary, BinaryKind, CacheFormat, Copy, GatherRow,
-    INT_SLOTS, IntSlot, LayerNorm, Linear, MatMul, OP_WORDS, Op, Operand, Reduce, ReduceKind,
-    Softmax, Space, Span, StateSpan, Unary, UnaryKind, WeightFormat, WeightSpan,
+    Activation, ArgMax, ArgMin, Attention, Binary, BinaryKind, Border, CacheFormat, Conv, Copy,
+    Depthwise, GatherRow, INT_SLOTS, IntSlot, LayerNorm, Linear, MatMul, OP_WORDS, Op, Operand,
+    Pair, Picture, Pool, PoolKind, Reduce, ReduceKind, Resize, Softmax, Space, Span, StateSpan,
+    Unary, UnaryKind, WeightFormat, WeightSpan, Window,
 };
 use lads_image::{Access, AccessKind, Checker, Fault, Isa, Machine, Program, Spaces, Work};
-use lads_kernels::{attention_scratch_len, packed_len};
+use lads_kernels::{attention_scratch_len, conv_packed_len, depthwise_packed_len, packed_len};
 
 const ARENA: u32 = 600;
 const TOKENS: u32 = 2;
@@ -195,7 +196,90 @@ fn samples() -> Vec<Op> {
     let (x, out) = (span(10, 12), IntSlot(7));
     ops.push(ArgMin { x, out }.into());
     ops.push(ArgMax { x, out }.into());
+    ops.extend(images());
     ops
+}
+
+/// Sound ops on images: with a border between rows, and as one of two groups of channels.
+fn images() -> Vec<Op> {
+    let window = Window {
+        out: Pair { rows: 2, cols: 3 },
+        kernel: Pair { rows: 2, cols: 1 },
+        stride: Pair { rows: 1, cols: 2 },
+        dilation: Pair { rows: 2, cols: 1 },
+    };
+    // Four rows of five pixels of three channels.
+    let x = Picture {
+        at: span(10, 3 * 40 + 4 * 6 + 3),
+        row: 40,
+        pixel: 6,
+    };
+    let y = Picture {
+        at: span(200, 50 + 2 * 10 + 3),
+        row: 50,
+        pixel: 10,
+    };
+    let conv = |accumulate| Conv {
+        x,
+        y,
+        window,
+        c: 3,
+        n: 3,
+        w: weight(4, conv_packed_len([6, 3]) as u32),
+        bias: weight(200, 3),
+        activation: Activation::Clipped(6.0),
+        accumulate,
+    };
+    let depthwise = Depthwise {
+        x,
+        y,
+        window,
+        c: 3,
+        w: weight(4, depthwise_packed_len([2, 3]) as u32),
+        bias: weight(200, 3),
+        activation: Activation::LeakyRelu(0.1),
+    };
+    let border = |value, after: u16| Border {
+        y: span(30, 4 * (3 + u32::from(after)) * 2),
+        inside: Pair { rows: 2, cols: 2 },
+        before: Pair { rows: 2, cols: 1 },
+        after: Pair {
+            rows: 0,
+            cols: after,
+        },
+        c: 2,
+        value,
+    };
+    let size = Pair { rows: 4, cols: 5 };
+    let pool = |kind| Pool {
+        kind,
+        x,
+        y,
+        size,
+        window,
+        before: Pair { rows: 1, cols: 0 },
+        after: Pair::of(1),
+        c: 3,
+    };
+    let resize = Resize {
+        x,
+        y,
+        size,
+        out: window.out,
+        c: 3,
+        rows: weight(7, 6),
+        cols: weight(20, 9),
+    };
+    vec![
+        conv(false).into(),
+        conv(true).into(),
+        depthwise.into(),
+        border(None, 1).into(),
+        border(Some(weight(3, 2)), 0).into(),
+        pool(PoolKind::Max).into(),
+        pool(PoolKind::PaddedMean).into(),
+        resize.into(),
+    ]
 }
 
 fn check(op: &Op) -> Result<(), Fault> {
@@ -245,7 +329,11 @@ fn outside_the_arena(op: &mut Op) -> Vec<(&mut u32, u32, usize)> {
         Op::Reduce(op) => operand(&mut op.x).into_iter().collect(),
         Op::Copy(op) => operand(&mut op.x).into_iter().collect(),
         Op::GatherRow(op) => operand(&mut op.table).into_iter().collect(),
-        Op::Softmax(_) | Op::ArgMin(_) | Op::ArgMax(_) => vec![],
+        Op::Conv(op) => vec![weights(&mut op.w), weights(&mut op.bias)],
+        Op::Depthwise(op) => vec![weights(&mut op.w), weights(&mut op.bias)],
+        Op::Border(op) => op.value.as_mut().into_iter().map(weights).collect(),
+        Op::Resize(op) => vec![weights(&mut op.rows), weights(&mut op.cols)],
+        Op::Softmax(_) | Op::ArgMin(_) | Op::ArgMax(_) | Op::Pool(_) => vec![],
     }
 }
 
@@ -470,6 +558,11 @@ fn work_counts_what_is_multiplied_and_read() {
                 assert_eq!(work, of(0, if weights { 12 } else { 0 }, 0));
             }
             Op::MatMul(_) => assert_eq!(work.multiply_adds, 24),
+            Op::Conv(op) => assert_eq!(work, of(108, u64::from(op.w.len + 3), 0)),
+            Op::Depthwise(op) => assert_eq!(work, of(36, u64::from(op.w.len + 3), 0)),
+            Op::Border(op) => {
+                assert_eq!(work, of(0, op.value.map_or(0, |value| value.len.into()), 0));
+            }
             Op::LayerNorm(_) => assert_eq!(work, of(10, 10, 0)),
             Op::Attention(_) => assert!(work.state_words > 0 && work.weight_words == 0),
             _ => assert!(work.multiply_adds > 0, "{op:?}"),

@@ -4,7 +4,7 @@
 //! - No allocation, no `std`, no panic, and no unsafe code but in `dispatch`, `simd`, `subnormal` and the loops over weights and cache: a slice
 //!   that is too short leaves the rest of the result as it was.
 //!   Callers that want to be told check shapes beforehand; `lads-image` does so once per program.
-//! - The same bits on every target with IEEE 754 arithmetic, but for subnormal numbers under [`flushed`]: every sum has one fixed order (sixteen lanes, then a tree), no
+//! - The same bits on every target with IEEE 754 arithmetic, but for subnormal numbers under [`flushed`]: every sum has one fixed order (sixteen lanes, then a tree; outputs of layers and images in the order of their inputs), no
 //!   multiply-add is fused, and `exp`, `tanh` and `sigmoid` are the polynomials of [`math`].
 //! - Inner loops run over blocks of sixteen elements: plain Rust that compilers vectorise, or the vectors of `simd` where a control
 //!   step spends its time. Those kernels are compiled once per instruction set and take an [`Isa`], which says which of them to run.
@@ -28,6 +28,8 @@
 
 mod attention;
 mod cache;
+mod conv;
+mod depthwise;
 mod dispatch;
 mod elementwise;
 mod floats;
@@ -37,8 +39,10 @@ mod linear;
 pub mod math;
 mod matmul;
 mod norm;
+mod pool;
 mod reduce;
 pub mod reference;
+mod resize;
 mod simd;
 pub mod stored;
 mod strided;
@@ -46,12 +50,16 @@ mod subnormal;
 
 pub use attention::{Attention, attention_scratch_len};
 pub use cache::{Append, Cache, CacheFormat, CacheMut, keys_len};
+pub use conv::{Conv, Sweep, conv_pack, conv_packed_len};
+pub use depthwise::{Depthwise, depthwise_pack, depthwise_packed_len};
 pub use dispatch::Isa;
 pub use elementwise::{Unary, UnaryKind, assign};
 pub use linear::{Activation, Linear, PANEL, pack, packed_len, packed_rows};
 pub use matmul::MatMul;
 pub use norm::{LayerNorm, softmax};
+pub use pool::{Pool, PoolKind};
 pub use reduce::{Axis, ReduceKind, arg_max, arg_min, reduce};
+pub use resize::Resize;
 pub use stored::{Panels, WeightFormat};
 pub use strided::{BinaryKind, Input, StridedCopy, binary};
 pub use subnormal::flushed;

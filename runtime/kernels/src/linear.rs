@@ -82,6 +82,8 @@ pub enum Activation {
     Relu,
     /// `x` where `x >= 0`, else `alpha * x`.
     LeakyRelu(f32),
+    /// `min(max(x, 0), bound)`: with a bound of 6, the rectifier of mobile networks.
+    Clipped(f32),
     /// Hyperbolic tangent.
     Tanh,
     /// `1 / (1 + exp(-x))`
@@ -92,14 +94,14 @@ impl Activation {
     /// The operation on each element that a layer may leave for the end: long code, which is compiled once.
     fn for_the_end(self) -> Option<UnaryKind> {
         match self {
-            Self::None | Self::Relu | Self::LeakyRelu(_) => None,
+            Self::None | Self::Relu | Self::LeakyRelu(_) | Self::Clipped(_) => None,
             Self::Tanh => Some(UnaryKind::Tanh),
             Self::Sigmoid => Some(UnaryKind::Sigmoid),
         }
     }
 
     #[inline(always)]
-    fn apply<S: Simd>(self, simd: S, x: S::V) -> S::V {
+    pub(crate) fn apply<S: Simd>(self, simd: S, x: S::V) -> S::V {
         /// Where a result is added to what is there; the same code for all instruction sets.
         #[inline(never)]
         fn each(block: &mut Block, f: fn(f32) -> f32) {
@@ -117,6 +119,10 @@ impl Activation {
             Self::None => x,
             Self::Relu => simd.where_negative(x, simd.splat(0.0)),
             Self::LeakyRelu(alpha) => simd.where_negative(x, simd.mul(simd.splat(alpha), x)),
+            Self::Clipped(bound) => {
+                let x = simd.where_negative(x, simd.splat(0.0));
+                simd.at_most(x, simd.splat(bound))
+            }
             Self::Tanh => slow(math::tanh),
             Self::Sigmoid => slow(math::sigmoid),
         }
@@ -268,7 +274,7 @@ impl Linear<'_> {
 
 /// The sixteen elements from `first` on; what is missing is zero, in `spare`.
 #[inline(always)]
-fn block<'b>(x: &'b [f32], first: usize, spare: &'b mut Block) -> &'b Block {
+pub(crate) fn block<'b>(x: &'b [f32], first: usize, spare: &'b mut Block) -> &'b Block {
     let x = x.get(first..).unwrap_or(&[]);
     if let Some(block) = x.first_chunk() {
         return block;

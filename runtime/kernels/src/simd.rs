@@ -27,6 +27,10 @@ pub(crate) trait Simd: Copy {
     const SUMS: usize;
     /// How many sums of products take turns, one or two: two where the next product would wait for the sum, as two take more code.
     const CHAINS: usize;
+    /// Pixels of an image whose sums stay in registers, beside the weights of as many panels as [`PANELS`](Self::PANELS) says.
+    const PIXELS: usize;
+    /// Panels of sixteen outputs that share the pixels that are read, one or two.
+    const PANELS: usize;
 
     /// The same number in every lane.
     fn splat(self, x: f32) -> Self::V;
@@ -38,6 +42,8 @@ pub(crate) trait Simd: Copy {
     fn add(self, a: Self::V, b: Self::V) -> Self::V;
     /// `other` in the lanes where `x < 0`, else `x`.
     fn where_negative(self, x: Self::V, other: Self::V) -> Self::V;
+    /// `bound` in the lanes where it is less than `x`, else `x`.
+    fn at_most(self, x: Self::V, bound: Self::V) -> Self::V;
     /// `a * b`
     fn mul(self, a: Self::V, b: Self::V) -> Self::V;
     /// `sum + a * b`, rounded twice: never fused.
@@ -117,6 +123,8 @@ impl Simd for Portable {
 
     const SUMS: usize = 2;
     const CHAINS: usize = 1;
+    const PIXELS: usize = 3;
+    const PANELS: usize = 1;
 
     #[inline(always)]
     fn splat(self, x: f32) -> Block {
@@ -145,6 +153,14 @@ impl Simd for Portable {
     fn where_negative(self, mut x: Block, other: Block) -> Block {
         for (x, other) in x.iter_mut().zip(other) {
             *x = if *x < 0.0 { other } else { *x };
+        }
+        x
+    }
+
+    #[inline(always)]
+    fn at_most(self, mut x: Block, bound: Block) -> Block {
+        for (x, bound) in x.iter_mut().zip(bound) {
+            *x = if bound < *x { bound } else { *x };
         }
         x
     }

@@ -49,7 +49,7 @@ fn volume(shape: &[Dim]) -> Option<(usize, Vec<usize>)> {
 
 impl Graph {
     /// Folds the node if all its operands are constants, else adds it.
-    fn fold(&mut self, op: Op, inputs: Vec<Id>, shape: Vec<Dim>, ty: Type) -> Built {
+    pub(super) fn fold(&mut self, op: Op, inputs: Vec<Id>, shape: Vec<Dim>, ty: Type) -> Built {
         if shape.len() > MAX_RANK || shape.contains(&Dim::of(0)) {
             return Err(format!(
                 "gives {}, which is empty or has more than {MAX_RANK} axes",
@@ -78,7 +78,7 @@ impl Graph {
         Ok(self.add(op, inputs, shape, ty))
     }
 
-    fn floats(&self, ids: &[Id]) -> Result<(), String> {
+    pub(super) fn floats(&self, ids: &[Id]) -> Result<(), String> {
         if ids.iter().all(|&id| self.ty(id) == Type::F32) {
             Ok(())
         } else {

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use lads_image::op::{BinaryKind, ReduceKind, UnaryKind};
 
-use super::{Op, Unary};
+use super::{Op, Unary, images};
 use crate::tensor::{Data, Tensor, strides};
 
 /// The most operations that folding the constants of one entry may take. A policy's take some hundred thousands; a small model could
@@ -17,6 +17,8 @@ pub(crate) fn cost(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> usize {
     let each = match op {
         Op::MatMul => x[0].shape.last().copied().unwrap_or(1),
         Op::Reduce(_, axis) => x[0].shape.get(*axis).copied().unwrap_or(1),
+        Op::Conv(_) => x[1].shape.first().copied().unwrap_or(1),
+        Op::Pool(_, windows) => windows.kernel[0].saturating_mul(windows.kernel[1]),
         _ => 1,
     };
     made.saturating_mul(each)
@@ -52,6 +54,9 @@ pub(crate) fn evaluate(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> Option<Te
         }
         Op::Reduce(kind, axis) => reduce(kind.0, &x[0], *axis, shape),
         Op::MatMul => matmul(&x[0], &x[1], shape),
+        Op::Conv(conv) => images::conv(conv, x, shape),
+        Op::Pool(kind, windows) => images::pool(kind.0, windows, &x[0], shape),
+        Op::Resize => images::resize(x, shape),
         Op::GatherRow => {
             let &[index] = x[1].as_i64()? else {
                 return None;

@@ -115,6 +115,9 @@ impl<'g> Rewriter<'g> {
             Op::GatherRow => new.gather_row(x[0], x[1])?,
             Op::ArgMin | Op::ArgMax => new.arg(node.op.clone(), x[0])?,
             Op::Linear { .. } => new.linear(node.op.clone(), x.to_vec())?,
+            Op::Conv(conv) => new.conv(*conv, x.to_vec())?,
+            Op::Pool(kind, windows) => new.pool(kind.0, *windows, x[0])?,
+            Op::Resize => new.resize(x[0], x[1], x[2])?,
             Op::Attention { .. } | Op::Record { .. } => new.cached(node.op.clone(), x.to_vec()),
         })
     }

@@ -1,4 +1,5 @@
-//! What each ONNX operator becomes. Shapes and indices are in [`shapes`](super::shapes), the LSTM in [`recurrent`](super::recurrent).
+//! What each ONNX operator becomes. Images are in [`images`](super::images), shapes and indices in [`shapes`](super::shapes), the LSTM in
+//! [`recurrent`](super::recurrent).
 
 use std::f32::consts::{FRAC_1_SQRT_2, SQRT_2};
 use std::sync::Arc;
@@ -6,7 +7,7 @@ use std::sync::Arc;
 use lads_image::op::{BinaryKind, ReduceKind, UnaryKind};
 
 use super::attributes::Attributes;
-use super::{Operands, recurrent, shapes};
+use super::{Operands, images, recurrent, shapes};
 use crate::graph::{Dim, Graph, Id, Op, Type, Unary};
 use crate::tensor::Tensor;
 
@@ -69,7 +70,7 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
         "ArgMax" => arg(g, x, a, Op::ArgMax),
         "LSTM" => recurrent::lstm(g, x, a),
         "GRU" => recurrent::gru(g, x, a),
-        _ => shapes::translate(g, operator, x, a),
+        _ => images::translate(g, operator, x, a),
     }
 }
 

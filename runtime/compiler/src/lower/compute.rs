@@ -61,6 +61,9 @@ impl Lowering<'_> {
                 residual,
                 activation,
             } => self.linear(id, &x, bias, residual, activation),
+            Op::Conv(conv) => self.conv(id, &x, conv),
+            Op::Pool(kind, windows) => self.pool(id, x[0], kind.0, &windows),
+            Op::Resize => self.resize(id, &x),
             Op::Attention { layer, scale, .. } => {
                 self.attention(id, &x, layer, f32::from_bits(scale))
             }
@@ -280,7 +283,7 @@ impl Lowering<'_> {
     }
 
     /// A constant in the weights.
-    fn plain(&mut self, id: Id) -> Result<WeightSpan, String> {
+    pub(super) fn plain(&mut self, id: Id) -> Result<WeightSpan, String> {
         let tensor = self
             .g
             .constant(id)
@@ -432,7 +435,7 @@ impl Lowering<'_> {
     }
 }
 
-fn activation_of(unary: Unary) -> Activation {
+pub(super) fn activation_of(unary: Unary) -> Activation {
     match unary.kind.0 {
         UnaryKind::Relu => Activation::Relu,
         UnaryKind::LeakyRelu => Activation::LeakyRelu(f32::from_bits(unary.alpha)),

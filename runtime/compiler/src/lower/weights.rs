@@ -9,7 +9,10 @@ use std::sync::Arc;
 
 use bytemuck::NoUninit;
 use lads_image::op::{WeightFormat, WeightSpan};
-use lads_kernels::{PANEL, pack, packed_len, stored};
+use lads_kernels::{
+    PANEL, conv_pack, conv_packed_len, depthwise_pack, depthwise_packed_len, pack, packed_len,
+    stored,
+};
 
 use crate::tensor::Tensor;
 
@@ -22,6 +25,10 @@ enum Form {
     Plain,
     Packed(WeightFormat),
     Scales(WeightFormat),
+    /// Of a convolution, in so many groups of outputs.
+    Windows(usize),
+    /// Of a convolution of each channel by itself.
+    Channels,
 }
 
 /// A packed matrix.
@@ -127,6 +134,42 @@ impl Weights {
         let scales = self.once(tensor, Form::Scales(format), |this| this.store(scales))?;
         let w = self.panels(tensor, format, [k, n], &integers)?;
         Ok((w, Some(scales)))
+    }
+
+    /// Stores the `[k, n]` matrix of a convolution for the kernel `Conv`: the panels of one group of outputs after those of another,
+    /// each as long.
+    pub fn windows(&mut self, tensor: &Arc<Tensor>, groups: usize) -> Result<WeightSpan, String> {
+        let data = tensor.as_f32().ok_or("reads integers as numbers")?;
+        let &[k, all] = &tensor.shape[..] else {
+            return Err("has weights that are no matrix".into());
+        };
+        self.once(tensor, Form::Windows(groups), |this| {
+            let n = all / groups;
+            let len = conv_packed_len([k, n]);
+            let mut panels = vec![0.0; groups * len];
+            for (i, panels) in panels.chunks_mut(len).enumerate() {
+                let own: Vec<f32> = data
+                    .chunks(all)
+                    .flat_map(|row| &row[i * n..][..n])
+                    .copied()
+                    .collect();
+                conv_pack(&own, [k, n], panels);
+            }
+            this.store(&panels)
+        })
+    }
+
+    /// Stores the `[kernel, c]` matrix of a convolution for the kernel `Depthwise`.
+    pub fn channels(&mut self, tensor: &Arc<Tensor>) -> Result<WeightSpan, String> {
+        let data = tensor.as_f32().ok_or("reads integers as numbers")?;
+        let &[kernel, c] = &tensor.shape[..] else {
+            return Err("has weights that are no matrix".into());
+        };
+        self.once(tensor, Form::Channels, |this| {
+            let mut packed = vec![0.0; depthwise_packed_len([kernel, c])];
+            depthwise_pack(data, [kernel, c], &mut packed);
+            this.store(&packed)
+        })
     }
 
     fn once(

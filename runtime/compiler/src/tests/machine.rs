@@ -1,7 +1,8 @@
 //! A plain interpreter of ops, independent of the core's executor: loops, sums in `f64`.
 
 use lads_image::op::{
-    Activation, INT_SLOTS, Op, Operand, Place, Space, Span, UnaryKind, WeightSpan,
+    Activation, INT_SLOTS, Op, Operand, Pair, Picture, Place, Space, Span, UnaryKind, WeightSpan,
+    Window,
 };
 use lads_kernels::{PANEL, reference};
 
@@ -21,6 +22,25 @@ fn offsets(dims: [u32; 4], strides: [u32; 4]) -> Vec<usize> {
     (0..dims.iter().product())
         .map(|i| reference::offset(dims, strides, i))
         .collect()
+}
+
+fn pair(pair: Pair) -> [usize; 2] {
+    [pair.rows, pair.cols].map(usize::from)
+}
+
+fn strides(picture: Picture) -> [usize; 2] {
+    [picture.row, picture.pixel].map(|stride| stride as usize)
+}
+
+fn sweep(window: Window, x: Picture, y: Picture) -> lads_kernels::Sweep {
+    lads_kernels::Sweep {
+        out: pair(window.out),
+        kernel: pair(window.kernel),
+        stride: pair(window.stride),
+        dilation: pair(window.dilation),
+        x_strides: strides(x),
+        y_strides: strides(y),
+    }
 }
 
 fn element(activation: UnaryKind, alpha: f32, x: f32) -> f32 {
@@ -121,6 +141,9 @@ impl<'w> Machine<'w> {
                         Activation::LeakyRelu(alpha) => {
                             element(UnaryKind::LeakyRelu, alpha, sum as f32)
                         }
+                        Activation::Clipped(bound) => {
+                            element(UnaryKind::Relu, 0.0, sum as f32).min(bound)
+                        }
                         Activation::Tanh => element(UnaryKind::Tanh, 0.0, sum as f32),
                         Activation::Sigmoid => element(UnaryKind::Sigmoid, 0.0, sum as f32),
                     };
@@ -218,6 +241,81 @@ impl<'w> Machine<'w> {
                 {
                     self.arena[op.y.offset as usize + to] = x[from];
                 }
+            }
+            Op::Conv(op) => {
+                let [kernel_rows, kernel_cols] = pair(op.window.kernel);
+                let (k, n) = (kernel_rows * kernel_cols * op.c as usize, op.n as usize);
+                let packed = self.weights(op.w);
+                let w: Vec<f32> = (0..k * n)
+                    .map(|i| packed[(i % n / 16 * k + i / n) * 16 + i % n % 16])
+                    .collect();
+                let mut y = self.get(op.y.at).to_vec();
+                let what = (op.activation, op.accumulate);
+                let weights = (&w[..], self.weights(op.bias));
+                let x = self.get(op.x.at);
+                reference::conv(&sweep(op.window, op.x, op.y), weights, what, x, &mut y);
+                self.put(op.y.at, &y);
+            }
+            Op::Depthwise(op) => {
+                let c = op.c as usize;
+                let packed = self.weights(op.w).chunks(c.next_multiple_of(16));
+                let w: Vec<f32> = packed.flat_map(|row| &row[..c]).copied().collect();
+                let mut y = self.get(op.y.at).to_vec();
+                let weights = (&w[..], self.weights(op.bias));
+                let x = self.get(op.x.at);
+                reference::depthwise(
+                    &sweep(op.window, op.x, op.y),
+                    weights,
+                    op.activation,
+                    x,
+                    &mut y,
+                );
+                self.put(op.y.at, &y);
+            }
+            Op::Border(op) => {
+                let ([top, left], [rows, cols]) = (pair(op.before), pair(op.inside));
+                let [_, right] = pair(op.after);
+                let (c, line) = (op.c as usize, left + cols + right);
+                for i in 0..op.y.len as usize {
+                    let (row, col) = (i / c / line, i / c % line);
+                    let inside =
+                        (top..top + rows).contains(&row) && (left..left + cols).contains(&col);
+                    if !inside {
+                        let value = op.value.map_or(0.0, |value| self.weights(value)[i % c]);
+                        self.arena[op.y.offset as usize + i] = value;
+                    }
+                }
+            }
+            Op::Pool(op) => {
+                let pool = lads_kernels::Pool {
+                    kind: op.kind,
+                    size: pair(op.size),
+                    out: pair(op.window.out),
+                    c: op.c as usize,
+                    kernel: pair(op.window.kernel),
+                    stride: pair(op.window.stride),
+                    dilation: pair(op.window.dilation),
+                    before: pair(op.before),
+                    after: pair(op.after),
+                    x_strides: strides(op.x),
+                    y_strides: strides(op.y),
+                };
+                let mut y = self.get(op.y.at).to_vec();
+                reference::pool(&pool, self.get(op.x.at), &mut y);
+                self.put(op.y.at, &y);
+            }
+            Op::Resize(op) => {
+                let resize = lads_kernels::Resize {
+                    size: pair(op.size),
+                    c: op.c as usize,
+                    rows: self.weights(op.rows),
+                    cols: self.weights(op.cols),
+                    x_strides: strides(op.x),
+                    y_strides: strides(op.y),
+                };
+                let mut y = self.get(op.y.at).to_vec();
+                reference::resize(&resize, self.get(op.x.at), &mut y);
+                self.put(op.y.at, &y);
             }
             Op::ArgMin(op) => {
                 self.ints[usize::from(op.out.0)] = first_best(self.get(op.x), |a, b| a < b);

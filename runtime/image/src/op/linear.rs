@@ -20,6 +20,7 @@ impl Field for Activation {
             Self::LeakyRelu(alpha) => (2, alpha),
             Self::Tanh => (3, 0.0),
             Self::Sigmoid => (4, 0.0),
+            Self::Clipped(bound) => (5, bound),
         };
         out.word(kind);
         alpha.put(out);
@@ -34,6 +35,7 @@ impl Field for Activation {
             2 => return Some(Self::LeakyRelu(alpha)),
             3 => Self::Tanh,
             4 => Self::Sigmoid,
+            5 => return Some(Self::Clipped(alpha)),
             _ => return None,
         };
         (alpha.to_bits() == 0).then_some(plain)

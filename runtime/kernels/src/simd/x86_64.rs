@@ -10,15 +10,15 @@ use core::arch::x86_64::{
     _mm256_castps_si256, _mm256_castsi256_ps, _mm256_castsi256_si128, _mm256_cmp_ps,
     _mm256_cvtepi8_epi16, _mm256_cvtepi32_ps, _mm256_cvtepu16_epi32, _mm256_cvtph_ps,
     _mm256_cvtps_ph, _mm256_extracti128_si256, _mm256_loadu_ps, _mm256_loadu_si256,
-    _mm256_madd_epi16, _mm256_max_epi32, _mm256_mul_ps, _mm256_packs_epi32,
+    _mm256_madd_epi16, _mm256_max_epi32, _mm256_min_ps, _mm256_mul_ps, _mm256_packs_epi32,
     _mm256_permute4x64_epi64, _mm256_set1_epi32, _mm256_set1_ps, _mm256_setzero_ps,
     _mm256_setzero_si256, _mm256_slli_epi32, _mm256_srai_epi32, _mm256_storeu_ps,
     _mm256_storeu_si256, _mm512_add_epi32, _mm512_add_ps, _mm512_and_si512, _mm512_castps_si512,
     _mm512_castsi512_ps, _mm512_cmp_ps_mask, _mm512_cvtepi8_epi16, _mm512_cvtepi32_epi16,
     _mm512_cvtepi32_ps, _mm512_cvtepu16_epi32, _mm512_cvtph_ps, _mm512_cvtps_ph,
     _mm512_dpwssd_epi32, _mm512_loadu_ps, _mm512_loadu_si512, _mm512_mask_blend_ps,
-    _mm512_max_epi32, _mm512_mul_ps, _mm512_reduce_max_epi32, _mm512_set1_epi32, _mm512_set1_ps,
-    _mm512_setzero_ps, _mm512_setzero_si512, _mm512_slli_epi32, _mm512_storeu_ps,
+    _mm512_max_epi32, _mm512_min_ps, _mm512_mul_ps, _mm512_reduce_max_epi32, _mm512_set1_epi32,
+    _mm512_set1_ps, _mm512_setzero_ps, _mm512_setzero_si512, _mm512_slli_epi32, _mm512_storeu_ps,
 };
 
 use super::{MAGNITUDE, ROUND, Simd};
@@ -61,6 +61,8 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
 
     const SUMS: usize = if NARROW { 8 } else { 4 };
     const CHAINS: usize = 1;
+    const PIXELS: usize = 6;
+    const PANELS: usize = 1;
 
     #[inline(always)]
     fn splat(self, x: f32) -> Self::V {
@@ -102,6 +104,12 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
                 _mm256_blendv_ps(high, other[1], negative(high)),
             ]
         }
+    }
+
+    #[inline(always)]
+    fn at_most(self, x: Self::V, bound: Self::V) -> Self::V {
+        // SAFETY: whoever made `self` has AVX2. The second operand is taken where either is not a number.
+        unsafe { [_mm256_min_ps(bound[0], x[0]), _mm256_min_ps(bound[1], x[1])] }
     }
 
     #[inline(always)]
@@ -255,6 +263,8 @@ impl Simd for Avx512 {
 
     const SUMS: usize = 16;
     const CHAINS: usize = 2;
+    const PIXELS: usize = 6;
+    const PANELS: usize = 2;
 
     #[inline(always)]
     fn splat(self, x: f32) -> Self::V {
@@ -287,6 +297,12 @@ impl Simd for Avx512 {
             let negative = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(x, _mm512_setzero_ps());
             _mm512_mask_blend_ps(negative, x, other)
         }
+    }
+
+    #[inline(always)]
+    fn at_most(self, x: Self::V, bound: Self::V) -> Self::V {
+        // SAFETY: whoever made `self` has AVX-512. The second operand is taken where either is not a number.
+        unsafe { _mm512_min_ps(bound, x) }
     }
 
     #[inline(always)]

@@ -1,0 +1,365 @@
+//! Convolutions, pools and changes of size: where an image lies, and the border around it.
+//!
+//! A convolution reads an image that has its border. Whoever computes an image leaves room for what its readers want around it and fills
+//! that first, so that the image is written once, inside its border; an image that something else wrote is copied into one.
+
+use lads_image::op::{
+    Activation, Border, Conv, Depthwise, Pair, Picture, Pool, PoolKind, Resize, WeightSpan, Window,
+};
+
+use super::Lowering;
+use super::compute::{Done, activation_of, product};
+use super::view::View;
+use crate::graph::{ConvOp, Id, Op, Windows};
+
+/// The batch, rows, columns and channels of images or sequences.
+fn four(shape: &[usize]) -> Result<[usize; 4], String> {
+    match *shape {
+        [n, rows, cols, c] => Ok([n, rows, cols, c]),
+        [n, cols, c] => Ok([n, 1, cols, c]),
+        _ => Err("is neither an image nor a sequence".into()),
+    }
+}
+
+fn pair([rows, cols]: [usize; 2]) -> Result<Pair, String> {
+    let number =
+        |n: usize| u16::try_from(n).map_err(|_| format!("has a side of {n}, beyond {}", u16::MAX));
+    Ok(Pair {
+        rows: number(rows)?,
+        cols: number(cols)?,
+    })
+}
+
+/// What covers both.
+fn larger(a: [usize; 4], b: [usize; 4]) -> [usize; 4] {
+    std::array::from_fn(|i| a[i].max(b[i]))
+}
+
+/// Images in memory: the view of each, of so many rows, columns and channels.
+struct Images {
+    view: View,
+    each: usize,
+    row: usize,
+    pixel: usize,
+}
+
+impl Lowering<'_> {
+    /// Decides which borders images get: the largest that a convolution wants, a residual that of its sum.
+    pub(super) fn plan_borders(&mut self, order: &[Id]) {
+        for &id in order.iter().rev() {
+            let Op::Conv(conv) = *self.g.op(id) else {
+                continue;
+            };
+            let inputs = &self.g.node(id).inputs;
+            // Padding that is not zero makes a border of its own.
+            if !conv.fill {
+                let pads = self.reached(&conv.windows, inputs[0]);
+                self.want(inputs[0], pads);
+            }
+            if let (true, Some(&residual)) = (conv.residual, inputs.last()) {
+                let own = self.wanted.get(&id).copied().unwrap_or_default();
+                self.want(residual, own);
+            }
+        }
+    }
+
+    fn want(&mut self, id: Id, border: [usize; 4]) {
+        if border != [0; 4] {
+            let known = self.wanted.get(&id).copied().unwrap_or_default();
+            self.wanted.insert(id, larger(known, border));
+        }
+    }
+
+    /// The padding that a convolution really reads.
+    fn reached(&self, windows: &Windows, x: Id) -> [usize; 4] {
+        let shape = self
+            .shape(x)
+            .and_then(|shape| four(&shape))
+            .unwrap_or([1; 4]);
+        windows.reached([shape[1], shape[2]]).pads()
+    }
+
+    /// A new image with the border that its readers want.
+    fn image(&mut self, id: Id, shape: &[usize]) -> Result<View, String> {
+        let border = self.wanted.get(&id).copied().unwrap_or_default();
+        if border == [0; 4] || self.placed.contains_key(&id) {
+            return Ok(self.allocate(id, shape));
+        }
+        self.borders.insert(id, border);
+        self.bordered(shape, border, None)
+    }
+
+    /// The inside of new images with a border around each.
+    fn bordered(
+        &mut self,
+        shape: &[usize],
+        border: [usize; 4],
+        value: Option<WeightSpan>,
+    ) -> Result<View, String> {
+        let [n, rows, cols, c] = four(shape)?;
+        let [top, left, bottom, right] = border;
+        let whole = [n, top + rows + bottom, left + cols + right, c];
+        let buffer = self.buffer(product(&whole));
+        let all = View::contiguous(buffer, 0, &whole);
+        let [each, row, pixel] = [all.strides[0], all.strides[1], c];
+        for i in 0..n {
+            let view = all.with(i * each, vec![]);
+            let op = Border {
+                y: self.span(&view, each),
+                inside: pair([rows, cols])?,
+                before: pair([top, left])?,
+                after: pair([bottom, right])?,
+                c: c as u32,
+                value,
+            };
+            self.ops.push(op.into());
+        }
+        let offset = top * row + left * pixel;
+        let strides = if shape.len() == 4 {
+            vec![each, row, pixel, 1]
+        } else {
+            vec![each, pixel, 1]
+        };
+        Ok(all.with(offset, strides))
+    }
+
+    /// Where images lie whose channels are side by side in the arena; a copy if they are not.
+    fn images(&mut self, id: Id) -> Result<Images, String> {
+        let shape = self.shape(id)?;
+        let view = self.view(id)?;
+        let channels = shape.last().copied().unwrap_or(1);
+        let side_by_side = channels == 1 || view.strides.last() == Some(&1);
+        let view = if side_by_side && view.buffer().is_some() {
+            view
+        } else {
+            let buffer = self.buffer(product(&shape));
+            let to = View::contiguous(buffer, 0, &shape);
+            self.copy(id, &to, &shape)?;
+            to
+        };
+        Ok(Images::of(view))
+    }
+
+    /// The images that a convolution reads, from the first pixel of their border on.
+    fn with_border(
+        &mut self,
+        id: Id,
+        pads: [usize; 4],
+        value: Option<WeightSpan>,
+    ) -> Result<Images, String> {
+        let [top, left, ..] = pads;
+        let there = self.borders.get(&id).copied().unwrap_or_default();
+        let fits = value.is_none() && larger(there, pads) == there;
+        let images = if fits || pads == [0; 4] {
+            self.images(id)?
+        } else {
+            let shape = self.shape(id)?;
+            let border = if value.is_some() {
+                pads
+            } else {
+                larger(pads, self.wanted.get(&id).copied().unwrap_or_default())
+            };
+            let inside = self.bordered(&shape, border, value)?;
+            self.copy(id, &inside, &shape)?;
+            if value.is_none() {
+                // For others that read it.
+                self.borders.insert(id, border);
+                self.set(id, inside.clone());
+            }
+            Images::of(inside)
+        };
+        let offset = images.view.offset - top * images.row - left * images.pixel;
+        Ok(Images {
+            view: images.view.with(offset, images.view.strides.clone()),
+            ..images
+        })
+    }
+
+    /// One of the images, `[rows, columns]` of it, some of its channels.
+    fn picture(
+        &self,
+        images: &Images,
+        i: usize,
+        [rows, cols]: [usize; 2],
+        [first, c]: [usize; 2],
+    ) -> Picture {
+        let view = images
+            .view
+            .with(images.view.offset + i * images.each + first, vec![]);
+        let len = (rows - 1) * images.row + (cols - 1) * images.pixel + c;
+        Picture {
+            at: self.span(&view, len),
+            row: images.row as u32,
+            pixel: images.pixel as u32,
+        }
+    }
+
+    pub(super) fn conv(&mut self, id: Id, x: &[Id], conv: ConvOp) -> Done {
+        let (from, shape) = (self.shape(x[0])?, self.shape(id)?);
+        let ([n, .., channels], [.., outputs]) = (four(&from)?, four(&shape)?);
+        let matrix = self
+            .g
+            .constant(x[1])
+            .cloned()
+            .ok_or("reads weights that are not constant")?;
+        let bias = self.plain(x[2])?;
+        let value = if conv.fill {
+            Some(self.plain(x[3])?)
+        } else {
+            None
+        };
+        let pads = self.reached(&conv.windows, x[0]);
+        let input = self.with_border(x[0], pads, value)?;
+        let y = match x.last() {
+            Some(&to) if conv.residual => self.sum(id, x[0], to)?,
+            _ => self.image(id, &shape)?,
+        };
+        self.set(id, y.clone());
+        let output = Images::of(y);
+        let windows = conv.windows;
+        let window = window(&windows)?;
+        let covered: [usize; 2] = std::array::from_fn(|i| {
+            (windows.out[i] - 1) * windows.stride[i]
+                + (windows.kernel[i] - 1) * windows.dilation[i]
+                + 1
+        });
+        let activation = match (conv.bound, conv.activation) {
+            (Some(bound), _) => Activation::Clipped(f32::from_bits(bound)),
+            (None, Some(unary)) => activation_of(unary),
+            (None, None) => Activation::None,
+        };
+        if conv.groups == channels && outputs == channels && !conv.residual && channels > 1 {
+            let w = self.weights.channels(&matrix)?;
+            for i in 0..n {
+                let op = Depthwise {
+                    x: self.picture(&input, i, covered, [0, channels]),
+                    y: self.picture(&output, i, windows.out, [0, channels]),
+                    window,
+                    c: channels as u32,
+                    w,
+                    bias,
+                    activation,
+                };
+                self.ops.push(op.into());
+            }
+            return Ok(());
+        }
+        let whole = self.weights.windows(&matrix, conv.groups)?;
+        let (c, own) = (channels / conv.groups, outputs / conv.groups);
+        let each = whole.len / conv.groups as u32;
+        for (i, group) in (0..n).flat_map(|i| (0..conv.groups).map(move |group| (i, group))) {
+            let op = Conv {
+                x: self.picture(&input, i, covered, [group * c, c]),
+                y: self.picture(&output, i, windows.out, [group * own, own]),
+                window,
+                c: c as u32,
+                n: own as u32,
+                w: WeightSpan {
+                    offset: whole.offset + group as u32 * each,
+                    len: each,
+                },
+                bias: WeightSpan {
+                    offset: bias.offset + (group * own) as u32,
+                    len: own as u32,
+                },
+                activation,
+                accumulate: conv.residual,
+            };
+            self.ops.push(op.into());
+        }
+        Ok(())
+    }
+
+    /// Where a convolution is added to: the residual itself if nobody else reads it, else a copy.
+    fn sum(&mut self, id: Id, x: Id, residual: Id) -> Result<View, String> {
+        let shape = self.shape(id)?;
+        let there = self.borders.get(&residual).copied().unwrap_or_default();
+        let wanted = self.wanted.get(&id).copied().unwrap_or_default();
+        let images = Images::of(self.view(residual)?);
+        if let Some(buffer) = images.view.buffer()
+            && images.view.strides.last() == Some(&1)
+            && larger(there, wanted) == there
+            && self.view(x)?.buffer() != Some(buffer)
+            && !self.placed.contains_key(&id)
+            && self.dies_here(buffer, id)
+        {
+            self.borders.insert(id, there);
+            return Ok(images.view);
+        }
+        let y = self.image(id, &shape)?;
+        self.copy(residual, &y, &shape)?;
+        Ok(y)
+    }
+
+    pub(super) fn pool(&mut self, id: Id, x: Id, kind: PoolKind, windows: &Windows) -> Done {
+        let (from, shape) = (self.shape(x)?, self.shape(id)?);
+        let [n, rows, cols, c] = four(&from)?;
+        let input = self.images(x)?;
+        let y = self.image(id, &shape)?;
+        self.set(id, y.clone());
+        let output = Images::of(y);
+        for i in 0..n {
+            let op = Pool {
+                kind,
+                x: self.picture(&input, i, [rows, cols], [0, c]),
+                y: self.picture(&output, i, windows.out, [0, c]),
+                size: pair([rows, cols])?,
+                window: window(windows)?,
+                before: pair(windows.before)?,
+                after: pair(windows.after)?,
+                c: c as u32,
+            };
+            self.ops.push(op.into());
+        }
+        Ok(())
+    }
+
+    pub(super) fn resize(&mut self, id: Id, x: &[Id]) -> Done {
+        let (from, shape) = (self.shape(x[0])?, self.shape(id)?);
+        let ([n, rows, cols, c], [_, out_rows, out_cols, _]) = (four(&from)?, four(&shape)?);
+        let tables = [self.plain(x[1])?, self.plain(x[2])?];
+        let input = self.images(x[0])?;
+        let y = self.image(id, &shape)?;
+        self.set(id, y.clone());
+        let output = Images::of(y);
+        for i in 0..n {
+            let op = Resize {
+                x: self.picture(&input, i, [rows, cols], [0, c]),
+                y: self.picture(&output, i, [out_rows, out_cols], [0, c]),
+                size: pair([rows, cols])?,
+                out: pair([out_rows, out_cols])?,
+                c: c as u32,
+                rows: tables[0],
+                cols: tables[1],
+            };
+            self.ops.push(op.into());
+        }
+        Ok(())
+    }
+}
+
+impl Images {
+    /// The images of a view `[N, rows, columns, C]` or `[N, columns, C]`.
+    fn of(view: View) -> Self {
+        let (each, row, pixel) = match view.strides[..] {
+            [each, row, pixel, _] => (each, row, pixel),
+            [each, pixel, _] => (each, 0, pixel),
+            _ => (0, 0, 0),
+        };
+        Self {
+            view,
+            each,
+            row,
+            pixel,
+        }
+    }
+}
+
+fn window(windows: &Windows) -> Result<Window, String> {
+    Ok(Window {
+        out: pair(windows.out)?,
+        kernel: pair(windows.kernel)?,
+        stride: pair(windows.stride)?,
+        dilation: pair(windows.dilation)?,
+    })
+}

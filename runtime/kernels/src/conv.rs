@@ -1,0 +1,339 @@
+//! Convolutions over images `[rows, columns, channels]`: `y = activation(x * W + b + (accumulate ? y : 0))`.
+//!
+//! ```text
+//! for each panel of 16 outputs:                  [kernel rows][kernel columns][c][16], one after the other in memory
+//!     for each output pixel:
+//!         for ky, kx, i:  sum[0..16] += x[pixel * stride + (ky, kx) * dilation][i] * panel[ky][kx][i][0..16]
+//!         y[pixel][panel] = activation(sum + bias + y)
+//! ```
+//!
+//! There is no padding here: `x` is a view that has its border, so every pixel is the same work, and a kernel of one row is a
+//! convolution over time. Departures for speed, none of which changes a sum:
+//!
+//! 1. Up to [`Simd::PIXELS`] pixels share each weight that is read, wherever in the image they lie; the pixels of an image are dealt
+//!    out evenly, because a tile of one pixel reads as many weights as one of six.
+//! 2. Pixels that follow one another in memory make a kernel row one run of `columns * c` inputs.
+//! 3. Panels that fit the first-level cache together are gone through for each tile, so that `x` is read once for all of them.
+
+use crate::dispatch::{Isa, Kernel};
+use crate::elementwise::assign;
+use crate::lanes::{Block, LANES};
+use crate::linear::{Activation, block};
+use crate::simd::Simd;
+
+/// Words of weights that are gone through for one tile of pixels before the next: a third of a first-level cache.
+const NEAR: usize = 4096;
+
+/// Elements of a `[k, n]` matrix in panels of sixteen outputs, `k` counting kernel rows, columns and input channels.
+pub const fn conv_packed_len([k, n]: [usize; 2]) -> usize {
+    n.div_ceil(LANES) * LANES * k
+}
+
+/// Packs `w`, `[k, n]` row-major, into panels `[n / 16][k][16]`; columns are rounded up to sixteen with zeros. Offline work.
+///
+/// # Panics
+/// When `w` is not `k * n` or `out` not [`conv_packed_len`] elements long.
+pub fn conv_pack<T: Copy + Default>(w: &[T], [k, n]: [usize; 2], out: &mut [T]) {
+    assert_eq!(w.len(), k * n, "w is [k, n]");
+    assert_eq!(out.len(), conv_packed_len([k, n]), "out is conv_packed_len");
+    out.fill(T::default());
+    for (l, row) in w.chunks_exact(n.max(1)).enumerate() {
+        for (p, part) in row.chunks(LANES).enumerate() {
+            let to = out.get_mut((p * k + l) * LANES..).unwrap_or(&mut []);
+            for (to, &w) in to.iter_mut().zip(part) {
+                *to = w;
+            }
+        }
+    }
+}
+
+/// Where a convolution reads and writes. Sizes are of rows, then columns; strides are elements from a row to the next, then from a
+/// pixel to the next.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Sweep {
+    /// Output pixels.
+    pub out: [usize; 2],
+    /// Kernel.
+    pub kernel: [usize; 2],
+    /// Input pixels from one output pixel to the next.
+    pub stride: [usize; 2],
+    /// Input pixels from one kernel element to the next.
+    pub dilation: [usize; 2],
+    /// Of the input.
+    pub x_strides: [usize; 2],
+    /// Of the output.
+    pub y_strides: [usize; 2],
+}
+
+impl Sweep {
+    /// Elements of the input from the first that is read to behind the last, of pixels of `c` channels; `None` beyond `usize`.
+    pub(crate) fn reach(&self, c: usize) -> Option<usize> {
+        let mut reach = c;
+        for axis in 0..2 {
+            let get = |of: &[usize; 2]| of.get(axis).copied().unwrap_or(0);
+            let outputs = get(&self.out)
+                .checked_sub(1)?
+                .checked_mul(get(&self.stride))?;
+            let inside = get(&self.kernel)
+                .checked_sub(1)?
+                .checked_mul(get(&self.dilation))?;
+            let last = outputs
+                .checked_add(inside)?
+                .checked_mul(get(&self.x_strides))?;
+            reach = reach.checked_add(last)?;
+        }
+        Some(reach)
+    }
+
+    /// The first input and the first output of each of the pixels from `first` on.
+    #[inline(always)]
+    pub(crate) fn pixels<const P: usize>(&self, first: usize) -> [[usize; 2]; P] {
+        let (mut row, mut col) = (first / self.out[1].max(1), first % self.out[1].max(1));
+        let (rows, cols) = (
+            self.stride[0] * self.x_strides[0],
+            self.stride[1] * self.x_strides[1],
+        );
+        [(); P].map(|()| {
+            let at = [
+                row * rows + col * cols,
+                row * self.y_strides[0] + col * self.y_strides[1],
+            ];
+            col += 1;
+            if col == self.out[1] {
+                (row, col) = (row + 1, 0);
+            }
+            at
+        })
+    }
+}
+
+/// A convolution of `c` input channels and `n` output channels.
+#[derive(Debug, Clone, Copy)]
+pub struct Conv<'w> {
+    /// Where it reads and writes.
+    pub sweep: Sweep,
+    /// Input channels.
+    pub c: usize,
+    /// Output channels.
+    pub n: usize,
+    /// [`conv_packed_len`] elements, ordered by [`conv_pack`].
+    pub w: &'w [f32],
+    /// `[n]`
+    pub bias: &'w [f32],
+    /// Applied at the end, after accumulation.
+    pub activation: Activation,
+    /// Whether the sum is added to `y`.
+    pub accumulate: bool,
+}
+
+impl Conv<'_> {
+    /// Computes `y` from `x`, both from the first pixel on. A view that is too short, or weights that are, leave `y` as it was.
+    pub fn run(&self, isa: Isa, x: &[f32], y: &mut [f32]) {
+        let [rows, cols] = self.sweep.kernel;
+        let k = rows * cols * self.c;
+        let there = self
+            .sweep
+            .reach(self.c)
+            .is_some_and(|reach| reach <= x.len());
+        if there && k > 0 && self.w.len() == conv_packed_len([k, self.n]) {
+            isa.run(Pixels {
+                conv: self,
+                k,
+                x,
+                y,
+            });
+        }
+    }
+}
+
+/// A convolution at work; `x` is long enough, and so are the weights.
+struct Pixels<'a> {
+    conv: &'a Conv<'a>,
+    k: usize,
+    x: &'a [f32],
+    y: &'a mut [f32],
+}
+
+/// Runs of inputs that one output pixel reads: so many times so many, so far apart, each so long.
+struct Runs {
+    times: [usize; 2],
+    apart: [usize; 2],
+    len: usize,
+}
+
+impl Runs {
+    #[inline(always)]
+    fn of(conv: &Conv) -> Self {
+        let Sweep {
+            kernel: [rows, cols],
+            dilation,
+            x_strides,
+            ..
+        } = conv.sweep;
+        let apart = [dilation[0] * x_strides[0], dilation[1] * x_strides[1]];
+        if apart[1] == conv.c || cols == 1 {
+            Self {
+                times: [rows, 1],
+                apart,
+                len: cols * conv.c,
+            }
+        } else {
+            Self {
+                times: [rows, cols],
+                apart,
+                len: conv.c,
+            }
+        }
+    }
+}
+
+impl Kernel for Pixels<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(mut self, simd: S) {
+        let conv = self.conv;
+        let runs = Runs::of(conv);
+        let pixels = conv.sweep.out[0] * conv.sweep.out[1];
+        let panels = conv.n.div_ceil(LANES);
+        let near = (NEAR / (self.k * LANES)).clamp(1, panels);
+        // Pairs of panels where there are registers for them.
+        let near = near.next_multiple_of(S::PANELS);
+        for first_panel in (0..panels).step_by(near) {
+            let end = panels.min(first_panel + near);
+            let mut first = 0;
+            while first < pixels {
+                let tiles = (pixels - first).div_ceil(S::PIXELS);
+                let size = (pixels - first).div_ceil(tiles);
+                let place = (first, first_panel..end);
+                match size {
+                    6 if S::PIXELS >= 6 => self.tile::<S, 6>(simd, &runs, place),
+                    5 if S::PIXELS >= 6 => self.tile::<S, 5>(simd, &runs, place),
+                    4 if S::PIXELS >= 6 => self.tile::<S, 4>(simd, &runs, place),
+                    3 => self.tile::<S, 3>(simd, &runs, place),
+                    2 => self.tile::<S, 2>(simd, &runs, place),
+                    _ => self.tile::<S, 1>(simd, &runs, place),
+                }
+                first += size;
+            }
+        }
+    }
+}
+
+impl Pixels<'_> {
+    /// `P` pixels from `first` on, in some panels.
+    #[inline(always)]
+    fn tile<S: Simd, const P: usize>(
+        &mut self,
+        simd: S,
+        runs: &Runs,
+        (first, panels): (usize, core::ops::Range<usize>),
+    ) {
+        let at = self.conv.sweep.pixels::<P>(first);
+        let mut panel = panels.start;
+        while panel < panels.end {
+            panel += if S::PANELS >= 2 && panels.end - panel >= 2 {
+                self.panels::<S, P, 2>(simd, runs, &at, panel)
+            } else {
+                self.panels::<S, P, 1>(simd, runs, &at, panel)
+            };
+        }
+    }
+
+    /// `P` pixels and `B` panels from `panel` on; returns `B`.
+    #[inline(always)]
+    #[expect(
+        clippy::indexing_slicing,
+        reason = "arrays whose length is a constant, as is every index"
+    )]
+    fn panels<S: Simd, const P: usize, const B: usize>(
+        &mut self,
+        simd: S,
+        runs: &Runs,
+        at: &[[usize; 2]; P],
+        panel: usize,
+    ) -> usize {
+        let sums = sums::<S, P, B>(simd, runs, (self.conv.w, self.k, panel), self.x, at);
+        let mut spare = [0.0; LANES];
+        for (b, sums) in sums.into_iter().enumerate() {
+            let first = (panel + b) * LANES;
+            let bias = simd.load(block(self.conv.bias, first, &mut spare));
+            let width = LANES.min(self.conv.n - first);
+            for p in 0..P {
+                let y = self.y.get_mut(at[p][1] + first..).unwrap_or(&mut []);
+                self.conv.finish(simd, simd.add(sums[p], bias), y, width);
+            }
+        }
+        B
+    }
+}
+
+impl Conv<'_> {
+    /// Accumulation, activation and store of the first `width` of sixteen outputs.
+    #[inline(always)]
+    fn finish<S: Simd>(&self, simd: S, mut v: S::V, y: &mut [f32], width: usize) {
+        if width == LANES
+            && let Some(y) = y.first_chunk_mut()
+        {
+            if self.accumulate {
+                v = simd.add(v, simd.load(y));
+            }
+            simd.store(self.activation.apply(simd, v), y);
+            return;
+        }
+        let mut spare = [0.0; LANES];
+        let y = y.get_mut(..width).unwrap_or(&mut []);
+        if self.accumulate {
+            assign(&mut spare, y);
+            v = simd.add(v, simd.load(&spare));
+        }
+        simd.store(self.activation.apply(simd, v), &mut spare);
+        assign(y, &spare);
+    }
+}
+
+/// The sums of `P` pixels with `B` panels of `k` weights each, from panel `first` on. Runs that are not there add nothing.
+#[inline(always)]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "arrays whose length is a constant, as is every index"
+)]
+#[expect(
+    unsafe_code,
+    reason = "the sums stay in registers only without a branch in the loop, and compilers keep some of the bounds checks"
+)]
+fn sums<S: Simd, const P: usize, const B: usize>(
+    simd: S,
+    runs: &Runs,
+    (w, k, first): (&[f32], usize, usize),
+    x: &[f32],
+    at: &[[usize; 2]; P],
+) -> [[S::V; P]; B] {
+    let mut sums = [[simd.splat(0.0); P]; B];
+    let (w, _) = w.as_chunks::<LANES>();
+    let mut l = first * k;
+    for ky in 0..runs.times[0] {
+        for kx in 0..runs.times[1] {
+            let offset = ky * runs.apart[0] + kx * runs.apart[1];
+            let x = at.map(|[at, _]| x.get(at + offset..at + offset + runs.len).unwrap_or(&[]));
+            let w: [&[Block]; B] = core::array::from_fn(|b| {
+                let l = l + b * k;
+                w.get(l..l + runs.len).unwrap_or(&[])
+            });
+            l += runs.len;
+            if x.iter().any(|x| x.len() != runs.len) || w.iter().any(|w| w.len() != runs.len) {
+                continue;
+            }
+            for i in 0..runs.len {
+                // SAFETY: each `w[b]` is as long as the run, as compared above.
+                let w = w.map(|w| simd.load(unsafe { w.get_unchecked(i) }));
+                for p in 0..P {
+                    // SAFETY: each `x[p]` is as long as the run, as compared above.
+                    let x = simd.splat(unsafe { *x[p].get_unchecked(i) });
+                    for b in 0..B {
+                        sums[b][p] = simd.add_product(sums[b][p], x, w[b]);
+                    }
+                }
+            }
+        }
+    }
+    sums
+}

@@ -1,0 +1,159 @@
+//! Depthwise convolutions over images `[rows, columns, channels]`: each channel by itself, `y = activation(x * w + b)`.
+//!
+//! ```text
+//! for each output pixel, for each sixteen channels:
+//!     for ky, kx:  sum[0..16] += x[pixel * stride + (ky, kx) * dilation][0..16] * w[ky][kx][0..16]
+//!     y[pixel][0..16] = activation(sum + bias)
+//! ```
+//!
+//! As in [`Conv`](crate::Conv) there is no padding: `x` is a view that has its border. Channels are the lanes; a few pixels at a time
+//! share the weights that are read. Each output is one sum in the order of the kernel.
+
+use crate::conv::Sweep;
+use crate::dispatch::{Isa, Kernel};
+use crate::elementwise::assign;
+use crate::lanes::{Block, LANES};
+use crate::linear::{Activation, block};
+use crate::simd::Simd;
+
+/// Elements of the packed weights of so many kernel elements and channels.
+pub const fn depthwise_packed_len([kernel, c]: [usize; 2]) -> usize {
+    c.next_multiple_of(LANES) * kernel
+}
+
+/// Packs `w`, `[kernel, c]` row-major, into `[kernel][c]` with `c` rounded up to sixteen with zeros. Offline work.
+///
+/// # Panics
+/// When `w` is not `kernel * c` or `out` not [`depthwise_packed_len`] elements long.
+pub fn depthwise_pack(w: &[f32], [kernel, c]: [usize; 2], out: &mut [f32]) {
+    assert_eq!(w.len(), kernel * c, "w is [kernel, c]");
+    assert_eq!(
+        out.len(),
+        depthwise_packed_len([kernel, c]),
+        "out is depthwise_packed_len"
+    );
+    out.fill(0.0);
+    let rows = out.chunks_exact_mut(c.next_multiple_of(LANES).max(1));
+    for (to, w) in rows.zip(w.chunks_exact(c.max(1))) {
+        assign(to, w);
+    }
+}
+
+/// A convolution of each of `c` channels with a kernel of its own.
+#[derive(Debug, Clone, Copy)]
+pub struct Depthwise<'w> {
+    /// Where it reads and writes.
+    pub sweep: Sweep,
+    /// Channels.
+    pub c: usize,
+    /// [`depthwise_packed_len`] elements, ordered by [`depthwise_pack`].
+    pub w: &'w [f32],
+    /// `[c]`
+    pub bias: &'w [f32],
+    /// Applied at the end.
+    pub activation: Activation,
+}
+
+impl Depthwise<'_> {
+    /// Computes `y` from `x`, both from the first pixel on. A view that is too short, or weights that are, leave `y` as it was.
+    pub fn run(&self, isa: Isa, x: &[f32], y: &mut [f32]) {
+        let [rows, cols] = self.sweep.kernel;
+        let there = (self.sweep.reach(self.c)).is_some_and(|reach| reach <= x.len());
+        if there && self.c > 0 && self.w.len() == depthwise_packed_len([rows * cols, self.c]) {
+            isa.run(Channels { layer: self, x, y });
+        }
+    }
+}
+
+/// A depthwise convolution at work; `x` is long enough, and so are the weights.
+struct Channels<'a> {
+    layer: &'a Depthwise<'a>,
+    x: &'a [f32],
+    y: &'a mut [f32],
+}
+
+impl Kernel for Channels<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(mut self, simd: S) {
+        let pixels = self.layer.sweep.out[0] * self.layer.sweep.out[1];
+        let mut first = 0;
+        while first < pixels {
+            first += match pixels - first {
+                4.. if S::PIXELS >= 6 => self.tile::<S, 4>(simd, first),
+                2.. => self.tile::<S, 2>(simd, first),
+                _ => self.tile::<S, 1>(simd, first),
+            };
+        }
+    }
+}
+
+impl Channels<'_> {
+    /// All channels of `P` pixels from `first` on; returns `P`.
+    #[inline(always)]
+    #[expect(
+        clippy::indexing_slicing,
+        reason = "arrays whose length is a constant, as is every index"
+    )]
+    fn tile<S: Simd, const P: usize>(&mut self, simd: S, first: usize) -> usize {
+        let layer = self.layer;
+        let at = layer.sweep.pixels::<P>(first);
+        let mut spare = [0.0; LANES];
+        for channel in (0..layer.c).step_by(LANES) {
+            let sums = sums::<S, P>(simd, layer, self.x, &at, channel);
+            let bias = simd.load(block(layer.bias, channel, &mut spare));
+            let width = LANES.min(layer.c - channel);
+            for p in 0..P {
+                let v = layer.activation.apply(simd, simd.add(sums[p], bias));
+                let y = self.y.get_mut(at[p][1] + channel..).unwrap_or(&mut []);
+                if width == LANES
+                    && let Some(y) = y.first_chunk_mut()
+                {
+                    simd.store(v, y);
+                } else {
+                    simd.store(v, &mut spare);
+                    assign(y.get_mut(..width).unwrap_or(&mut []), &spare);
+                }
+            }
+        }
+        P
+    }
+}
+
+/// The sums of sixteen channels of `P` pixels. Behind the last pixel's channels zeros are read; behind another's, the next pixel, and
+/// nobody looks at the result.
+#[inline(always)]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "arrays whose length is a constant, as is every index"
+)]
+fn sums<S: Simd, const P: usize>(
+    simd: S,
+    layer: &Depthwise,
+    x: &[f32],
+    at: &[[usize; 2]; P],
+    channel: usize,
+) -> [S::V; P] {
+    let Sweep {
+        kernel: [rows, cols],
+        dilation,
+        x_strides,
+        ..
+    } = layer.sweep;
+    let mut sums = [simd.splat(0.0); P];
+    let wide = layer.c.next_multiple_of(LANES);
+    let mut spare: Block = [0.0; LANES];
+    let mut l = channel;
+    for ky in 0..rows {
+        let row = channel + ky * dilation[0] * x_strides[0];
+        for kx in 0..cols {
+            let offset = row + kx * dilation[1] * x_strides[1];
+            let w = simd.load(block(layer.w, l, &mut spare));
+            for p in 0..P {
+                let x = simd.load(block(x, at[p][0] + offset, &mut spare));
+                sums[p] = simd.add_product(sums[p], x, w);
+            }
+            l += wide;
+        }
+    }
+    sums
+}

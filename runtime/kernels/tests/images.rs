@@ -1,0 +1,272 @@
+//! Kernels of images against their naive twins, on random shapes, strides and values, and bit for bit on every instruction set.
+
+mod support;
+
+use lads_kernels::reference as naive;
+use lads_kernels::{
+    Activation, Conv, Depthwise, Isa, Pool, PoolKind, Resize, Sweep, conv_pack, conv_packed_len,
+    depthwise_pack, depthwise_packed_len,
+};
+use proptest::prelude::*;
+use proptest::sample::select;
+use support::{close_up_to, digest, on_all, values};
+
+fn activation() -> impl Strategy<Value = Activation> {
+    let all = [
+        Activation::None,
+        Activation::Relu,
+        Activation::LeakyRelu(0.1),
+        Activation::Clipped(0.5),
+        Activation::Tanh,
+    ];
+    select(all.to_vec())
+}
+
+/// Sizes of rows, then columns.
+fn pair(range: std::ops::Range<usize>) -> impl Strategy<Value = [usize; 2]> {
+    [range.clone(), range]
+}
+
+/// A sweep over pixels of `c` channels to pixels of `n`, with gaps between pixels and between rows, and the lengths of both sides.
+fn sweep(
+    [c, n]: [usize; 2],
+    [out, kernel, stride, dilation]: [[usize; 2]; 4],
+    gaps: [usize; 2],
+) -> (Sweep, [usize; 2]) {
+    let covered =
+        |axis: usize| (out[axis] - 1) * stride[axis] + (kernel[axis] - 1) * dilation[axis] + 1;
+    let x_strides = [(c + gaps[0]) * covered(1) + gaps[1], c + gaps[0]];
+    let y_strides = [(n + gaps[1]) * out[1] + gaps[0], n + gaps[1]];
+    let sweep = Sweep {
+        out,
+        kernel,
+        stride,
+        dilation,
+        x_strides,
+        y_strides,
+    };
+    let len = |rows: usize, cols: usize, strides: [usize; 2], c: usize| {
+        (rows - 1) * strides[0] + (cols - 1) * strides[1] + c
+    };
+    let lens = [
+        len(covered(0), covered(1), x_strides, c),
+        len(out[0], out[1], y_strides, n),
+    ];
+    (sweep, lens)
+}
+
+/// Whether everything but the written elements is as it was.
+fn untouched(sweep: &Sweep, n: usize, before: &[f32], after: &[f32]) -> bool {
+    let [row, pixel] = sweep.y_strides;
+    before
+        .iter()
+        .zip(after)
+        .enumerate()
+        .all(|(i, (before, after))| {
+            let (line, inside) = (i / row, i % row);
+            let written =
+                line < sweep.out[0] && inside / pixel < sweep.out[1] && inside % pixel < n;
+            written || before.to_bits() == after.to_bits()
+        })
+}
+
+proptest! {
+    #[test]
+    fn conv_equals_its_twin(
+        (c, n) in (prop_oneof![1_usize..6, 14_usize..40], prop_oneof![1_usize..5, 14_usize..80]),
+        shape in [pair(1..6), pair(1..5), pair(1..4), pair(1..3)],
+        gaps in pair(0..4),
+        (activation, accumulate) in (activation(), any::<bool>()),
+        seed in any::<u64>(),
+    ) {
+        let (sweep, [x_len, y_len]) = sweep([c, n], shape, gaps);
+        let k = sweep.kernel[0] * sweep.kernel[1] * c;
+        let (x, w, bias) = (values(x_len, seed), values(k * n, seed ^ 1), values(n, seed ^ 2));
+        let mut packed = vec![0.0; conv_packed_len([k, n])];
+        conv_pack(&w, [k, n], &mut packed);
+        let conv = Conv { sweep, c, n, w: &packed, bias: &bias, activation, accumulate };
+        let before = values(y_len, seed ^ 3);
+        let [y] = on_all(|isa| {
+            let mut y = before.clone();
+            conv.run(isa, &x, &mut y);
+            [y]
+        });
+        let mut expected = before.clone();
+        naive::conv(&sweep, (&w, &bias), (activation, accumulate), &x, &mut expected);
+        // Units of the sums, which grow with the root of their length.
+        close_up_to(&y, &expected, 2e-6, &vec![1e-7 * (k as f32).sqrt() * 4.0; y_len]);
+        prop_assert!(untouched(&sweep, n, &before, &y));
+    }
+
+    #[test]
+    fn depthwise_equals_its_twin(
+        c in prop_oneof![1_usize..6, 14_usize..70],
+        shape in [pair(1..7), pair(1..6), pair(1..4), pair(1..3)],
+        gaps in pair(0..4),
+        activation in activation(),
+        seed in any::<u64>(),
+    ) {
+        let (sweep, [x_len, y_len]) = sweep([c, c], shape, gaps);
+        let kernel = sweep.kernel[0] * sweep.kernel[1];
+        let (x, w, bias) = (values(x_len, seed), values(kernel * c, seed ^ 1), values(c, seed ^ 2));
+        let mut packed = vec![0.0; depthwise_packed_len([kernel, c])];
+        depthwise_pack(&w, [kernel, c], &mut packed);
+        let layer = Depthwise { sweep, c, w: &packed, bias: &bias, activation };
+        let before = values(y_len, seed ^ 3);
+        let [y] = on_all(|isa| {
+            let mut y = before.clone();
+            layer.run(isa, &x, &mut y);
+            [y]
+        });
+        let mut expected = before.clone();
+        naive::depthwise(&sweep, (&w, &bias), activation, &x, &mut expected);
+        close_up_to(&y, &expected, 4e-6, &vec![0.0; y_len]);
+        prop_assert!(untouched(&sweep, c, &before, &y));
+    }
+
+    #[test]
+    fn pool_equals_its_twin(
+        kind in select(vec![PoolKind::Max, PoolKind::Mean, PoolKind::PaddedMean]),
+        (c, size) in (1_usize..20, pair(1..9)),
+        [kernel, stride, dilation] in [pair(1..5), pair(1..4), pair(1..3)],
+        [before, after] in [pair(0..3), pair(0..3)],
+        (ceil, gap, seed) in (any::<bool>(), 0_usize..3, any::<u64>()),
+    ) {
+        // As many windows as ONNX says, at least one.
+        let out = [0, 1].map(|axis| {
+            let whole = before[axis] + size[axis] + after[axis];
+            let rest = whole.saturating_sub((kernel[axis] - 1) * dilation[axis] + 1);
+            1 + if ceil { rest.div_ceil(stride[axis]) } else { rest / stride[axis] }
+        });
+        let strides = |cols: usize| [(c + gap) * cols, c + gap];
+        let pool = Pool {
+            kind, size, out, c, kernel, stride, dilation, before, after,
+            x_strides: strides(size[1]),
+            y_strides: strides(out[1]),
+        };
+        let x = values(size[0] * size[1] * (c + gap), seed);
+        let [y] = on_all(|isa| {
+            let mut y = vec![7.0; out[0] * out[1] * (c + gap)];
+            pool.run(isa, &x, &mut y);
+            [y]
+        });
+        let mut expected = vec![7.0; y.len()];
+        naive::pool(&pool, &x, &mut expected);
+        close_up_to(&y, &expected, 1e-6, &vec![0.0; y.len()]);
+    }
+
+    #[test]
+    fn resize_equals_its_twin(
+        (c, size, out) in (1_usize..20, pair(1..9), pair(1..9)),
+        seed in any::<u64>(),
+    ) {
+        let table = |axis: usize| -> Vec<f32> {
+            let random = values(3 * out[axis], seed ^ axis as u64);
+            let index = |x: f32| ((x + 1.0) / 2.0 * size[axis] as f32).floor();
+            random.chunks(3).flat_map(|r| [index(r[0]), index(r[1]), (r[2] + 1.0) / 2.0]).collect()
+        };
+        let (rows, cols) = (table(0), table(1));
+        let resize = Resize {
+            size, c, rows: &rows, cols: &cols,
+            x_strides: [c * size[1], c],
+            y_strides: [c * out[1], c],
+        };
+        let x = values(size[0] * size[1] * c, seed);
+        let [y] = on_all(|isa| {
+            let mut y = vec![0.0; out[0] * out[1] * c];
+            resize.run(isa, &x, &mut y);
+            [y]
+        });
+        let mut expected = vec![0.0; y.len()];
+        naive::resize(&resize, &x, &mut expected);
+        close_up_to(&y, &expected, 1e-6, &vec![0.0; y.len()]);
+    }
+}
+
+#[test]
+fn what_is_too_short_is_left_as_it_was() {
+    let (sweep, [x_len, y_len]) = sweep([2, 3], [[2, 2], [2, 2], [1, 1], [1, 1]], [0, 0]);
+    let (packed, bias) = (vec![1.0; conv_packed_len([8, 3])], [0.0; 3]);
+    let conv = Conv {
+        sweep,
+        c: 2,
+        n: 3,
+        w: &packed,
+        bias: &bias,
+        activation: Activation::None,
+        accumulate: false,
+    };
+    let layer = Depthwise {
+        sweep,
+        c: 2,
+        w: &packed[..depthwise_packed_len([4, 2])],
+        bias: &bias[..2],
+        activation: Activation::None,
+    };
+    for isa in Isa::all() {
+        let mut y = vec![5.0; y_len];
+        conv.run(isa, &vec![1.0; x_len - 1], &mut y);
+        Conv {
+            w: &packed[1..],
+            ..conv
+        }
+        .run(isa, &vec![1.0; x_len], &mut y);
+        layer.run(isa, &vec![1.0; x_len - 1], &mut y);
+        assert!(y.iter().all(|&y| y == 5.0));
+        // Whole pixels that there are are written.
+        conv.run(isa, &vec![1.0; x_len], &mut y[..4]);
+        assert_eq!(y[..5], [8.0, 8.0, 8.0, 5.0, 5.0]);
+    }
+}
+
+#[test]
+fn not_a_number_is_not_lost() {
+    let pool = Pool {
+        kind: PoolKind::Max,
+        size: [1, 3],
+        out: [1, 1],
+        c: 1,
+        kernel: [1, 3],
+        stride: [1, 1],
+        dilation: [1, 1],
+        before: [0, 0],
+        after: [0, 0],
+        x_strides: [3, 1],
+        y_strides: [1, 1],
+    };
+    for i in 0..3 {
+        let mut x = [1.0, 2.0, 3.0];
+        x[i] = f32::NAN;
+        let [y] = on_all(|isa| {
+            let mut y = vec![0.0];
+            pool.run(isa, &x, &mut y);
+            [y]
+        });
+        assert!(y[0].is_nan());
+    }
+}
+
+/// Bits that must never change, on any target or at any optimisation level.
+#[test]
+fn results_have_the_same_bits_everywhere() {
+    let (sweep, [x_len, y_len]) = sweep([19, 37], [[5, 7], [3, 3], [2, 1], [1, 1]], [0, 0]);
+    let k = 9 * 19;
+    let mut packed = vec![0.0; conv_packed_len([k, 37])];
+    conv_pack(&values(k * 37, 1), [k, 37], &mut packed);
+    let bias = values(37, 2);
+    let conv = Conv {
+        sweep,
+        c: 19,
+        n: 37,
+        w: &packed,
+        bias: &bias,
+        activation: Activation::Clipped(6.0),
+        accumulate: false,
+    };
+    let [y] = on_all(|isa| {
+        let mut y = vec![0.0; y_len];
+        conv.run(isa, &values(x_len, 3), &mut y);
+        [y]
+    });
+    assert_eq!(digest(&y), 13_669_488_750_079_871_009);
+}
