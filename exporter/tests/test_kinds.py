@@ -13,8 +13,8 @@ from lads_exporter.kinds import common
 
 STEPS, SEED = 28, 2  # several plans of every kind
 OPERATORS = {
-    "Add", "ArgMin", "Cast", "Clip", "Concat", "Div", "Exp", "GRU", "Gather", "Gemm", "Identity", "LSTM", "LayerNormalization", "LeakyRelu", "MatMul",
-    "Min", "Mul", "ReduceSum", "Relu", "Reshape", "Slice", "Softmax", "Split", "Squeeze", "Sub", "Tanh", "Transpose", "Unsqueeze",
+    "Add", "ArgMin", "AveragePool", "BatchNormalization", "Cast", "Clip", "Concat", "Conv", "Div", "Exp", "Flatten", "GRU", "Gather", "Gemm", "Identity",
+    "LSTM", "LayerNormalization", "LeakyRelu", "MatMul", "MaxPool", "Min", "Mul", "ReduceSum", "Relu", "Reshape", "Slice", "Softmax", "Split", "Squeeze", "Sub", "Tanh", "Transpose", "Unsqueeze",
 }  # fmt: skip
 
 

@@ -13,7 +13,7 @@ use safetensors::{SafeTensors, tensor::TensorView};
 pub const FOLDER: &str = "LADS_FAMILIES";
 
 /// The kinds of random policies.
-pub const KINDS: [&str; 11] = [
+pub const KINDS: [&str; 12] = [
     "lads",
     "lang_dt",
     "lisa",
@@ -25,6 +25,7 @@ pub const KINDS: [&str; 11] = [
     "recurrent",
     "stacked",
     "camera",
+    "images",
 ];
 
 /// Where the bundles and episodes lie.

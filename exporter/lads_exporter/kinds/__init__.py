@@ -10,7 +10,7 @@ import torch
 
 from .. import bundle, random_policy
 from ..config import UserError
-from . import common, diffusion, history, lads, lang_dt, lisa, plain, vae
+from . import common, diffusion, history, images, lads, lang_dt, lisa, plain, vae
 from .common import Sizes
 
 
@@ -26,6 +26,11 @@ def _of(network, build, contract, sizes=Sizes()):
     return Kind(lambda sizes, seed: common.randomize(network(sizes), seed), build, contract, sizes)
 
 
+def _images(name, cameras, hidden, sizes=Sizes(steps=12)):
+    contract = lambda sizes, seed: images.contract(cameras, seed, name)
+    return Kind(lambda sizes, seed: images.randomize(images.Images(cameras, hidden), seed), images.build, contract, sizes)
+
+
 KINDS = {
     "lads": Kind(lads.policy, lads.build, lads.contract),
     "lang_dt": _of(lang_dt.LangDt, lang_dt.build, lang_dt.contract),
@@ -38,14 +43,18 @@ KINDS = {
     "recurrent": _of(plain.Recurrent, plain.build_recurrent, plain.contract_recurrent),
     "stacked": _of(plain.Stacked, plain.build_stacked, plain.contract_stacked),
     "camera": _of(plain.Camera, plain.build_camera, plain.contract_camera),
+    "images": _images("images", images.SMALL, (32,)),
 }
+# Of the sizes that encoders have in the field.
+LARGE = {name: _images(name, *parts, Sizes(steps=4)) for name, parts in images.SIZES.items()}
 
 
 def export(name, seed=0):
     """-> the networks in PyTorch, the complete bundle."""
-    if name not in KINDS:
-        raise UserError(f"--kind {name}: unknown; known: {', '.join(KINDS)}")
-    kind = KINDS[name]
+    known = KINDS | LARGE
+    if name not in known:
+        raise UserError(f"--kind {name}: unknown; known: {', '.join(known)}")
+    kind = known[name]
     torch.manual_seed(seed)  # of what PyTorch starts weights with that are not drawn anew
     policy = kind.policy(kind.sizes, seed)
     found = kind.contract(kind.sizes, seed)

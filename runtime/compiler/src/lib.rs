@@ -12,10 +12,10 @@
 //! operator, the node and the entry:
 //!
 //! ```text
-//! Abs Add ArgMax ArgMin BatchNormalization Cast Clip Concat Constant ConstantOfShape Div Dropout Erf Exp Expand Flatten Gather
-//! GRU Gelu Gemm Identity LSTM LayerNormalization LeakyRelu Log LogSoftmax MatMul Max Min Mul Neg Pow Reciprocal ReduceL1 ReduceL2
-//! ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare Relu Reshape Shape Sigmoid Slice Softmax Split Sqrt
-//! Squeeze Sub Sum Tanh Transpose Unsqueeze
+//! Abs Add ArgMax ArgMin AveragePool BatchNormalization Cast Clip Concat Constant ConstantOfShape Conv Div Dropout Erf Exp Expand
+//! Flatten Gather Gelu Gemm GlobalAveragePool GlobalMaxPool GRU Identity LayerNormalization LeakyRelu Log LogSoftmax LSTM MatMul
+//! Max MaxPool Min Mul Neg Pow Reciprocal ReduceL1 ReduceL2 ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare
+//! Relu Reshape Resize Shape Sigmoid Slice Softmax Split Sqrt Squeeze Sub Sum Tanh Transpose Unsqueeze
 //! ```
 #![forbid(unsafe_code)]
 

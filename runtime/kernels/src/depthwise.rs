@@ -126,6 +126,10 @@ impl Channels<'_> {
     clippy::indexing_slicing,
     reason = "arrays whose length is a constant, as is every index"
 )]
+#[expect(
+    unsafe_code,
+    reason = "a load for each product: a branch for each of them would take longer than the products"
+)]
 fn sums<S: Simd, const P: usize>(
     simd: S,
     layer: &Depthwise,
@@ -141,19 +145,46 @@ fn sums<S: Simd, const P: usize>(
     } = layer.sweep;
     let mut sums = [simd.splat(0.0); P];
     let wide = layer.c.next_multiple_of(LANES);
+    let [down, along] = [dilation[0] * x_strides[0], dilation[1] * x_strides[1]];
+    let last = channel + rows.saturating_sub(1) * down + cols.saturating_sub(1) * along;
+    let mut places = at.iter().map(|&[at, _]| at);
+    // `run` found the weights of every channel.
+    let whole =
+        places.all(|at| at + last + LANES <= x.len()) && rows * cols * wide <= layer.w.len();
     let mut spare: Block = [0.0; LANES];
-    let mut l = channel;
     for ky in 0..rows {
-        let row = channel + ky * dilation[0] * x_strides[0];
         for kx in 0..cols {
-            let offset = row + kx * dilation[1] * x_strides[1];
-            let w = simd.load(block(layer.w, l, &mut spare));
-            for p in 0..P {
-                let x = simd.load(block(x, at[p][0] + offset, &mut spare));
-                sums[p] = simd.add_product(sums[p], x, w);
+            let offset = channel + ky * down + kx * along;
+            let l = (ky * cols + kx) * wide + channel;
+            if whole {
+                // SAFETY: `l` is at most sixteen from the end of `rows * cols * wide` weights, as `channel` is a multiple of sixteen below
+                // `wide`; each place is at most that of the last kernel element, behind which sixteen inputs lie, as compared above.
+                unsafe {
+                    let w = simd.load(sixteen(layer.w, l));
+                    for p in 0..P {
+                        sums[p] =
+                            simd.add_product(sums[p], simd.load(sixteen(x, at[p][0] + offset)), w);
+                    }
+                }
+            } else {
+                let w = simd.load(block(layer.w, l, &mut spare));
+                for p in 0..P {
+                    let x = simd.load(block(x, at[p][0] + offset, &mut spare));
+                    sums[p] = simd.add_product(sums[p], x, w);
+                }
             }
-            l += wide;
         }
     }
     sums
+}
+
+/// The sixteen elements from `first` on.
+///
+/// # Safety
+/// They are there.
+#[inline(always)]
+#[expect(unsafe_code, reason = "see where it is called")]
+unsafe fn sixteen(x: &[f32], first: usize) -> &Block {
+    // SAFETY: the caller's promise.
+    unsafe { &*x.as_ptr().add(first).cast() }
 }

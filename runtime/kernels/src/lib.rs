@@ -1,7 +1,7 @@
 //! Dense kernels for batch-1 policies: slices and shapes, nothing of ONNX or LADS.
 //!
 //! Invariants:
-//! - No allocation, no `std`, no panic, and no unsafe code but in `dispatch`, `simd`, `subnormal` and the loops over weights and cache: a slice
+//! - No allocation, no `std`, no panic, and no unsafe code but in `dispatch`, `simd`, `subnormal` and the loops over weights, cache and images: a slice
 //!   that is too short leaves the rest of the result as it was.
 //!   Callers that want to be told check shapes beforehand; `lads-image` does so once per program.
 //! - The same bits on every target with IEEE 754 arithmetic, but for subnormal numbers under [`flushed`]: every sum has one fixed order (sixteen lanes, then a tree; outputs of layers and images in the order of their inputs), no

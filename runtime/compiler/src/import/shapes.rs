@@ -357,15 +357,11 @@ fn gather(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> {
     let rows = rows
         .filter(|rows| !rows.is_empty())
         .ok_or_else(|| format!("has indices outside 0..{len}"))?;
-    let consecutive = rows.windows(2).all(|pair| pair[0] + 1 == pair[1]);
-    let picked = if consecutive {
-        g.slice(value, along, rows[0], rows.len())?
-    } else {
-        let parts = rows
-            .iter()
-            .map(|&row| g.slice(value, along, row, 1))
-            .collect::<Result<Vec<_>, _>>()?;
-        g.concat(&parts, along)?
-    };
+    // Rows that follow one another are one slice.
+    let runs = rows.chunk_by(|row, next| row + 1 == *next);
+    let parts = runs
+        .map(|run| g.slice(value, along, run[0], run.len()))
+        .collect::<Result<Vec<_>, _>>()?;
+    let picked = g.concat(&parts, along)?;
     g.reshape(picked, &shape)
 }

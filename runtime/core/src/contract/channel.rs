@@ -355,6 +355,13 @@ impl<'a> Channel<'a> {
         self.bounds().iter()
     }
 
+    /// Whether no byte is outside its limits.
+    #[inline]
+    pub(crate) fn takes_every_byte(&self) -> bool {
+        let bounds = self.bounds();
+        bounds.own.is_empty() && bounds.alike.min <= 0.0 && bounds.alike.max >= 255.0
+    }
+
     pub(super) fn bounds(&self) -> Bounds<'a> {
         Bounds {
             own: self.tables.elements(&self.record),
