@@ -91,6 +91,49 @@ def gru(linear_before_reset):
     return types.SimpleNamespace(name=name, model=model, data_sets=[(list(inputs.values()), outputs)])
 
 
+def drawn(number):
+    """A convolution, pool or change of size of random shape, whose expected output is ONNX Runtime's."""
+    ort = pytest.importorskip("onnxruntime")
+    random = np.random.default_rng(number)
+    whole = lambda low, high, count=None: random.integers(low, high + 1, count).tolist()
+    operator = ("Conv", "Conv", "MaxPool", "AveragePool", "Resize")[number % 5]
+    rank = whole(1, 2)
+    sides = whole(5, 12, rank)
+    kernel, strides, dilations = whole(1, 4, rank), whole(1, 3, rank), whole(1, 2, rank)
+    pads = [whole(0, size - 1) for size in kernel * 2]
+    groups = whole(1, 3)
+    channels = groups * whole(1, 9)
+    inputs = {"X": random.normal(size=[whole(1, 2), channels, *sides]).astype(np.float32)}
+    constants, attributes = {}, {"kernel_shape": kernel, "strides": strides, "pads": pads, "dilations": dilations}
+    if operator == "Conv":
+        # As many groups as channels in every third case.
+        groups = channels if number % 3 == 0 else groups
+        outputs = groups * whole(1, 2 if groups == channels else 20)
+        constants["W"] = random.normal(size=[outputs, channels // groups, *kernel]).astype(np.float32)
+        constants |= {"B": random.normal(size=[outputs]).astype(np.float32)} if number % 2 else {}
+        attributes["group"] = groups
+    elif operator == "Resize":
+        mode = ("nearest", "linear")[whole(0, 1)]
+        constants |= {"roi": np.zeros(0, np.float32), "scales": np.zeros(0, np.float32)}
+        constants["sizes"] = np.array([*inputs["X"].shape[:2], *whole(1, 20, rank)], np.int64)
+        ways = ("half_pixel", "asymmetric", "align_corners", "pytorch_half_pixel")
+        attributes = {"mode": mode, "coordinate_transformation_mode": ways[whole(0, 3)], "nearest_mode": ("floor", "ceil")[whole(0, 1)]}
+    elif operator == "AveragePool":
+        attributes |= {"count_include_pad": whole(0, 1), "ceil_mode": 0}
+    else:
+        attributes["ceil_mode"] = whole(0, 1)
+    node = helper.make_node(operator, ["X", *constants], ["Y"], **attributes)
+    tensors = [numpy_helper.from_array(value, name) for name, value in constants.items()]
+    declared = helper.make_tensor_value_info("X", TensorProto.FLOAT, inputs["X"].shape)
+    graph = helper.make_graph([node], operator, [declared], [helper.make_tensor_value_info("Y", TensorProto.FLOAT, None)], tensors)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 19)], ir_version=9)
+    try:
+        outputs = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"]).run(None, inputs)
+    except Exception:  # the window is larger than the image, or ONNX Runtime has no kernel for it
+        return None
+    return types.SimpleNamespace(name=f"drawn_{operator.lower()}_{number}", model=model, data_sets=[(list(inputs.values()), outputs)])
+
+
 def test_node_cases(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -102,6 +145,9 @@ def test_node_cases(tmp_path):
     for case in map(gru, (0, 1)):
         assert write(case, tmp_path)
         written += 1
+    images = [case for case in map(drawn, range(400)) if case]
+    assert len(images) > 300
+    written += sum(write(case, tmp_path) for case in images)
     command = ["cargo", "test", *SELECTION, "--lib", "onnx_node_cases", "--", "--nocapture"]
     done = subprocess.run(command, cwd=ROOT, env=os.environ | {"LADS_ONNX_NODES": str(tmp_path)}, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
