@@ -103,14 +103,16 @@ def drawn(number):
     pads = [whole(0, size - 1) for size in kernel * 2]
     groups = whole(1, 3)
     channels = groups * whole(1, 9)
-    inputs = {"X": random.normal(size=[whole(1, 2), channels, *sides]).astype(np.float32)}
+    # Eighths: sums of their products are exact, so that no order of them can differ near zero.
+    eighths = lambda low, shape: (random.integers(low, 9, shape) / 8).astype(np.float32)
+    inputs = {"X": eighths(-8 if operator == "Conv" else 1, [whole(1, 2), channels, *sides])}
     constants, attributes = {}, {"kernel_shape": kernel, "strides": strides, "pads": pads, "dilations": dilations}
     if operator == "Conv":
         # As many groups as channels in every third case.
         groups = channels if number % 3 == 0 else groups
         outputs = groups * whole(1, 2 if groups == channels else 20)
-        constants["W"] = random.normal(size=[outputs, channels // groups, *kernel]).astype(np.float32)
-        constants |= {"B": random.normal(size=[outputs]).astype(np.float32)} if number % 2 else {}
+        constants["W"] = eighths(-8, [outputs, channels // groups, *kernel])
+        constants |= {"B": eighths(-8, [outputs])} if number % 2 else {}
         attributes["group"] = groups
     elif operator == "Resize":
         mode = ("nearest", "linear")[whole(0, 1)]
@@ -154,4 +156,4 @@ def test_node_cases(tmp_path):
     agreed, refused = map(int, re.search(r"(\d+) cases agree, (\d+) are refused", done.stdout).groups())
     print(re.search(r".* cases agree.*", done.stdout).group())
     assert agreed + refused == written
-    assert agreed > 200
+    assert agreed > 700

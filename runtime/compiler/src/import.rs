@@ -8,6 +8,7 @@ mod attributes;
 mod images;
 mod operators;
 mod recurrent;
+mod resize;
 mod shapes;
 mod trial;
 

@@ -14,8 +14,8 @@
 //! ```text
 //! Abs Add ArgMax ArgMin AveragePool BatchNormalization Cast Clip Concat Constant ConstantOfShape Conv Div Dropout Erf Exp Expand
 //! Flatten Gather Gelu Gemm GlobalAveragePool GlobalMaxPool GRU Identity LayerNormalization LeakyRelu Log LogSoftmax LSTM MatMul
-//! Max MaxPool Min Mul Neg Pow Reciprocal ReduceL1 ReduceL2 ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare
-//! Relu Reshape Resize Shape Sigmoid Slice Softmax Split Sqrt Squeeze Sub Sum Tanh Transpose Unsqueeze
+//! Max MaxPool Min Mul Neg Pad Pow Reciprocal ReduceL1 ReduceL2 ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum
+//! ReduceSumSquare Relu Reshape Resize Shape Sigmoid Slice Softmax Split Sqrt Squeeze Sub Sum Tanh Transpose Unsqueeze
 //! ```
 #![forbid(unsafe_code)]
 

@@ -15,11 +15,13 @@
 //! 2. Pixels that follow one another in memory make a kernel row one run of `columns * c` inputs.
 //! 3. Panels that fit the first-level cache together are gone through for each tile, so that `x` is read once for all of them.
 
+use core::hint::black_box;
+
 use crate::dispatch::{Isa, Kernel};
 use crate::elementwise::assign;
 use crate::lanes::{Block, LANES};
 use crate::linear::{Activation, block};
-use crate::simd::Simd;
+use crate::simd::{Simd, prefetch_ahead};
 
 /// Words of weights that are gone through for one tile of pixels before the next: a third of a first-level cache.
 const NEAR: usize = 4096;
@@ -187,6 +189,12 @@ impl Runs {
     }
 }
 
+/// The most pixels and panels of a tile.
+const MOST: [usize; 2] = [2, 6];
+
+/// Sums of a tile: panels, then pixels.
+type Sums = [[Block; MOST[1]]; MOST[0]];
+
 impl Kernel for Pixels<'_> {
     #[inline(always)]
     fn run<S: Simd>(mut self, simd: S) {
@@ -194,23 +202,25 @@ impl Kernel for Pixels<'_> {
         let runs = Runs::of(conv);
         let pixels = conv.sweep.out[0] * conv.sweep.out[1];
         let panels = conv.n.div_ceil(LANES);
-        let near = (NEAR / (self.k * LANES)).clamp(1, panels);
-        // Pairs of panels where there are registers for them.
-        let near = near.next_multiple_of(S::PANELS);
+        let near = (NEAR / (self.k * LANES).max(1)).min(panels);
+        let near = near.next_multiple_of(S::PANELS).max(S::PANELS);
+        let mut sums = [[[0.0; LANES]; MOST[1]]; MOST[0]];
         for first_panel in (0..panels).step_by(near) {
             let end = panels.min(first_panel + near);
             let mut first = 0;
             while first < pixels {
                 let tiles = (pixels - first).div_ceil(S::PIXELS);
-                let size = (pixels - first).div_ceil(tiles);
-                let place = (first, first_panel..end);
-                match size {
-                    6 if S::PIXELS >= 6 => self.tile::<S, 6>(simd, &runs, place),
-                    5 if S::PIXELS >= 6 => self.tile::<S, 5>(simd, &runs, place),
-                    4 if S::PIXELS >= 6 => self.tile::<S, 4>(simd, &runs, place),
-                    3 => self.tile::<S, 3>(simd, &runs, place),
-                    2 => self.tile::<S, 2>(simd, &runs, place),
-                    _ => self.tile::<S, 1>(simd, &runs, place),
+                let size = (pixels - first).div_ceil(tiles.max(1));
+                let at = conv.sweep.pixels(first);
+                for panel in (first_panel..end).step_by(S::PANELS) {
+                    let w = (conv.w, self.k, panel);
+                    if S::PANELS == 2 && end - panel >= 2 {
+                        some::<S, 2>(simd, size, &runs, w, self.x, &at, &mut sums);
+                        self.finish(simd, &sums, &at, [size, panel, 2]);
+                    } else {
+                        some::<S, 1>(simd, size, &runs, w, self.x, &at, &mut sums);
+                        self.finish(simd, &sums, &at, [size, panel, 1]);
+                    }
                 }
                 first += size;
             }
@@ -218,51 +228,53 @@ impl Kernel for Pixels<'_> {
     }
 }
 
-impl Pixels<'_> {
-    /// `P` pixels from `first` on, in some panels.
-    #[inline(always)]
-    fn tile<S: Simd, const P: usize>(
-        &mut self,
-        simd: S,
-        runs: &Runs,
-        (first, panels): (usize, core::ops::Range<usize>),
-    ) {
-        let at = self.conv.sweep.pixels::<P>(first);
-        let mut panel = panels.start;
-        while panel < panels.end {
-            panel += if S::PANELS >= 2 && panels.end - panel >= 2 {
-                self.panels::<S, P, 2>(simd, runs, &at, panel)
-            } else {
-                self.panels::<S, P, 1>(simd, runs, &at, panel)
-            };
-        }
+/// The sums of the first `size` of some pixels with `B` panels.
+#[inline(always)]
+#[expect(
+    clippy::too_many_arguments,
+    reason = "those of `sums`, which it chooses"
+)]
+fn some<S: Simd, const B: usize>(
+    simd: S,
+    size: usize,
+    runs: &Runs,
+    w: (&[f32], usize, usize),
+    x: &[f32],
+    at: &[[usize; 2]; MOST[1]],
+    out: &mut Sums,
+) {
+    match size {
+        6 if S::PIXELS >= 6 => sums::<S, 6, B>(simd, runs, w, x, at, out),
+        5 if S::PIXELS >= 6 => sums::<S, 5, B>(simd, runs, w, x, at, out),
+        4 if S::PIXELS >= 6 => sums::<S, 4, B>(simd, runs, w, x, at, out),
+        3 => sums::<S, 3, B>(simd, runs, w, x, at, out),
+        2 => sums::<S, 2, B>(simd, runs, w, x, at, out),
+        _ => sums::<S, 1, B>(simd, runs, w, x, at, out),
     }
+}
 
-    /// `P` pixels and `B` panels from `panel` on; returns `B`.
+impl Pixels<'_> {
+    /// Bias, accumulation, activation and store of `size` pixels and so many panels from `panel` on. Written once for all sizes, and not
+    /// unrolled by those who know them: activations are long.
     #[inline(always)]
-    #[expect(
-        clippy::indexing_slicing,
-        reason = "arrays whose length is a constant, as is every index"
-    )]
-    fn panels<S: Simd, const P: usize, const B: usize>(
+    fn finish<S: Simd>(
         &mut self,
         simd: S,
-        runs: &Runs,
-        at: &[[usize; 2]; P],
-        panel: usize,
-    ) -> usize {
-        let sums = sums::<S, P, B>(simd, runs, (self.conv.w, self.k, panel), self.x, at);
+        sums: &Sums,
+        at: &[[usize; 2]; MOST[1]],
+        [size, panel, panels]: [usize; 3],
+    ) {
         let mut spare = [0.0; LANES];
-        for (b, sums) in sums.into_iter().enumerate() {
+        for (b, sums) in sums.iter().enumerate().take(black_box(panels)) {
             let first = (panel + b) * LANES;
             let bias = simd.load(block(self.conv.bias, first, &mut spare));
             let width = LANES.min(self.conv.n - first);
-            for p in 0..P {
-                let y = self.y.get_mut(at[p][1] + first..).unwrap_or(&mut []);
-                self.conv.finish(simd, simd.add(sums[p], bias), y, width);
+            for (sum, [_, at]) in sums.iter().zip(at).take(black_box(size)) {
+                let y = self.y.get_mut(at + first..).unwrap_or(&mut []);
+                self.conv
+                    .finish(simd, simd.add(simd.load(sum), bias), y, width);
             }
         }
-        B
     }
 }
 
@@ -305,15 +317,19 @@ fn sums<S: Simd, const P: usize, const B: usize>(
     runs: &Runs,
     (w, k, first): (&[f32], usize, usize),
     x: &[f32],
-    at: &[[usize; 2]; P],
-) -> [[S::V; P]; B] {
+    at: &[[usize; 2]; MOST[1]],
+    out: &mut Sums,
+) {
     let mut sums = [[simd.splat(0.0); P]; B];
     let (w, _) = w.as_chunks::<LANES>();
     let mut l = first * k;
     for ky in 0..runs.times[0] {
         for kx in 0..runs.times[1] {
             let offset = ky * runs.apart[0] + kx * runs.apart[1];
-            let x = at.map(|[at, _]| x.get(at + offset..at + offset + runs.len).unwrap_or(&[]));
+            let x: [&[f32]; P] = core::array::from_fn(|p| {
+                let first = at[p][0] + offset;
+                x.get(first..first + runs.len).unwrap_or(&[])
+            });
             let w: [&[Block]; B] = core::array::from_fn(|b| {
                 let l = l + b * k;
                 w.get(l..l + runs.len).unwrap_or(&[])
@@ -324,7 +340,11 @@ fn sums<S: Simd, const P: usize, const B: usize>(
             }
             for i in 0..runs.len {
                 // SAFETY: each `w[b]` is as long as the run, as compared above.
-                let w = w.map(|w| simd.load(unsafe { w.get_unchecked(i) }));
+                let w = w.map(|w| unsafe { w.get_unchecked(i) });
+                let w = w.map(|w| {
+                    prefetch_ahead(i, w);
+                    simd.load(w)
+                });
                 for p in 0..P {
                     // SAFETY: each `x[p]` is as long as the run, as compared above.
                     let x = simd.splat(unsafe { *x[p].get_unchecked(i) });
@@ -335,5 +355,9 @@ fn sums<S: Simd, const P: usize, const B: usize>(
             }
         }
     }
-    sums
+    for (out, sums) in out.iter_mut().zip(sums) {
+        for (out, sum) in out.iter_mut().zip(sums) {
+            simd.store(sum, out);
+        }
+    }
 }

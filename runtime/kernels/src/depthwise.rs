@@ -9,6 +9,8 @@
 //! As in [`Conv`](crate::Conv) there is no padding: `x` is a view that has its border. Channels are the lanes; a few pixels at a time
 //! share the weights that are read. Each output is one sum in the order of the kernel.
 
+use core::hint::black_box;
+
 use crate::conv::Sweep;
 use crate::dispatch::{Isa, Kernel};
 use crate::elementwise::assign;
@@ -72,50 +74,65 @@ struct Channels<'a> {
     y: &'a mut [f32],
 }
 
+/// The most pixels that share the weights that are read.
+const MOST: usize = 4;
+
 impl Kernel for Channels<'_> {
     #[inline(always)]
     fn run<S: Simd>(mut self, simd: S) {
-        let pixels = self.layer.sweep.out[0] * self.layer.sweep.out[1];
+        let layer = self.layer;
+        let pixels = layer.sweep.out[0] * layer.sweep.out[1];
+        let mut out = [[0.0; LANES]; MOST];
         let mut first = 0;
         while first < pixels {
-            first += match pixels - first {
-                4.. if S::PIXELS >= 6 => self.tile::<S, 4>(simd, first),
-                2.. => self.tile::<S, 2>(simd, first),
-                _ => self.tile::<S, 1>(simd, first),
+            let at = layer.sweep.pixels(first);
+            let size = match pixels - first {
+                4.. if S::PIXELS >= 4 => 4,
+                2.. => 2,
+                _ => 1,
             };
+            for channel in (0..layer.c).step_by(LANES) {
+                match size {
+                    4 if S::PIXELS >= 4 => {
+                        sums::<S, 4>(simd, layer, self.x, &at, channel, &mut out)
+                    }
+                    2 => sums::<S, 2>(simd, layer, self.x, &at, channel, &mut out),
+                    _ => sums::<S, 1>(simd, layer, self.x, &at, channel, &mut out),
+                }
+                self.finish(simd, &out, &at, [size, channel]);
+            }
+            first += size;
         }
     }
 }
 
 impl Channels<'_> {
-    /// All channels of `P` pixels from `first` on; returns `P`.
+    /// Bias, activation and store of sixteen channels of `size` pixels. Written once for all sizes, and not unrolled by those who know
+    /// them: activations are long.
     #[inline(always)]
-    #[expect(
-        clippy::indexing_slicing,
-        reason = "arrays whose length is a constant, as is every index"
-    )]
-    fn tile<S: Simd, const P: usize>(&mut self, simd: S, first: usize) -> usize {
+    fn finish<S: Simd>(
+        &mut self,
+        simd: S,
+        sums: &[Block; MOST],
+        at: &[[usize; 2]; MOST],
+        [size, channel]: [usize; 2],
+    ) {
         let layer = self.layer;
-        let at = layer.sweep.pixels::<P>(first);
         let mut spare = [0.0; LANES];
-        for channel in (0..layer.c).step_by(LANES) {
-            let sums = sums::<S, P>(simd, layer, self.x, &at, channel);
-            let bias = simd.load(block(layer.bias, channel, &mut spare));
-            let width = LANES.min(layer.c - channel);
-            for p in 0..P {
-                let v = layer.activation.apply(simd, simd.add(sums[p], bias));
-                let y = self.y.get_mut(at[p][1] + channel..).unwrap_or(&mut []);
-                if width == LANES
-                    && let Some(y) = y.first_chunk_mut()
-                {
-                    simd.store(v, y);
-                } else {
-                    simd.store(v, &mut spare);
-                    assign(y.get_mut(..width).unwrap_or(&mut []), &spare);
-                }
+        let bias = simd.load(block(layer.bias, channel, &mut spare));
+        let width = LANES.min(layer.c - channel);
+        for (sum, [_, at]) in sums.iter().zip(at).take(black_box(size)) {
+            let v = layer.activation.apply(simd, simd.add(simd.load(sum), bias));
+            let y = self.y.get_mut(at + channel..).unwrap_or(&mut []);
+            if width == LANES
+                && let Some(y) = y.first_chunk_mut()
+            {
+                simd.store(v, y);
+            } else {
+                simd.store(v, &mut spare);
+                assign(y.get_mut(..width).unwrap_or(&mut []), &spare);
             }
         }
-        P
     }
 }
 
@@ -134,9 +151,10 @@ fn sums<S: Simd, const P: usize>(
     simd: S,
     layer: &Depthwise,
     x: &[f32],
-    at: &[[usize; 2]; P],
+    at: &[[usize; 2]; MOST],
     channel: usize,
-) -> [S::V; P] {
+    out: &mut [Block; MOST],
+) {
     let Sweep {
         kernel: [rows, cols],
         dilation,
@@ -147,7 +165,7 @@ fn sums<S: Simd, const P: usize>(
     let wide = layer.c.next_multiple_of(LANES);
     let [down, along] = [dilation[0] * x_strides[0], dilation[1] * x_strides[1]];
     let last = channel + rows.saturating_sub(1) * down + cols.saturating_sub(1) * along;
-    let mut places = at.iter().map(|&[at, _]| at);
+    let mut places = at.iter().take(P).map(|&[at, _]| at);
     // `run` found the weights of every channel.
     let whole =
         places.all(|at| at + last + LANES <= x.len()) && rows * cols * wide <= layer.w.len();
@@ -175,7 +193,9 @@ fn sums<S: Simd, const P: usize>(
             }
         }
     }
-    sums
+    for (out, sum) in out.iter_mut().zip(sums) {
+        simd.store(sum, out);
+    }
 }
 
 /// The sixteen elements from `first` on.

@@ -2,6 +2,7 @@
 //! an activation with its upper bound.
 //!
 //! ```text
+//! conv(pad(x, 0))        = conv'(x)   with more padding
 //! conv(s x + t)          = conv'(x)   with weights s W, bias b + W·t, and padding (0 - t) / s, which the scale makes what it was
 //! s conv(x) + t          = conv'(x)   with weights s W and bias s b + t: so batch normalisation disappears
 //! min(relu(conv + r), u)              as one operation
@@ -45,7 +46,15 @@ pub(super) fn fuse(fused: Fused) -> Result<Fused, String> {
         rewriter.at(id);
         let g = &mut rewriter.new;
         let taken = match old.op(id) {
-            Op::Conv(conv) => Some(with_input(g, *conv, operands.clone(), alone[0])?),
+            Op::Conv(conv) => {
+                let (conv, source) = if alone[0] {
+                    with_padding(g, *conv, operands[0])
+                } else {
+                    (*conv, operands[0])
+                };
+                let inputs = [&[source], &operands[1..]].concat();
+                Some(with_input(g, conv, inputs, alone[0])?)
+            }
             Op::Binary(kind) => combined(g, kind.0, &operands, &alone)?,
             Op::Unary(unary) if alone[0] => activated(g, *unary, operands[0])?,
             _ => None,
@@ -120,6 +129,33 @@ fn tensor(g: &mut Graph, shape: &[usize], values: &[f64]) -> Id {
 fn numbers(g: &Graph, id: Id) -> Option<Vec<f64>> {
     let tensor = g.constant(id)?;
     Some(tensor.as_f32()?.iter().copied().map(f64::from).collect())
+}
+
+/// A convolution with the zeros around its input as padding of its own, and what they are around.
+fn with_padding(g: &Graph, mut conv: ConvOp, mut x: Id) -> (ConvOp, Id) {
+    let zeros = |id: Id| g.constant(id).and_then(|tensor| tensor.uniform()) == Some(0.0);
+    while let Op::Concat { axis } = *g.op(x) {
+        let parts = &g.node(x).inputs;
+        let rank = g.shape(x).len();
+        let inside: Vec<usize> = (0..parts.len()).filter(|&i| !zeros(parts[i])).collect();
+        // Rows and columns, of a sequence columns alone.
+        let (&[inside], Some(side)) = (&inside[..], (axis + 3).checked_sub(rank)) else {
+            break;
+        };
+        if axis == 0 || side > 1 || conv.fill {
+            break;
+        }
+        let len = |parts: &[Id]| {
+            parts
+                .iter()
+                .map(|&id| g.shape(id)[axis].fixed)
+                .sum::<usize>()
+        };
+        conv.windows.before[side] += len(&parts[..inside]);
+        conv.windows.after[side] += len(&parts[inside + 1..]);
+        x = parts[inside];
+    }
+    (conv, x)
 }
 
 /// A convolution without the scales and shifts of its input.

@@ -91,7 +91,16 @@ fn turned(g: &mut Graph, old: &Graph, id: Id, x: &[Id]) -> Result<Option<Id>, St
             );
             g.slice(last[0], axis, *start, len)?
         }
-        (Op::Concat { axis }, Some(last)) => {
+        // Constants beside turned views: what pads them.
+        (Op::Concat { axis }, _) if x.iter().any(|&id| inner(g, id).is_some()) => {
+            let mut last = vec![];
+            for &id in x {
+                match inner(g, id) {
+                    Some(own) => last.push(own),
+                    None if g.constant(id).is_some() => last.push(channels_last(g, id)?),
+                    None => return Ok(None),
+                }
+            }
             let axis = axis_of(old.shape(id).len(), *axis);
             g.concat(&last, axis)?
         }

@@ -72,6 +72,7 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
             let along = axis(g, x.get(0)?, a.int("axis", i64::MIN)?)?;
             one(g.concat(&parts, along))
         }
+        "Pad" => one(pad(g, x, a)),
         "Split" => split(g, x, a),
         "Slice" => one(slice(g, x)),
         "Gather" => one(gather(g, x, a)),
@@ -298,6 +299,50 @@ fn split(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
         ));
     }
     Ok(parts)
+}
+
+/// A constant around a value: concatenations.
+fn pad(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> {
+    x.at_most(4)?;
+    let mut value = x.get(0)?;
+    if let Some(mode) = a.text("mode")?.filter(|mode| mode != "constant") {
+        return Err(format!("does not support mode = {mode}, only constant"));
+    }
+    let pads = wanted(g, x.get(1)?)?;
+    let filling = match x.optional(2) {
+        Some(id) => {
+            let found = g.constant(id).and_then(|tensor| tensor.uniform());
+            found.ok_or("needs a constant number to pad with")?
+        }
+        None => 0.0,
+    };
+    let axes = match integers(g, x.optional(3))? {
+        Some(axes) => axes
+            .iter()
+            .map(|&i| axis(g, value, i))
+            .collect::<Result<Vec<_>, _>>()?,
+        None => (0..g.shape(value).len()).collect(),
+    };
+    if pads.len() != 2 * axes.len() {
+        return Err(format!("has {} pads for {} axes", pads.len(), axes.len()));
+    }
+    let (before, after) = pads.split_at(axes.len());
+    for (along, (&before, &after)) in axes.into_iter().zip(before.iter().zip(after)) {
+        let side = |g: &mut Graph, len: i64| -> Result<Option<Id>, String> {
+            let len = usize::try_from(len).map_err(|_| "has a negative pad".to_owned())?;
+            let mut shape = g.shape(value).to_vec();
+            shape[along] = Dim::of(len);
+            if len == 0 {
+                return Ok(None);
+            }
+            let single = g.add_const(Arc::new(Tensor::scalar(filling)));
+            g.expand(single, &shape).map(Some)
+        };
+        let (first, last) = (side(g, before)?, side(g, after)?);
+        let parts: Vec<Id> = [first, Some(value), last].into_iter().flatten().collect();
+        value = g.concat(&parts, along)?;
+    }
+    Ok(value)
 }
 
 fn slice(g: &mut Graph, x: &Operands) -> Result<Id, String> {

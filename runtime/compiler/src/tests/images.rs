@@ -35,6 +35,15 @@ fn convolutions() {
             conv(2, side, [3, 2, 3, 3], &attributes).output("y", &[1, 3, out(side), out(side + 1)]),
         );
     }
+    // Zeros around the image, by an operator of their own.
+    let around = Small::new()
+        .input("a", &[1, 2, 5, 5])
+        .random("w", &[4, 2, 3, 3])
+        .integers("pads", &[0, 0, 0, 1, 0, 0, 2, 1])
+        .node("Pad", &["a", "pads"], &["p"], &[])
+        .node("Conv", &["p", "w"], &["y"], &[ints("strides", &[2, 2])])
+        .output("y", &[1, 4, 3, 3]);
+    assert_eq!(names(&agrees(around)), ["Border", "Copy", "Conv", "Copy"]);
     // Groups, as many as there are channels among them, and with several outputs for each.
     agrees(conv(6, 5, [4, 3, 3, 3], &[int("group", 2)]).output("y", &[1, 4, 3, 4]));
     agrees(conv(6, 5, [12, 1, 3, 3], &[int("group", 6)]).output("y", &[1, 12, 3, 4]));
