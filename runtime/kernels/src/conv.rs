@@ -230,10 +230,6 @@ impl Kernel for Pixels<'_> {
 
 /// The sums of the first `size` of some pixels with `B` panels.
 #[inline(always)]
-#[expect(
-    clippy::too_many_arguments,
-    reason = "those of `sums`, which it chooses"
-)]
 fn some<S: Simd, const B: usize>(
     simd: S,
     size: usize,

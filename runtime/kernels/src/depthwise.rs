@@ -94,7 +94,7 @@ impl Kernel for Channels<'_> {
             for channel in (0..layer.c).step_by(LANES) {
                 match size {
                     4 if S::PIXELS >= 4 => {
-                        sums::<S, 4>(simd, layer, self.x, &at, channel, &mut out)
+                        sums::<S, 4>(simd, layer, self.x, &at, channel, &mut out);
                     }
                     2 => sums::<S, 2>(simd, layer, self.x, &at, channel, &mut out),
                     _ => sums::<S, 1>(simd, layer, self.x, &at, channel, &mut out),

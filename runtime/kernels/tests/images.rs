@@ -162,8 +162,8 @@ proptest! {
     ) {
         let table = |axis: usize| -> Vec<f32> {
             let random = values(3 * out[axis], seed ^ axis as u64);
-            let index = |x: f32| ((x + 1.0) / 2.0 * size[axis] as f32).floor();
-            random.chunks(3).flat_map(|r| [index(r[0]), index(r[1]), (r[2] + 1.0) / 2.0]).collect()
+            let index = |x: f32| (f32::midpoint(x, 1.0) * size[axis] as f32).floor();
+            random.chunks(3).flat_map(|r| [index(r[0]), index(r[1]), f32::midpoint(r[2], 1.0)]).collect()
         };
         let (rows, cols) = (table(0), table(1));
         let resize = Resize {
