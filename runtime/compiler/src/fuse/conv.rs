@@ -162,14 +162,12 @@ fn with_padding(g: &Graph, mut conv: ConvOp, mut x: Id) -> (ConvOp, Id) {
 fn with_input(g: &mut Graph, mut conv: ConvOp, mut x: Vec<Id>, alone: bool) -> Result<Id, String> {
     let mut total: Option<Vec<[f64; 2]>> = None;
     let mut source = x[0];
-    while alone && conv.groups == 1 && !conv.fill && !conv.residual {
-        let Some((inside, outer)) = affine_of(g, source) else {
-            break;
-        };
-        // The padding is divided by the scale.
-        if outer.iter().any(|[scale, _]| !scale.is_normal()) {
-            break;
-        }
+    let folds = alone && conv.groups == 1 && !conv.fill && !conv.residual;
+    // The padding is divided by the scale.
+    let divides = |outer: &[[f64; 2]]| outer.iter().all(|[scale, _]| scale.is_normal());
+    while let Some((inside, outer)) =
+        affine_of(g, source).filter(|(_, outer)| folds && divides(outer))
+    {
         // outer(inner(x)), from the last to the first.
         let after = total.unwrap_or_else(|| vec![[1.0, 0.0]; outer.len()]);
         let both = outer
