@@ -198,6 +198,11 @@ impl Reference {
                 Value::Int(array) => return Some(Value::Int(array.mapv(|x| x + by))),
                 Value::Float(_) => return None,
             },
+            Op::ToIndex => return Some(Value::Int(float(0)?.mapv(|x| x.trunc() as i64))),
+            Op::FromIndex => match x(0)? {
+                Value::Int(array) => array.mapv(|x| x as f64),
+                Value::Float(_) => return None,
+            },
             Op::ArgMin | Op::ArgMax => {
                 let largest = node.op == Op::ArgMax;
                 return Some(Value::Int(ArrayD::from_elem(
@@ -381,5 +386,10 @@ fn apply(unary: Unary, x: f64) -> f64 {
         UnaryKind::Recip => 1.0 / x,
         UnaryKind::Erf => libm::erf(x),
         UnaryKind::Square => x * x,
+        UnaryKind::Elu if x < 0.0 => alpha * x.exp_m1(),
+        UnaryKind::Elu => x,
+        UnaryKind::Softplus => x.max(0.0) + (-x.abs()).exp().ln_1p(),
+        UnaryKind::Mish => x * (x.max(0.0) + (-x.abs()).exp().ln_1p()).tanh(),
+        UnaryKind::Trunc => x.trunc(),
     }
 }

@@ -48,6 +48,11 @@ fn volume(shape: &[Dim]) -> Option<(usize, Vec<usize>)> {
 }
 
 impl Graph {
+    /// The shape that a shape and a value broadcast to.
+    pub fn broadcast(&self, shape: &[Dim], x: Id) -> Result<Vec<Dim>, String> {
+        broadcast(shape, self.shape(x))
+    }
+
     /// Folds the node if all its operands are constants, else adds it.
     fn fold(&mut self, op: Op, inputs: Vec<Id>, shape: Vec<Dim>, ty: Type) -> Built {
         if shape.len() > MAX_RANK || shape.contains(&Dim::of(0)) {
@@ -383,6 +388,28 @@ impl Graph {
         }
         let ty = self.ty(table);
         self.fold(Op::GatherRow, vec![table, index], shape[1..].to_vec(), ty)
+    }
+
+    /// One number as an integer, without its fraction.
+    pub fn to_index(&mut self, x: Id) -> Built {
+        self.floats(&[x])?;
+        let shape = self.shape(x).to_vec();
+        if shape.iter().any(|dim| !dim.is_one()) {
+            return Err(format!(
+                "makes {} integers at once, one is supported",
+                show(&shape)
+            ));
+        }
+        self.fold(Op::ToIndex, vec![x], shape, Type::I64)
+    }
+
+    /// One integer as a number.
+    pub fn from_index(&mut self, x: Id) -> Built {
+        let shape = self.shape(x).to_vec();
+        if self.ty(x) != Type::I64 || shape.iter().any(|dim| !dim.is_one()) {
+            return Err(format!("reads {} as one integer", show(self.shape(x))));
+        }
+        self.fold(Op::FromIndex, vec![x], shape, Type::F32)
     }
 
     /// Index of the first smallest or largest element of all.

@@ -52,6 +52,14 @@ pub(crate) fn evaluate(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> Option<Te
         }
         Op::Reduce(kind, axis) => reduce(kind.0, &x[0], *axis, shape),
         Op::MatMul => matmul(&x[0], &x[1], shape),
+        Op::ToIndex => {
+            let integers = x[0].as_f32()?.iter().map(|&x| x as i64).collect();
+            Some(Tensor::i64(shape, integers))
+        }
+        Op::FromIndex => {
+            let numbers = x[0].as_i64()?.iter().map(|&x| x as f32).collect();
+            Some(Tensor::f32(shape, numbers))
+        }
         Op::GatherRow => {
             let &[index] = x[1].as_i64()? else {
                 return None;
@@ -148,6 +156,9 @@ fn binary(kind: BinaryKind, a: &Tensor, b: &Tensor, shape: &[usize]) -> Option<T
                 BinaryKind::Max => a.max(b),
                 BinaryKind::Min => a.min(b),
                 BinaryKind::Pow => a.powf(b),
+                BinaryKind::Greater => f32::from(u8::from(a > b)),
+                BinaryKind::Keep if b == 0.0 => 0.0,
+                BinaryKind::Keep => a,
             };
             Some(Tensor::f32(shape, a.iter().zip(b).map(f).collect()))
         }
@@ -159,7 +170,8 @@ fn binary(kind: BinaryKind, a: &Tensor, b: &Tensor, shape: &[usize]) -> Option<T
                 BinaryKind::Div => a.checked_div(b),
                 BinaryKind::Max => Some(a.max(b)),
                 BinaryKind::Min => Some(a.min(b)),
-                BinaryKind::Pow => None,
+                BinaryKind::Greater => Some(i64::from(a > b)),
+                BinaryKind::Pow | BinaryKind::Keep => None,
             };
             let y: Option<Vec<i64>> = a.iter().zip(b).map(f).collect();
             Some(Tensor::i64(shape, y?))
@@ -190,6 +202,11 @@ pub(crate) fn apply(unary: Unary, x: f32) -> f32 {
         UnaryKind::Recip => 1.0 / x,
         UnaryKind::Erf => lads_kernels::math::erf(x),
         UnaryKind::Square => x * x,
+        UnaryKind::Elu if x < 0.0 => f32::from_bits(unary.alpha) * x.exp_m1(),
+        UnaryKind::Elu => x,
+        UnaryKind::Softplus => x.max(0.0) + (-x.abs()).exp().ln_1p(),
+        UnaryKind::Mish => x * (x.max(0.0) + (-x.abs()).exp().ln_1p()).tanh(),
+        UnaryKind::Trunc => x.trunc(),
     }
 }
 
