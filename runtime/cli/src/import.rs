@@ -62,7 +62,10 @@ pub fn import(request: &Request) -> Result<(), Refusal> {
         wires: request.wire.clone(),
         golden: request.golden.as_deref(),
     };
-    let first = request.models.first().map_or(Path::new(""), PathBuf::as_path);
+    let first = request
+        .models
+        .first()
+        .map_or(Path::new(""), PathBuf::as_path);
     if request.template {
         let form = lads_import::template(&asked).map_err(|error| refusal(first, error))?;
         return print(&form);

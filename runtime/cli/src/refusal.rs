@@ -22,10 +22,17 @@ impl Refusal {
     }
 
     /// All that is wrong with `thing`, a line for each, and the remedy.
-    pub fn list(thing: impl Display, wrong: impl Iterator<Item = String>, remedy: impl Display) -> Self {
+    pub fn list(
+        thing: impl Display,
+        wrong: impl Iterator<Item = String>,
+        remedy: impl Display,
+    ) -> Self {
         let wrong: Vec<String> = wrong.map(|line| format!("  {}", one_line(&line))).collect();
         let things = if wrong.len() == 1 { "thing" } else { "things" };
-        let head = one_line(&format!("{thing}: {} {things} to settle; {remedy}", wrong.len()));
+        let head = one_line(&format!(
+            "{thing}: {} {things} to settle; {remedy}",
+            wrong.len()
+        ));
         Self(format!("{head}\n{}", wrong.join("\n")))
     }
 

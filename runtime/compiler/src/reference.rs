@@ -260,7 +260,8 @@ impl Reference {
                 let eps = f64::from(f32::from_bits(*eps));
                 let mut y = rows(float(0)?, |mut row| {
                     let mean = row.sum() / row.len() as f64;
-                    let var = row.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / row.len() as f64;
+                    let var =
+                        row.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / row.len() as f64;
                     row.mapv_inplace(|x| (x - mean) / (var + eps).sqrt());
                 });
                 y = y * float(1)?.broadcast(IxDyn(&shape))?;
@@ -302,21 +303,16 @@ fn constant(graph: &Graph, id: Id) -> Option<Value> {
 }
 
 /// The rows of a ring with one more, at most so many.
-fn appended(
-    known: Option<&ArrayD<f64>>,
-    row: &[f64],
-    most: usize,
-) -> Result<ArrayD<f64>, String> {
+fn appended(known: Option<&ArrayD<f64>>, row: &[f64], most: usize) -> Result<ArrayD<f64>, String> {
     let row = ArrayD::from_shape_vec(IxDyn(&[1, row.len()]), row.to_vec());
     let row = row.map_err(|error| error.to_string())?;
     let Some(known) = known else {
         return Ok(row);
     };
-    let all = concatenate(Axis(0), &[known.view(), row.view()]).map_err(|error| error.to_string())?;
+    let all =
+        concatenate(Axis(0), &[known.view(), row.view()]).map_err(|error| error.to_string())?;
     let surplus = all.shape()[0].saturating_sub(most);
-    Ok(all
-        .slice_axis(Axis(0), Slice::from(surplus..))
-        .to_owned())
+    Ok(all.slice_axis(Axis(0), Slice::from(surplus..)).to_owned())
 }
 
 /// A copy whose rows over the last axis were changed.
@@ -366,6 +362,9 @@ fn binary(kind: BinaryKind, a: f64, b: f64) -> f64 {
         BinaryKind::Max => a.max(b),
         BinaryKind::Min => a.min(b),
         BinaryKind::Pow => a.powf(b),
+        BinaryKind::Greater => f64::from(u8::from(a > b)),
+        BinaryKind::Keep if b == 0.0 => 0.0,
+        BinaryKind::Keep => a,
     }
 }
 

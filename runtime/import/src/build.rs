@@ -111,7 +111,10 @@ fn opsets(models: &[Model], problems: &mut Problems) -> Option<Vec<OperatorSetId
         if of(model) != first {
             problems.add(
                 model.path.display(),
-                format!("has operator set {:?}, the first file has {first:?}; export them alike", of(model)),
+                format!(
+                    "has operator set {:?}, the first file has {first:?}; export them alike",
+                    of(model)
+                ),
             );
             return None;
         }
@@ -175,7 +178,10 @@ impl Net {
     }
 
     fn integers(&mut self, values: &[i64]) -> String {
-        let raw: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+        let raw: Vec<u8> = values
+            .iter()
+            .flat_map(|value| value.to_le_bytes())
+            .collect();
         self.constant(&[values.len()], data_type::INT64, raw.into())
     }
 
@@ -316,7 +322,10 @@ impl Net {
         let Some((low, high)) = clip else {
             return value;
         };
-        let (low, high) = (self.floats(&[1, low.len()], low), self.floats(&[1, high.len()], high));
+        let (low, high) = (
+            self.floats(&[1, low.len()], low),
+            self.floats(&[1, high.len()], high),
+        );
         let value = self.op("Max", &[&value, &low], vec![]);
         self.op("Min", &[&value, &high], vec![])
     }

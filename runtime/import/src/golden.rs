@@ -51,7 +51,9 @@ impl Episode {
         let steps = second.map_or(self.len(), |at| at + 1).min(KEPT);
         let bytes = |rows: &[Vec<f64>]| -> Vec<u8> {
             let values = rows[..steps].iter().flatten();
-            values.flat_map(|&value| (value as f32).to_le_bytes()).collect()
+            values
+                .flat_map(|&value| (value as f32).to_le_bytes())
+                .collect()
         };
         let mut all: Vec<(String, Vec<usize>, Vec<u8>)> = plan
             .channels
@@ -72,7 +74,8 @@ impl Episode {
             .collect::<Result<Vec<_>, _>>()
             .map_err(|error| error.to_string())?;
         let metadata = HashMap::from([("tolerance".to_owned(), format!("{tolerance:e}"))]);
-        let blob = safetensors::serialize(views, Some(metadata)).map_err(|error| error.to_string())?;
+        let blob =
+            safetensors::serialize(views, Some(metadata)).map_err(|error| error.to_string())?;
         Ok(base64::engine::general_purpose::STANDARD.encode(blob))
     }
 }
@@ -125,7 +128,10 @@ pub(crate) fn computed(
 /// episodes a column `reset` that is 1 where one begins.
 pub(crate) fn recorded(path: &Path, plan: &Plan, problems: &mut Problems) -> Option<Episode> {
     let about = path.display().to_string();
-    let mut reader = match csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path) {
+    let mut reader = match csv::ReaderBuilder::new()
+        .trim(csv::Trim::All)
+        .from_path(path)
+    {
         Ok(reader) => reader,
         Err(error) => {
             problems.add(about, format!("cannot be read: {error}"));
@@ -183,7 +189,9 @@ pub(crate) fn recorded(path: &Path, plan: &Plan, problems: &mut Problems) -> Opt
         for (rows, columns) in episode.channels.iter_mut().zip(&columns) {
             rows.push(columns.iter().map(&mut value).collect());
         }
-        episode.actions.push(actions.iter().map(&mut value).collect());
+        episode
+            .actions
+            .push(actions.iter().map(&mut value).collect());
         let begins = row == 0 || reset.is_some_and(|column| value(&Some(column)) != 0.0);
         episode.begins.push(begins);
     }

@@ -373,5 +373,11 @@ fn compared(
         actions.push(action.into_iter().map(f64::from).collect());
     }
     let what = "the compiled policy";
-    Ok(differences(&episode.actions, &actions, plan, what, problems))
+    Ok(differences(
+        &episode.actions,
+        &actions,
+        plan,
+        what,
+        problems,
+    ))
 }

@@ -54,12 +54,14 @@ impl Model {
             path: path.into(),
             source: Box::new(source),
         };
-        let bytes = lads_host::input::read(path)
-            .map_err(|error| named(BundleError::Read(error)))?;
+        let bytes =
+            lads_host::input::read(path).map_err(|error| named(BundleError::Read(error)))?;
         let sha256 = lads_compiler::sha256(&bytes);
         let mut proto = onnx::decode(&Bytes::from(bytes)).map_err(named)?;
         if let Some(graph) = &mut proto.graph {
-            let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+            let folder = path
+                .parent()
+                .filter(|folder| !folder.as_os_str().is_empty());
             bring_in(graph, folder.unwrap_or(Path::new(".")), problems);
             check(graph, problems);
         }
@@ -140,7 +142,9 @@ fn edge(
     for (axis, dim) in shape.dim.iter().enumerate() {
         dims.push(length(axis, dim, axes)?);
     }
-    let len = dims.iter().try_fold(1_usize, |len, &dim| len.checked_mul(dim));
+    let len = dims
+        .iter()
+        .try_fold(1_usize, |len, &dim| len.checked_mul(dim));
     if !len.is_some_and(|len| (1..=MAX_LEN).contains(&len)) {
         return Err(format!(
             "has shape {dims:?}, which has no elements or more than {MAX_LEN}"
@@ -289,7 +293,10 @@ fn check(graph: &GraphProto, problems: &mut Problems) {
     let mut known: HashSet<&str> = HashSet::new();
     for name in weights {
         if !known.insert(name) {
-            problems.add(format!("weight `{name}`"), "is there twice; export the policy again");
+            problems.add(
+                format!("weight `{name}`"),
+                "is there twice; export the policy again",
+            );
         }
     }
     for tensor in &graph.initializer {
@@ -303,14 +310,20 @@ fn check(graph: &GraphProto, problems: &mut Problems) {
     let mut inputs = HashSet::new();
     for value in &graph.input {
         if !inputs.insert(value.name.as_str()) {
-            problems.add(format!("input `{}`", value.name), "is there twice; export the policy again");
+            problems.add(
+                format!("input `{}`", value.name),
+                "is there twice; export the policy again",
+            );
         }
         known.insert(&value.name);
     }
     let mut later: HashSet<&str> = HashSet::new();
     for name in graph.node.iter().flat_map(|node| &node.output) {
         if !name.is_empty() && (!later.insert(name) || known.contains(name.as_str())) {
-            problems.add(format!("value `{name}`"), "is given twice; export the policy again");
+            problems.add(
+                format!("value `{name}`"),
+                "is given twice; export the policy again",
+            );
         }
     }
     for node in &graph.node {
@@ -349,7 +362,9 @@ fn finite(tensor: &TensorProto) -> bool {
         // All ones in the exponent.
         data_type::FLOAT16 => {
             let words = raw.as_chunks::<2>().0.iter();
-            words.map(|&word| u16::from_le_bytes(word)).all(|half| half & 0x7c00 != 0x7c00)
+            words
+                .map(|&word| u16::from_le_bytes(word))
+                .all(|half| half & 0x7c00 != 0x7c00)
         }
         _ => true,
     }

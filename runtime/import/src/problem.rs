@@ -32,7 +32,12 @@ impl Problems {
 
     /// The same without some.
     pub(crate) fn without(self, drop: impl Fn(&Problem) -> bool) -> Self {
-        Self(self.0.into_iter().filter(|problem| !drop(problem)).collect())
+        Self(
+            self.0
+                .into_iter()
+                .filter(|problem| !drop(problem))
+                .collect(),
+        )
     }
 
     /// Whether there are none.

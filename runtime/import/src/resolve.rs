@@ -63,7 +63,10 @@ impl Edges {
         match matches[..] {
             [edge] => Ok(edge),
             [] => Err(format!("\"{said}\" is none of them; there are {}", known())),
-            _ => Err(format!("\"{said}\" is in several files; say one of {}", known())),
+            _ => Err(format!(
+                "\"{said}\" is in several files; say one of {}",
+                known()
+            )),
         }
     }
 
@@ -159,7 +162,10 @@ pub(crate) fn resolve(
             "is not said: the time from one control step to the next, in seconds",
         ),
         Some(period) if !(period.is_finite() && period > 0.0) => {
-            problems.add("control_period_s", format!("is {period}, it must be positive"));
+            problems.add(
+                "control_period_s",
+                format!("is {period}, it must be positive"),
+            );
         }
         Some(_) => {}
     }
@@ -228,10 +234,9 @@ fn assigned<'r>(context: &mut terms::Context<'r, '_>, open: &[&Edge]) -> Vec<Vec
             (Some(said), _) => match edges.find(&edges.inputs, said) {
                 Ok(input) => match open.iter().position(|other| *other == input) {
                     Some(place) => by_input[place].push(term),
-                    None => context.problems.add(
-                        about,
-                        format!("input `{said}` is fed otherwise already"),
-                    ),
+                    None => context
+                        .problems
+                        .add(about, format!("input `{said}` is fed otherwise already")),
                 },
                 Err(problem) => context.problems.add(about, format!("`input`: {problem}")),
             },
@@ -243,7 +248,10 @@ fn assigned<'r>(context: &mut terms::Context<'r, '_>, open: &[&Edge]) -> Vec<Vec
                 let names: Vec<String> = open.iter().map(|edge| edges.name(edge)).collect();
                 context.problems.add(
                     about,
-                    format!("does not say which `input` it is a part of: {}", names.join(", ")),
+                    format!(
+                        "does not say which `input` it is a part of: {}",
+                        names.join(", ")
+                    ),
                 );
             }
         }

@@ -367,10 +367,15 @@ mod tests {
         mine.fill(parse("control_period_s = 0.02\n[[term]]\nname = \"a\"\nscale = 3\nwidth = 4\n[action]\nunit = \"m\"\nscale = 1"))
             .expect("the same terms");
         assert_eq!(mine.control_period_s, Some(0.02));
-        assert_eq!((mine.terms[0].scale.clone(), mine.terms[0].width), (Some(Each::One(2.0)), Some(4)));
+        assert_eq!(
+            (mine.terms[0].scale.clone(), mine.terms[0].width),
+            (Some(Each::One(2.0)), Some(4))
+        );
         assert_eq!(mine.action.unit.as_deref(), Some("rad"));
         assert_eq!(mine.action.scale, Some(Each::One(1.0)));
-        let error = mine.fill(parse("[[term]]\nname = \"b\"")).expect_err("other terms");
+        let error = mine
+            .fill(parse("[[term]]\nname = \"b\""))
+            .expect_err("other terms");
         assert!(error.contains("a here and b there"), "{error}");
     }
 }

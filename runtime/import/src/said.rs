@@ -27,7 +27,12 @@ const POSTURE: [&str; 4] = [
     "default_angles",
 ];
 const PERIOD: [&str; 4] = ["step_dt", "control_dt", "policy_dt", "control_period_s"];
-const RATE: [&str; 4] = ["control_frequency", "control_freq", "control_hz", "policy_hz"];
+const RATE: [&str; 4] = [
+    "control_frequency",
+    "control_freq",
+    "control_hz",
+    "policy_hz",
+];
 
 /// Metadata of a model file: keys and texts.
 pub(crate) fn metadata<'m>(
@@ -186,7 +191,9 @@ fn each(value: &Value, joints: Option<&[String]>) -> Option<Each> {
         .iter()
         .map(|joint| value.get(joint)?.number())
         .collect();
-    numbers.filter(|numbers| !numbers.is_empty()).map(Each::Many)
+    numbers
+        .filter(|numbers| !numbers.is_empty())
+        .map(Each::Many)
 }
 
 /// `deploy.yaml`: positions, scales and offsets are in the policy's order, gains in the robot's.
@@ -224,7 +231,9 @@ pub(crate) fn deploy(text: &str, source: &str, problems: &mut Problems) -> Said 
             .collect();
         values.map(Each::Many)
     };
-    robot.action.stiffness = used("stiffness").and_then(Value::numbers).and_then(by_policy);
+    robot.action.stiffness = used("stiffness")
+        .and_then(Value::numbers)
+        .and_then(by_policy);
     robot.action.damping = used("damping").and_then(Value::numbers).and_then(by_policy);
     robot.joint_ids_map.clone_from(&map);
     let commands = used("commands").cloned().unwrap_or_default();
@@ -346,7 +355,10 @@ mod tests {
         ];
         let mut problems = Problems::default();
         let said = metadata(pairs.into_iter(), &mut problems);
-        assert_eq!(said.robot.action.stiffness, Some(Each::Many(vec![20.0, 30.0])));
+        assert_eq!(
+            said.robot.action.stiffness,
+            Some(Each::Many(vec![20.0, 30.0]))
+        );
         assert!(problems.is_empty(), "{problems}");
     }
 
@@ -366,7 +378,11 @@ mod tests {
         assert_eq!(robot.action.stiffness, Some(Each::Many(vec![20.0, 10.0])));
         assert_eq!(robot.action.max, Some(Each::Many(vec![1.0, 2.0])));
         let names: Vec<&str> = robot.terms.iter().map(|term| term.name.as_str()).collect();
-        assert_eq!(names, ["zeta", "alpha"], "the graph reads them in the file's order");
+        assert_eq!(
+            names,
+            ["zeta", "alpha"],
+            "the graph reads them in the file's order"
+        );
         assert_eq!(robot.terms[1].elements, Some(vec!["x".into()]));
         assert_eq!(robot.history.expect("a history").start, Some(Start::First));
     }

@@ -25,15 +25,37 @@ pub(crate) fn template(edges: &Edges, robot: &Robot) -> String {
         )),
         None => form.line("# environment = { id = \"my-robot\", version = \"1\" }   # what the policy was made for"),
     }
-    form.field("control_period_s", robot.control_period_s.map(|period| period.to_string()), "0.02", "seconds from one control step to the next");
-    form.field("joints", robot.joints.as_deref().map(texts), "[\"hip\", \"knee\"]", "in the policy's order");
+    form.field(
+        "control_period_s",
+        robot.control_period_s.map(|period| period.to_string()),
+        "0.02",
+        "seconds from one control step to the next",
+    );
+    form.field(
+        "joints",
+        robot.joints.as_deref().map(texts),
+        "[\"hip\", \"knee\"]",
+        "in the policy's order",
+    );
     if robot.joint_ids_map.is_some() || robot.robot_joints.is_some() {
-        form.field("joint_ids_map", robot.joint_ids_map.as_ref().map(|map| format!("{map:?}")), "[0, 1]", "the number of each of the policy's joints among the robot's");
-        form.field("robot_joints", robot.robot_joints.as_deref().map(texts), "[\"hip\", \"knee\"]", "all of the robot's joints, in its own order");
+        form.field(
+            "joint_ids_map",
+            robot.joint_ids_map.as_ref().map(|map| format!("{map:?}")),
+            "[0, 1]",
+            "the number of each of the policy's joints among the robot's",
+        );
+        form.field(
+            "robot_joints",
+            robot.robot_joints.as_deref().map(texts),
+            "[\"hip\", \"knee\"]",
+            "all of the robot's joints, in its own order",
+        );
     } else {
         form.line("# robot_joints = [\"knee\", \"hip\"]   # only if the robot has them in another order; it then gives and gets that one");
     }
-    form.line("# quaternion_order = \"wxyz\"   # or \"xyzw\"; only for terms with `from = \"gravity\"`");
+    form.line(
+        "# quaternion_order = \"wxyz\"   # or \"xyzw\"; only for terms with `from = \"gravity\"`",
+    );
     history(&mut form, robot);
     if edges.inputs.len() > 1 {
         form.line("# Several inputs: terms name theirs with `input`; others are states, constants or wired.");
@@ -93,7 +115,9 @@ fn history(form: &mut Form, robot: &Robot) {
         form.line(line);
     } else {
         let example = "history = { length = 5, layout = \"term\", order = \"oldest_first\", start = \"first\" }";
-        form.line(format_args!("# {example}   # only if the graph reads several steps"));
+        form.line(format_args!(
+            "# {example}   # only if the graph reads several steps"
+        ));
     }
 }
 
@@ -127,26 +151,49 @@ fn term(form: &mut Form, said: &Term, robot: &Robot) {
     let raw = matches!(full.from, None | Some(From::Sensor));
     if raw {
         if let Some(channel) = &full.channel {
-            form.line(format_args!("channel = {}   # a vector of its own", text(channel)));
+            form.line(format_args!(
+                "channel = {}   # a vector of its own",
+                text(channel)
+            ));
         }
         match (&full.elements, full.per_joint, full.width) {
             (Some(names), ..) => form.line(format_args!("elements = {}", texts(names))),
             (None, Some(true), _) => form.line("per_joint = true"),
             (None, _, Some(width)) => form.line(format_args!("width = {width}")),
-            _ => form.line("# width = 3   # or elements = [\"x\", \"y\", \"z\"], or per_joint = true"),
+            _ => form
+                .line("# width = 3   # or elements = [\"x\", \"y\", \"z\"], or per_joint = true"),
         }
-        form.field("unit", full.unit.as_deref().map(text), "\"rad\"", "of what the sensor gives; \"1\" for none");
+        form.field(
+            "unit",
+            full.unit.as_deref().map(text),
+            "\"rad\"",
+            "of what the sensor gives; \"1\" for none",
+        );
         if let Some(interface) = &full.interface {
             form.line(format_args!("interface = {}", text(interface)));
         }
-        form.field("min", full.min.as_ref().map(each), "-1.0", "the smallest value that can be right");
+        form.field(
+            "min",
+            full.min.as_ref().map(each),
+            "-1.0",
+            "the smallest value that can be right",
+        );
         form.field("max", full.max.as_ref().map(each), "1.0", "the largest");
         let posture = robot.default_position.clone().map(Each::Many);
-        let offset = full.offset.clone().or_else(|| posture.clone().filter(|_| relative));
-        let positions = full.per_joint == Some(true) && full.interface.as_deref() == Some("position");
+        let offset = full
+            .offset
+            .clone()
+            .or_else(|| posture.clone().filter(|_| relative));
+        let positions =
+            full.per_joint == Some(true) && full.interface.as_deref() == Some("position");
         if positions || offset.is_some() {
             let example = posture.as_ref().map_or("0".into(), each);
-            form.field("offset", offset.as_ref().map(each), &example, "the posture that the policy sees as 0; 0 if it sees positions as they are");
+            form.field(
+                "offset",
+                offset.as_ref().map(each),
+                &example,
+                "the posture that the policy sees as 0; 0 if it sees positions as they are",
+            );
         }
     }
     if let Some(bounds) = &full.clip {
@@ -162,28 +209,68 @@ fn term(form: &mut Form, said: &Term, robot: &Robot) {
 
 fn action(form: &mut Form, edges: &Edges, robot: &Robot) {
     let said = &robot.action;
-    form.line("\n# What the policy's output means: clip(raw) * scale + offset, which the robot gets.");
+    form.line(
+        "\n# What the policy's output means: clip(raw) * scale + offset, which the robot gets.",
+    );
     form.line("[action]");
-    let example = edges.outputs.first().map_or(String::new(), |edge| edges.name(edge));
+    let example = edges
+        .outputs
+        .first()
+        .map_or(String::new(), |edge| edges.name(edge));
     if edges.outputs.len() > 1 || said.output.is_some() {
-        form.field("output", said.output.as_deref().map(text), &text(&example), "which output it is");
+        form.field(
+            "output",
+            said.output.as_deref().map(text),
+            &text(&example),
+            "which output it is",
+        );
     }
     if let Some(names) = &said.elements {
         form.line(format_args!("elements = {}", texts(names)));
     }
-    form.field("unit", said.unit.as_deref().map(text), "\"rad\"", "of what the robot gets");
-    form.field("interface", said.interface.as_deref().map(text), "\"position\"", "position, velocity or effort");
-    form.field("scale", said.scale.as_ref().map(each), "0.25", "1 for nothing");
+    form.field(
+        "unit",
+        said.unit.as_deref().map(text),
+        "\"rad\"",
+        "of what the robot gets",
+    );
+    form.field(
+        "interface",
+        said.interface.as_deref().map(text),
+        "\"position\"",
+        "position, velocity or effort",
+    );
+    form.field(
+        "scale",
+        said.scale.as_ref().map(each),
+        "0.25",
+        "1 for nothing",
+    );
     let posture = robot.default_position.clone().map(Each::Many);
     let example = posture.as_ref().map_or("0".into(), each);
-    form.field("offset", said.offset.as_ref().map(each), &example, "for example the default posture; 0 for nothing");
-    form.field("min", said.min.as_ref().map(each), "-1.0", "the smallest value that the robot may get");
+    form.field(
+        "offset",
+        said.offset.as_ref().map(each),
+        &example,
+        "for example the default posture; 0 for nothing",
+    );
+    form.field(
+        "min",
+        said.min.as_ref().map(each),
+        "-1.0",
+        "the smallest value that the robot may get",
+    );
     form.field("max", said.max.as_ref().map(each), "1.0", "the largest");
     match &said.clip {
         Some(bounds) => form.line(format_args!("clip = {}", clip(bounds))),
         None => form.line("# clip = [-100, 100]   # of the raw output, if training had one"),
     }
-    form.field("stiffness", said.stiffness.as_ref().map(each), "20.0", "gains of the joints' controllers that training had; they are only handed on");
+    form.field(
+        "stiffness",
+        said.stiffness.as_ref().map(each),
+        "20.0",
+        "gains of the joints' controllers that training had; they are only handed on",
+    );
     form.field("damping", said.damping.as_ref().map(each), "0.5", "");
 }
 
@@ -200,7 +287,11 @@ impl Form {
 
     /// A field with what is known, or as a comment with an example.
     fn field(&mut self, name: &str, known: Option<String>, example: &str, what: &str) {
-        let what = if what.is_empty() { String::new() } else { format!("   # {what}") };
+        let what = if what.is_empty() {
+            String::new()
+        } else {
+            format!("   # {what}")
+        };
         match known {
             Some(value) => self.line(format_args!("{name} = {value}")),
             None => self.line(format_args!("# {name} = {example}{what}")),

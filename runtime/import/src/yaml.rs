@@ -70,9 +70,11 @@ impl From<serde_json::Value> for Value {
             Json::Number(number) => number.as_f64().map_or(Value::Null, Value::Number),
             Json::String(text) => Value::Text(text),
             Json::Array(values) => Value::List(values.into_iter().map(Value::from).collect()),
-            Json::Object(map) => {
-                Value::Map(map.into_iter().map(|(key, value)| (key, value.into())).collect())
-            }
+            Json::Object(map) => Value::Map(
+                map.into_iter()
+                    .map(|(key, value)| (key, value.into()))
+                    .collect(),
+            ),
         }
     }
 }

@@ -40,12 +40,18 @@ fn joints_come_and_go_in_the_robots_order() {
         .clone();
     let row = |channel: &lads_compiler::contract::Channel| -> Vec<(Option<String>, f32)> {
         let elements = channel.elements.iter();
-        elements.map(|element| (element.joint.clone(), element.min)).collect()
+        elements
+            .map(|element| (element.joint.clone(), element.min))
+            .collect()
     };
     let joint = |name: &str| Some(name.to_owned());
     assert_eq!(
         row(contract.observation()),
-        [(joint("toe"), -3.0), (joint("hip"), -1.0), (joint("knee"), -2.0)]
+        [
+            (joint("toe"), -3.0),
+            (joint("hip"), -1.0),
+            (joint("knee"), -2.0)
+        ]
     );
     assert_eq!(row(contract.action())[0].0, joint("toe"));
 }
@@ -58,7 +64,12 @@ fn history(layout: &str, order: &str, start: &str) -> Vec<Vec<f32>> {
         wide_action(9)
     );
     let case = Case::new(&mirror(9), &robot);
-    let rows = [[1.0, 11.0, 21.0], [2.0, 12.0, 22.0], [3.0, 13.0, 23.0], [4.0, 14.0, 24.0]];
+    let rows = [
+        [1.0, 11.0, 21.0],
+        [2.0, 12.0, 22.0],
+        [3.0, 13.0, 23.0],
+        [4.0, 14.0, 24.0],
+    ];
     let mut steps: Vec<_> = rows.iter().map(|row| step(&[&row[..]])).collect();
     steps.insert(3, None);
     case.actions(&steps)
@@ -67,23 +78,44 @@ fn history(layout: &str, order: &str, start: &str) -> Vec<Vec<f32>> {
 #[test]
 fn histories_are_laid_out_as_the_graph_reads_them() {
     let by_term = history("term", "oldest_first", "first");
-    close(&by_term[0], &[2.0, 2.0, 2.0, 10.0, 20.0, 10.0, 20.0, 10.0, 20.0]);
-    close(&by_term[2], &[2.0, 4.0, 6.0, 10.0, 20.0, 11.0, 21.0, 12.0, 22.0]);
+    close(
+        &by_term[0],
+        &[2.0, 2.0, 2.0, 10.0, 20.0, 10.0, 20.0, 10.0, 20.0],
+    );
+    close(
+        &by_term[2],
+        &[2.0, 4.0, 6.0, 10.0, 20.0, 11.0, 21.0, 12.0, 22.0],
+    );
     // Another episode knows nothing of the one before.
-    close(&by_term[3], &[8.0, 8.0, 8.0, 13.0, 23.0, 13.0, 23.0, 13.0, 23.0]);
+    close(
+        &by_term[3],
+        &[8.0, 8.0, 8.0, 13.0, 23.0, 13.0, 23.0, 13.0, 23.0],
+    );
     let by_time = history("time", "newest_first", "zero");
-    close(&by_time[0], &[2.0, 10.0, 20.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
-    close(&by_time[2], &[6.0, 12.0, 22.0, 4.0, 11.0, 21.0, 2.0, 10.0, 20.0]);
-    close(&by_time[3], &[8.0, 13.0, 23.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    close(
+        &by_time[0],
+        &[2.0, 10.0, 20.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+    );
+    close(
+        &by_time[2],
+        &[6.0, 12.0, 22.0, 4.0, 11.0, 21.0, 2.0, 10.0, 20.0],
+    );
+    close(
+        &by_time[3],
+        &[8.0, 13.0, 23.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+    );
     let by_element = history("element", "oldest_first", "zero");
-    close(&by_element[1], &[0.0, 2.0, 4.0, 0.0, 10.0, 11.0, 0.0, 20.0, 21.0]);
+    close(
+        &by_element[1],
+        &[0.0, 2.0, 4.0, 0.0, 10.0, 11.0, 0.0, 20.0, 21.0],
+    );
 }
 
 #[test]
 fn terms_may_have_histories_of_their_own() {
     let robot = format!(
         "{HEAD}history = {{ layout = \"term\", order = \"oldest_first\", start = \"first\" }}\n\
-         [[term]]\nname = \"a\"\n{SENSOR}history = 3\n[[term]]\nname = \"b\"\n{SENSOR}history = 2\n[[term]]\nname = \"c\"\n{SENSOR}{}",
+         [[term]]\nname = \"a\"\nwidth = 1\n{SENSOR}history = 3\n[[term]]\nname = \"b\"\nwidth = 1\n{SENSOR}history = 2\n[[term]]\nname = \"c\"\n{SENSOR}{}",
         wide_action(6)
     );
     let case = Case::new(&mirror(6), &robot);
@@ -171,7 +203,10 @@ fn states_of_the_graph_are_kept_and_cleared() {
     let robot = format!("{HEAD}[[term]]\nname = \"a\"\n{SENSOR}{}", wide_action(1));
     let case = Case::new(&graph, &robot);
     let told = case.refused();
-    assert!(told.contains("action.output") && told.contains("h_out"), "{told}");
+    assert!(
+        told.contains("action.output") && told.contains("h_out"),
+        "{told}"
+    );
     assert!(told.contains("`input` it is a part of"), "{told}");
     let imported = case
         .import_with(|request| {

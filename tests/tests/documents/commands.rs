@@ -146,7 +146,8 @@ fn folder() -> tempfile::TempDir {
     let release = folder.path().join("target/release");
     fs::create_dir_all(release.join("examples")).expect("there is room");
     for program in BUILT {
-        symlink(target.join("debug").join(program), release.join(program)).expect("links can be made");
+        symlink(target.join("debug").join(program), release.join(program))
+            .expect("links can be made");
     }
     folder
 }

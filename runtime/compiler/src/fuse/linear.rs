@@ -7,7 +7,7 @@ use std::collections::HashMap;
 
 use lads_image::op::{BinaryKind, UnaryKind};
 
-use super::Fused;
+use super::{Fused, columns};
 use crate::graph::{Dim, Graph, Id, Op, Rewriter, Type, Unary, topological};
 
 /// Fuses the linear layers of an entry.
@@ -62,13 +62,14 @@ fn product(g: &mut Graph, x: &[Id]) -> Result<Option<Id>, String> {
     if !(matrix && rows) {
         return Ok(None);
     }
+    let (rows, matrix) = columns::sorted(g, x[0], x[1])?.unwrap_or((x[0], x[1]));
     g.linear(
         Op::Linear {
             bias: false,
             residual: false,
             activation: None,
         },
-        x.to_vec(),
+        vec![rows, matrix],
     )
     .map(Some)
 }

@@ -116,9 +116,9 @@ fn rows(g: &mut Graph, value: Id, along: usize, rows: &[usize]) -> Result<Id, St
     if rows.windows(2).all(|pair| pair[0] + 1 == pair[1]) {
         return g.slice(value, along, rows[0], rows.len());
     }
-    let parts = rows
-        .iter()
-        .map(|&row| g.slice(value, along, row, 1))
+    let runs = rows.chunk_by(|a, b| a + 1 == *b);
+    let parts = runs
+        .map(|run| g.slice(value, along, run[0], run.len()))
         .collect::<Result<Vec<_>, _>>()?;
     g.concat(&parts, along)
 }

@@ -36,8 +36,9 @@ fn main() -> ExitCode {
 }
 
 fn run() -> Result<(), Box<dyn Error>> {
-    let (flags, named): (Vec<_>, Vec<_>) =
-        std::env::args().skip(1).partition(|argument| argument == "--fast");
+    let (flags, named): (Vec<_>, Vec<_>) = std::env::args()
+        .skip(1)
+        .partition(|argument| argument == "--fast");
     let [stand, walk, more @ ..] = &named[..] else {
         return Err("usage: biped STAND WALK [PERIODS] [--fast]".into());
     };
@@ -138,12 +139,20 @@ impl Robot {
             .action()
             .elements()
             .filter_map(|target| {
-                Some((place(target.joint, "position")?, place(target.joint, "velocity")?))
+                Some((
+                    place(target.joint, "position")?,
+                    place(target.joint, "velocity")?,
+                ))
             })
             .collect();
-        let mut sensors: Vec<f32> = channel.elements().map(|element| element.limits.clamp(0.0)).collect();
+        let mut sensors: Vec<f32> = channel
+            .elements()
+            .map(|element| element.limits.clamp(0.0))
+            .collect();
         // Upright.
-        let upright = channel.elements().position(|element| element.name.ends_with("gravity.w"));
+        let upright = channel
+            .elements()
+            .position(|element| element.name.ends_with("gravity.w"));
         if let Some(w) = upright {
             sensors[w] = 1.0;
         }

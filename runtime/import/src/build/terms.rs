@@ -6,7 +6,7 @@
 use std::collections::HashMap;
 
 use super::{Kept, Net};
-use crate::plan::{Channel, Feed, Plan, Source, Stack, Term};
+use crate::plan::{Bounds, Feed, Plan, Source, Stack, Term};
 use crate::robot::{Layout, Order, Start, Wave};
 
 /// States beside those of the graphs.
@@ -19,12 +19,80 @@ pub(super) struct Pieces<'p> {
     plan: &'p Plan,
     /// Rows of each channel's ring; the ring is an input already where the number is there.
     rings: HashMap<usize, usize>,
+    /// How the columns of each channel are processed, where all terms agree on it.
+    whole: Vec<Option<Whole>>,
+    /// Processed values, by the raw ones.
+    done: HashMap<String, String>,
     last_action: bool,
     /// The clock's turn in a step.
     clock: Option<f64>,
     steps: bool,
     histories: usize,
 }
+
+/// Offset, clip and scale of every column of a channel: one operation for the channel instead of one for each term.
+struct Whole {
+    offset: Vec<f64>,
+    clip: Bounds,
+    scale: Vec<f64>,
+}
+
+impl Whole {
+    /// `None` if two terms read a column differently.
+    fn of(plan: &Plan, wanted: usize) -> Option<Self> {
+        let mut columns: Vec<Option<[f64; 4]>> = vec![None; plan.channels[wanted].elements.len()];
+        for (_, feed) in &plan.feeds {
+            let Feed::Terms { terms, .. } = feed else {
+                continue;
+            };
+            for term in terms {
+                let Source::Columns {
+                    channel,
+                    columns: own,
+                } = &term.source
+                else {
+                    continue;
+                };
+                for (i, &column) in own.iter().enumerate().filter(|_| *channel == wanted) {
+                    let (low, high) = match &term.clip {
+                        Some((low, high)) => (low[i], high[i]),
+                        None => UNBOUNDED,
+                    };
+                    let row = [term.offset[i], low, high, term.scale[i]];
+                    if columns[column].is_some_and(|known| known != row) {
+                        return None;
+                    }
+                    columns[column] = Some(row);
+                }
+            }
+        }
+        // Of an orientation's columns nothing but gravity is read.
+        let of = |part: usize| {
+            let neutral = [0.0, UNBOUNDED.0, UNBOUNDED.1, 1.0];
+            columns
+                .iter()
+                .map(|row| row.unwrap_or(neutral)[part])
+                .collect()
+        };
+        Some(Self {
+            offset: of(0),
+            clip: (of(1), of(2)),
+            scale: of(3),
+        })
+    }
+
+    fn process(&self, net: &mut Net, raw: String) -> String {
+        let value = net.moved("Sub", raw, &self.offset);
+        let (low, high) = &self.clip;
+        let bounded = low.iter().any(|&low| low != UNBOUNDED.0)
+            || high.iter().any(|&high| high != UNBOUNDED.1);
+        let value = net.clipped(value, bounded.then_some(&self.clip));
+        net.scaled(value, &self.scale)
+    }
+}
+
+/// Bounds of a column that is not clipped.
+const UNBOUNDED: (f64, f64) = (f32::MIN as f64, f32::MAX as f64);
 
 /// The files whose outputs an input is made of.
 pub(super) fn outputs(feed: &Feed) -> Vec<usize> {
@@ -46,6 +114,10 @@ impl<'p> Pieces<'p> {
         Self {
             plan,
             rings: HashMap::new(),
+            whole: (0..plan.channels.len())
+                .map(|channel| Whole::of(plan, channel))
+                .collect(),
+            done: HashMap::new(),
             last_action: false,
             clock: None,
             steps: false,
@@ -96,13 +168,12 @@ impl<'p> Pieces<'p> {
         };
         if let (Some(channel), Start::First, true) = (channel, start, term.history > 1) {
             let raw = self.ring(net, channel, term.history);
-            return processed(net, &self.plan.channels[channel], term, &raw);
+            return self.processed(net, channel, term, raw);
         }
         let now = match channel {
             Some(channel) => {
-                let found = &self.plan.channels[channel];
-                let raw = net.entry(&found.name);
-                processed(net, found, term, &raw)
+                let raw = net.entry(&self.plan.channels[channel].name);
+                self.processed(net, channel, term, raw)
             }
             None => {
                 let raw = self.own(net, term).unwrap_or_default();
@@ -146,6 +217,30 @@ impl<'p> Pieces<'p> {
         }
         let last: Vec<i64> = ((rows - history) as i64..rows as i64).collect();
         net.gathered(&value, &last, 0)
+    }
+
+    /// `clip(raw - offset) * scale` of a term's columns of a channel's rows.
+    fn processed(&mut self, net: &mut Net, channel: usize, term: &Term, raw: String) -> String {
+        let width = self.plan.channels[channel].elements.len();
+        match (&term.source, &self.whole[channel]) {
+            (Source::Columns { columns, .. }, Some(whole)) => {
+                let all = match self.done.get(&raw) {
+                    Some(all) => all.clone(),
+                    None => whole.process(net, raw.clone()),
+                };
+                self.done.insert(raw, all.clone());
+                net.columns(all, columns, width)
+            }
+            (Source::Columns { columns, .. }, None) => {
+                let picked = net.columns(raw, columns, width);
+                finished(net, term, picked)
+            }
+            (Source::Gravity { columns, .. }, _) => {
+                let value = gravity(net, &raw, columns);
+                finished(net, term, value)
+            }
+            _ => raw,
+        }
     }
 
     /// What the runtime makes itself, `[1, width]`; `None` for what the caller gives.
@@ -253,17 +348,6 @@ fn longest(plan: &Plan, wanted: usize) -> usize {
     of_channel.map(|term| term.history).max().unwrap_or(1)
 }
 
-/// `clip(raw - offset) * scale` of a term's columns of a channel's rows.
-fn processed(net: &mut Net, channel: &Channel, term: &Term, raw: &str) -> String {
-    let width = channel.elements.len();
-    let picked = match &term.source {
-        Source::Columns { columns, .. } => net.columns(raw.into(), columns, width),
-        Source::Gravity { columns, .. } => gravity(net, raw, columns),
-        _ => raw.into(),
-    };
-    finished(net, term, picked)
-}
-
 fn finished(net: &mut Net, term: &Term, value: String) -> String {
     let value = net.moved("Sub", value, &term.offset);
     let value = net.clipped(value, term.clip.as_ref());
@@ -279,7 +363,11 @@ fn gravity(net: &mut Net, raw: &str, columns: &[usize; 4]) -> String {
     let [wy, xz, yz, wx] = [(&w, &y), (&x, &z), (&y, &z), (&w, &x)].map(|(a, b)| product(a, b));
     let [ww, xx, yy, zz] = [&w, &x, &y, &z].map(|a| product(a, a));
     let mut pair = |operator: &str, a: &str, b: &str| net.op(operator, &[a, b], vec![]);
-    let (forward, left, down) = (pair("Sub", &wy, &xz), pair("Add", &yz, &wx), pair("Add", &xx, &yy));
+    let (forward, left, down) = (
+        pair("Sub", &wy, &xz),
+        pair("Add", &yz, &wx),
+        pair("Add", &xx, &yy),
+    );
     let rest = pair("Add", &ww, &zz);
     let square = pair("Add", &down, &rest);
     let parts = net.joined(&[forward, left, down], 1);

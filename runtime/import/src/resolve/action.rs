@@ -1,7 +1,7 @@
 //! The policy's output: which one it is, what a number of it means, and how far it may go.
 
-use super::elements::{Joints, bounds, limits, spread};
 use super::Edges;
+use super::elements::{Joints, bounds, limits, spread};
 use crate::plan::{Action, Element};
 use crate::problem::Problems;
 use crate::robot::Robot;
@@ -49,7 +49,10 @@ pub(crate) fn resolve(
         Some(_) => {}
     }
     if said.unit.is_none() {
-        problems.add("action.unit", "is not said: of what the robot gets, for example \"rad\"");
+        problems.add(
+            "action.unit",
+            "is not said: of what the robot gets, for example \"rad\"",
+        );
     }
     let limits = limits(
         [said.min.as_ref(), said.max.as_ref()],
@@ -59,8 +62,16 @@ pub(crate) fn resolve(
         problems,
     );
     for (field, missing, what) in [
-        ("action.scale", said.scale.is_none(), "what the policy's number is multiplied with; 1 for nothing"),
-        ("action.offset", said.offset.is_none(), "what is added to it then, for example the default posture; 0 for nothing"),
+        (
+            "action.scale",
+            said.scale.is_none(),
+            "what the policy's number is multiplied with; 1 for nothing",
+        ),
+        (
+            "action.offset",
+            said.offset.is_none(),
+            "what is added to it then, for example the default posture; 0 for nothing",
+        ),
     ] {
         if missing {
             problems.add(field, format!("is not said: {what}"));
@@ -74,7 +85,10 @@ pub(crate) fn resolve(
     if let Some(tolerance) = said.tolerance
         && !(tolerance.is_finite() && tolerance > 0.0)
     {
-        problems.add("action.tolerance", format!("is {tolerance}, it must be positive"));
+        problems.add(
+            "action.tolerance",
+            format!("is {tolerance}, it must be positive"),
+        );
     }
     let names = names.filter(|names| names.len() == width)?;
     let order = match of_joints {

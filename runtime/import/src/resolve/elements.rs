@@ -35,7 +35,10 @@ impl Joints {
                 "is not said: the names of all of the robot's joints in its own order, in which `joint_ids_map` numbers them",
             );
         }
-        for (field, names) in [("joints", &policy), ("robot_joints", order.as_ref().unwrap_or(&vec![]))] {
+        for (field, names) in [
+            ("joints", &policy),
+            ("robot_joints", order.as_ref().unwrap_or(&vec![])),
+        ] {
             for (i, name) in names.iter().enumerate() {
                 if name.trim().is_empty() || names[..i].contains(name) {
                     problems.add(field, format!("names \"{name}\" twice, or not at all"));
@@ -84,7 +87,10 @@ pub(crate) fn spread(
             return None;
         }
     };
-    if let Some(value) = values.iter().find(|value| !value.is_finite() || value.abs() > 1e30) {
+    if let Some(value) = values
+        .iter()
+        .find(|value| !value.is_finite() || value.abs() > 1e30)
+    {
         problems.add(about, format!("holds {value}, which is no finite number"));
         return None;
     }

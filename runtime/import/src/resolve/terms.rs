@@ -12,7 +12,14 @@ use crate::robot::{self, From, History, Layout, Order, QuaternionOrder, Robot, S
 const OBSERVATION: &str = "observation";
 
 /// Names that mean something else to a policy of the family `plain`.
-const RESERVED: [&str; 6] = ["action", "previous_action", "timestep", "phase", "pass", "index"];
+const RESERVED: [&str; 6] = [
+    "action",
+    "previous_action",
+    "timestep",
+    "phase",
+    "pass",
+    "index",
+];
 
 /// A unit quaternion's elements, and a little more for the rounding of whoever computes it.
 const QUATERNION: f64 = 1.01;
@@ -44,7 +51,10 @@ pub(super) fn feed(context: &mut Context, input: &Edge, said: &[&robot::Term]) -
         .and_then(|own| own.history.clone())
         .or_else(|| context.robot.history.clone())
         .unwrap_or_default();
-    let terms: Vec<(robot::Term, bool)> = said.iter().map(|term| completed(term)).collect();
+    let terms: Vec<(robot::Term, bool)> = said
+        .iter()
+        .map(|term| completed(context.robot, term))
+        .collect();
     let lengths: Vec<usize> = terms
         .iter()
         .map(|(term, _)| term.history.or(rule.length).unwrap_or(1))
@@ -65,9 +75,32 @@ pub(super) fn feed(context: &mut Context, input: &Edge, said: &[&robot::Term]) -
     })
 }
 
-/// A term with what its name says, and whether it is relative to the default posture by definition.
-fn completed(term: &robot::Term) -> (robot::Term, bool) {
+/// A term with what its name says, and whether it is relative to the default posture by definition. What a sensor gives is said once,
+/// also where several inputs read it.
+fn completed(robot: &Robot, term: &robot::Term) -> (robot::Term, bool) {
     let mut term = term.clone();
+    let same = |other: &&robot::Term| {
+        let sensor = |from: &Option<From>| matches!(from, None | Some(From::Sensor));
+        other.name == term.name
+            && other.channel == term.channel
+            && sensor(&other.from)
+            && sensor(&term.from)
+    };
+    if let Some(other) = robot
+        .terms
+        .iter()
+        .filter(same)
+        .find(|other| other.unit.is_some())
+    {
+        term.fill(robot::Term {
+            unit: other.unit.clone(),
+            interface: other.interface.clone(),
+            elements: other.elements.clone(),
+            min: other.min.clone(),
+            max: other.max.clone(),
+            ..robot::Term::default()
+        });
+    }
     let found = known(&term.name);
     let relative = found.as_ref().is_some_and(|found| found.relative);
     if let Some(found) = found {
@@ -84,14 +117,17 @@ fn stack(
     terms: &[(robot::Term, bool)],
 ) -> Option<Stack> {
     if lengths.contains(&0) {
-        context.problems.add(about, "a `history` is 0; 1 is the present step alone");
+        context
+            .problems
+            .add(about, "a `history` is 0; 1 is the present step alone");
         return None;
     }
     let longest = lengths.iter().max().copied().unwrap_or(1);
     if longest > 1024 {
-        context
-            .problems
-            .add(about, format!("a `history` is {longest}, more than 1024 steps"));
+        context.problems.add(
+            about,
+            format!("a `history` is {longest}, more than 1024 steps"),
+        );
         return None;
     }
     if longest == 1 {
@@ -102,9 +138,21 @@ fn stack(
         });
     }
     for (field, missing, what) in [
-        ("layout", rule.layout.is_none(), "\"term\" (all steps of a term, then of the next), \"time\" (all terms of a step, then of the next) or \"element\" (all steps of an element, then of the next)"),
-        ("order", rule.order.is_none(), "\"oldest_first\" or \"newest_first\""),
-        ("start", rule.start.is_none(), "what stands for steps before the first: \"first\" (the first step) or \"zero\""),
+        (
+            "layout",
+            rule.layout.is_none(),
+            "\"term\" (all steps of a term, then of the next), \"time\" (all terms of a step, then of the next) or \"element\" (all steps of an element, then of the next)",
+        ),
+        (
+            "order",
+            rule.order.is_none(),
+            "\"oldest_first\" or \"newest_first\"",
+        ),
+        (
+            "start",
+            rule.start.is_none(),
+            "what stands for steps before the first: \"first\" (the first step) or \"zero\"",
+        ),
     ] {
         if missing {
             context.problems.add(
@@ -127,7 +175,10 @@ fn stack(
     }
     if stack.start == Start::First {
         for ((term, _), _) in terms.iter().zip(lengths).filter(|(_, length)| **length > 1) {
-            if matches!(term.from, Some(From::Phase | From::Step | From::First | From::Output(_))) {
+            if matches!(
+                term.from,
+                Some(From::Phase | From::Step | From::First | From::Output(_))
+            ) {
                 context.problems.add(
                     format!("term.{}", term.name),
                     "has a history that begins with its first step, which only what the caller gives and the last action can have; use `start = \"zero\"`",
@@ -146,10 +197,8 @@ fn widths(
     terms: &[(robot::Term, bool)],
     lengths: &[usize],
 ) -> Option<Vec<usize>> {
-    let mut widths: Vec<Option<usize>> = terms
-        .iter()
-        .map(|(term, _)| width(context, term))
-        .collect();
+    let mut widths: Vec<Option<usize>> =
+        terms.iter().map(|(term, _)| width(context, term)).collect();
     let sum = |widths: &[Option<usize>]| {
         let parts = widths.iter().zip(lengths);
         parts
@@ -167,27 +216,38 @@ fn widths(
     let open: Vec<usize> = (0..widths.len()).filter(|&i| widths[i].is_none()).collect();
     for &i in &open {
         let wanted = "how many elements it has is not said: `width`, `elements` (their names) or `per_joint = true`";
-        context.problems.add(format!("term.{}", terms[i].0.name), wanted);
+        context
+            .problems
+            .add(format!("term.{}", terms[i].0.name), wanted);
     }
     let table = || {
         let rows = terms.iter().zip(&widths).zip(lengths);
         let rows = rows.map(|(((term, _), width), length)| {
             let width = width.map_or("?".into(), |width| width.to_string());
-            let times = if *length == 1 { String::new() } else { format!(" x {length} steps") };
+            let times = if *length == 1 {
+                String::new()
+            } else {
+                format!(" x {length} steps")
+            };
             format!("{} {width}{times}", term.name)
         });
         rows.collect::<Vec<_>>().join(", ")
     };
     if !open.is_empty() {
-        context
-            .problems
-            .add(about, format!("has {len} elements; known so far: {}", table()));
+        context.problems.add(
+            about,
+            format!("has {len} elements; known so far: {}", table()),
+        );
         return None;
     }
     if sum(&widths) != len {
         context.problems.add(
             about,
-            format!("has {len} elements, its terms add up to {}: {}", sum(&widths), table()),
+            format!(
+                "has {len} elements, its terms add up to {}: {}",
+                sum(&widths),
+                table()
+            ),
         );
         return None;
     }
@@ -240,7 +300,11 @@ fn resolved(
     let source = source(context, term, width, &about);
     let mut offset = term.offset.clone();
     if relative && offset.is_none() {
-        offset = context.robot.default_position.clone().map(robot::Each::Many);
+        offset = context
+            .robot
+            .default_position
+            .clone()
+            .map(robot::Each::Many);
     }
     let positions = term.per_joint == Some(true)
         && term.interface.as_deref() == Some("position")
@@ -251,13 +315,24 @@ fn resolved(
             "is not said: the joint positions that the policy sees as 0, in its own order (its default posture), or 0 if it sees positions as they are",
         );
     }
-    let number = |each: Option<robot::Each>, otherwise: f64| each.unwrap_or(robot::Each::One(otherwise));
+    let number =
+        |each: Option<robot::Each>, otherwise: f64| each.unwrap_or(robot::Each::One(otherwise));
     let mut each = |each: robot::Each, field: &str| {
-        spread(Some(&each), width, &format!("{about}.{field}"), context.problems)
+        spread(
+            Some(&each),
+            width,
+            &format!("{about}.{field}"),
+            context.problems,
+        )
     };
     let offset = each(number(offset, 0.0), "offset");
     let scale = each(number(term.scale.clone(), 1.0), "scale");
-    let clip = bounds(term.clip.as_ref(), width, &format!("{about}.clip"), context.problems);
+    let clip = bounds(
+        term.clip.as_ref(),
+        width,
+        &format!("{about}.clip"),
+        context.problems,
+    );
     Some(Term {
         name: term.name.clone(),
         source: source?,
@@ -276,7 +351,9 @@ fn plain(name: &str) -> bool {
 fn source(context: &mut Context, term: &robot::Term, width: usize, about: &str) -> Option<Source> {
     let said = [&term.unit, &term.interface, &term.channel];
     let raw = matches!(term.from, None | Some(From::Sensor | From::Gravity));
-    if !raw && (said.iter().any(|field| field.is_some()) || term.min.is_some() || term.max.is_some()) {
+    if !raw
+        && (said.iter().any(|field| field.is_some()) || term.min.is_some() || term.max.is_some())
+    {
         context.problems.add(
             about,
             "is made by the runtime itself, so it has no `unit`, `interface`, `channel`, `min` and `max`",
@@ -310,7 +387,10 @@ fn phase(context: &mut Context, term: &robot::Term, about: &str) -> Option<Sourc
     if !(phase.period_s.is_finite() && phase.period_s > period) {
         context.problems.add(
             format!("{about}.phase.period_s"),
-            format!("is {}, it must be longer than a control step of {period} s", phase.period_s),
+            format!(
+                "is {}, it must be longer than a control step of {period} s",
+                phase.period_s
+            ),
         );
         return None;
     }
@@ -330,7 +410,10 @@ fn sensor(context: &mut Context, term: &robot::Term, width: usize, about: &str) 
     {
         context.problems.add(
             about,
-            format!("has {width} elements, one for each joint, and there are {} joints", joints.len()),
+            format!(
+                "has {width} elements, one for each joint, and there are {} joints",
+                joints.len()
+            ),
         );
         return None;
     }
@@ -352,7 +435,10 @@ fn sensor(context: &mut Context, term: &robot::Term, width: usize, about: &str) 
             );
             return None;
         }
-        return Some(Source::Columns { channel, columns: columns(first) });
+        return Some(Source::Columns {
+            channel,
+            columns: columns(first),
+        });
     }
     if term.unit.is_none() {
         context.problems.add(
@@ -401,7 +487,10 @@ fn sensor(context: &mut Context, term: &robot::Term, width: usize, about: &str) 
         .channels
         .iter()
         .position(|known| known.name == *term.channel.as_deref().unwrap_or(OBSERVATION))?;
-    Some(Source::Columns { channel, columns: columns(first) })
+    Some(Source::Columns {
+        channel,
+        columns: columns(first),
+    })
 }
 
 fn gravity(context: &mut Context, term: &robot::Term, about: &str) -> Option<Source> {
@@ -450,7 +539,10 @@ fn place(
     if RESERVED.contains(&name) || name.contains('.') || name.is_empty() || !plain(name) {
         context.problems.add(
             format!("{about}.channel"),
-            format!("\"{name}\" cannot name a channel: letters, digits, `_` and `-` do, except {}", RESERVED.join(", ")),
+            format!(
+                "\"{name}\" cannot name a channel: letters, digits, `_` and `-` do, except {}",
+                RESERVED.join(", ")
+            ),
         );
         return None;
     }
@@ -485,21 +577,37 @@ fn element(term: &str, name: &str) -> String {
 pub(super) fn check_channels(channels: &[Channel], problems: &mut Problems) {
     let most = lads_core::MAX_OBSERVATIONS;
     if channels.len() > most {
-        let names: Vec<&str> = channels.iter().map(|channel| channel.name.as_str()).collect();
+        let names: Vec<&str> = channels
+            .iter()
+            .map(|channel| channel.name.as_str())
+            .collect();
         problems.add(
             "channel",
-            format!("there are {} channels ({}), a controller takes {most}; put terms together", channels.len(), names.join(", ")),
+            format!(
+                "there are {} channels ({}), a controller takes {most}; put terms together",
+                channels.len(),
+                names.join(", ")
+            ),
         );
     }
     if channels.is_empty() && problems.is_empty() {
-        problems.add("term", "no term comes from the caller; a policy observes something");
+        problems.add(
+            "term",
+            "no term comes from the caller; a policy observes something",
+        );
     }
     for channel in channels {
         for (i, element) in channel.elements.iter().enumerate() {
-            if channel.elements[..i].iter().any(|other| other.name == element.name) {
+            if channel.elements[..i]
+                .iter()
+                .any(|other| other.name == element.name)
+            {
                 problems.add(
                     format!("channel `{}`", channel.name),
-                    format!("has an element `{}` twice; give the terms or their elements other names", element.name),
+                    format!(
+                        "has an element `{}` twice; give the terms or their elements other names",
+                        element.name
+                    ),
                 );
             }
         }

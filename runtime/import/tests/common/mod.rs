@@ -1,7 +1,7 @@
 //! Small policies whose action is what they read, so that what an import puts in front of them can be looked at.
 #![allow(dead_code, reason = "each suite uses its part")]
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use lads_compiler::onnx::{
     DimensionProto, GraphProto, ModelProto, NodeProto, OperatorSetIdProto, StringStringEntryProto,
@@ -114,12 +114,17 @@ pub const HEAD: &str =
 /// A folder with a policy and a description.
 pub struct Case {
     pub folder: TempDir,
+    model: PathBuf,
+    robot: PathBuf,
 }
 
 impl Case {
     pub fn new(model: &ModelProto, robot: &str) -> Self {
+        let folder = TempDir::new().expect("a folder");
         let case = Self {
-            folder: TempDir::new().expect("a folder"),
+            model: folder.path().join("policy.onnx"),
+            robot: folder.path().join("robot.toml"),
+            folder,
         };
         case.put("policy.onnx", &model.encode_to_vec());
         case.put("robot.toml", robot.as_bytes());
@@ -140,11 +145,13 @@ impl Case {
         self.import_with(|_| {})
     }
 
-    pub fn import_with(&self, change: impl FnOnce(&mut Request)) -> Result<Imported, ImportError> {
-        let (model, robot) = (self.path("policy.onnx"), self.path("robot.toml"));
+    pub fn import_with<'r>(
+        &'r self,
+        change: impl FnOnce(&mut Request<'r>),
+    ) -> Result<Imported, ImportError> {
         let mut request = Request {
-            models: vec![Path::new(&model)],
-            robot: Some(&robot),
+            models: vec![self.model.as_path()],
+            robot: Some(&self.robot),
             ..Request::default()
         };
         change(&mut request);
@@ -172,7 +179,10 @@ pub fn run(bundle: &[u8], steps: &[Option<Vec<Vec<f32>>>]) -> Vec<Vec<f32>> {
     let mut controller = loaded.controller();
     controller.self_test().expect("the golden steps replay");
     let contract = controller.policy().contract();
-    let ids: Vec<ChannelId> = contract.observations().map(|channel| channel.id()).collect();
+    let ids: Vec<ChannelId> = contract
+        .observations()
+        .map(|channel| channel.id())
+        .collect();
     let mut action = vec![0.0; contract.action_len()];
     let mut all = vec![];
     for step in steps {
@@ -180,8 +190,9 @@ pub fn run(bundle: &[u8], steps: &[Option<Vec<Vec<f32>>>]) -> Vec<Vec<f32>> {
             controller.reset();
             continue;
         };
-        let given: Vec<(ChannelId, Data)> =
-            (ids.iter().copied()).zip(rows.iter().map(|row| Data::F32(row))).collect();
+        let given: Vec<(ChannelId, Data)> = (ids.iter().copied())
+            .zip(rows.iter().map(|row| Data::F32(row)))
+            .collect();
         controller.step_with(&given, &mut action).expect("a step");
         all.push(action.clone());
     }
@@ -193,6 +204,9 @@ pub fn run(bundle: &[u8], steps: &[Option<Vec<Vec<f32>>>]) -> Vec<Vec<f32>> {
 pub fn close(got: &[f32], wanted: &[f32]) {
     assert_eq!(got.len(), wanted.len());
     for (got_one, wanted_one) in got.iter().zip(wanted) {
-        assert!((got_one - wanted_one).abs() < 1e-5, "{got:?} is not {wanted:?}");
+        assert!(
+            (got_one - wanted_one).abs() < 1e-5,
+            "{got:?} is not {wanted:?}"
+        );
     }
 }
