@@ -13,12 +13,12 @@
 //!
 //! ```text
 //! Abs Add And ArgMax ArgMin BatchNormalization Cast Celu Clip Concat ConcatFromSequence Constant ConstantOfShape Div Dropout
-//! Einsum Elu Equal Erf Exp Expand EyeLike Flatten GRU Gather Gelu Gemm Greater GreaterOrEqual GroupNormalization HardSigmoid
-//! HardSwish Identity InstanceNormalization LSTM LayerNormalization LeakyRelu Less LessOrEqual Log LogSoftmax MatMul Max Min Mish
-//! Mul Neg Not Or PRelu Pad Pow RMSNormalization Range Reciprocal ReduceL1 ReduceL2 ReduceMax ReduceMean ReduceMin ReduceProd
-//! ReduceSum ReduceSumSquare Relu Reshape ScatterND Selu SequenceAt SequenceConstruct SequenceEmpty SequenceInsert SequenceLength
-//! Shape Sigmoid Size Slice Softmax Softplus Softsign Split SplitToSequence Sqrt Squeeze Sub Sum Swish Tanh ThresholdedRelu Tile
-//! Transpose Unsqueeze Where Xor
+//! Einsum Elu Equal Erf Exp Expand EyeLike Flatten GRU Gather GatherND Gelu Gemm Greater GreaterOrEqual GroupNormalization
+//! HardSigmoid HardSwish Identity InstanceNormalization LSTM LayerNormalization LeakyRelu Less LessOrEqual Log LogSoftmax MatMul
+//! Max Min Mish Mul Neg Not Or PRelu Pad Pow RMSNormalization Range Reciprocal ReduceL1 ReduceL2 ReduceMax ReduceMean ReduceMin
+//! ReduceProd ReduceSum ReduceSumSquare Relu Reshape ScatterND Selu SequenceAt SequenceConstruct SequenceEmpty SequenceInsert
+//! SequenceLength Shape Sigmoid Size Slice Softmax Softplus Softsign Split SplitToSequence Sqrt Squeeze Sub Sum Swish Tanh
+//! ThresholdedRelu Tile Transpose Unsqueeze Where Xor
 //! ```
 //!
 //! A program computes with 32-bit floats, whatever width the file's have: constants are rounded as the file says, what is computed
