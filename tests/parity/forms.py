@@ -7,6 +7,7 @@ newer one (`-dynamo`, where `onnxscript` is installed); the others are built nod
 them. Names of inputs and outputs, shapes and quirks are those of the field, sizes are not. The same seed gives the same files.
 """
 
+import importlib.util
 import io
 import json
 import pathlib
@@ -221,7 +222,6 @@ def torch_forms():
     yield "mlp-celu", mlp(lambda: nn.CELU(0.7)), observed, *plain, {}
     yield "mlp-gelu", mlp(nn.GELU), observed, *plain, {}
     yield "mlp-gelu-tanh", mlp(lambda: nn.GELU("tanh")), observed, *plain, {}
-    yield "mlp-threshold", mlp(lambda: nn.Threshold(0.1, 0.0)), observed, *plain, {}
     yield "mlp-dropout-batchnorm", nn.Sequential(nn.Linear(N, 16), nn.BatchNorm1d(16), nn.ELU(), nn.Dropout(), nn.Linear(16, M)), observed, *plain, {}
     yield "rank-one", mlp(nn.ELU), (torch.randn(N),), ["nn_input"], ["action"], {}, {}, {}
     yield "batch", mlp(nn.ELU), observed, *plain, {"batch": "batch_size"}
@@ -331,7 +331,7 @@ def built_forms(random):
     ]
     constants = {
         "two": np.array([2]), "minus": np.array([-1, -1]), "given": np.array([-1, N]), "gain": draw(N), "r0": np.int64(0), "r1": np.int64(N // 2),
-        "r2": np.int64(1), "twice": np.array([2]), "half": np.float32(2.5), "at": np.array([[1], [4]]), "new": np.float32([0.25, -0.5]),
+        "r2": np.int64(1), "twice": np.array([2]), "half": np.float32(2.5), "at": np.array([[0, 1], [0, 4]]), "new": np.float32([0.25, -0.5]),
         "square": np.zeros((N, N), np.float32), "from": np.array([-1]), "to": np.array([-N - 1]), "axis": np.array([1]), "step": np.array([-2]),
         "order": np.array([5, 0, 3, 1]), "w": draw(4, M),
     }  # fmt: skip
@@ -354,24 +354,21 @@ def built_forms(random):
     yield "newer-21", built(nodes, constants, {"obs": [1, N]}, {"actions": [1, M]}, 21, 10), "actions"
 
 
-def forms():
-    """All forms, in a fixed order."""
+def forms(wanted=lambda name: True):
+    """All forms whose names are wanted, in a fixed order."""
+    newer = importlib.util.find_spec("onnxscript") is not None
     torch.manual_seed(7)
-    try:
-        import onnxscript  # noqa: F401
-
-        newer = True
-    except ImportError:
-        newer = False
     for name, module, inputs, names, outputs, states, limits, more in torch_forms():
         for opset in OPSETS:
             # The exporter knows some operators from a later set on.
             with suppress(UnsupportedOperatorError):
-                yield Form(f"{name}-{opset}", traced(module, inputs, names, outputs, opset, **more), outputs[0], states, limits)
-        if newer and not more:
+                if wanted(f"{name}-{opset}"):
+                    yield Form(f"{name}-{opset}", traced(module, inputs, names, outputs, opset, **more), outputs[0], states, limits)
+        if newer and not more and wanted(f"{name}-dynamo"):
             yield Form(f"{name}-dynamo", traced(module, inputs, names, outputs, 18, dynamo=True), outputs[0], states, limits)
     for name, model, action in built_forms(np.random.default_rng(7)):
-        yield Form(name, model, action)
+        if wanted(name):
+            yield Form(name, model, action)
 
 
 def main(folder):

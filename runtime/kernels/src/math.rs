@@ -64,7 +64,7 @@ fn split(x: f32) -> (i32, f32) {
     (n, p * (r * r) + r)
 }
 
-/// `x` where `x >= 0`, else `alpha * (exp(x) - 1)`, near zero without cancellation; relative error below 2.5e-7.
+/// `x` where `x >= 0`, else `alpha * (exp(x) - 1)`, near zero without cancellation; relative error below 1.2e-7 with an `alpha` of 1.
 #[inline(always)]
 pub fn elu(x: f32, alpha: f32) -> f32 {
     // Below -30 the exponential is lost beside one.

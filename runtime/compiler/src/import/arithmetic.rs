@@ -46,6 +46,22 @@ pub(super) fn binary(g: &mut Graph, kind: BinaryKind, a: Id, b: Id) -> Result<Id
     Ok(y)
 }
 
+/// A unary operator; of integers only of constants.
+pub(super) fn unary(g: &mut Graph, kind: UnaryKind, x: Id) -> Result<Id, String> {
+    let by: fn(i64) -> Option<i64> = match kind {
+        UnaryKind::Neg => i64::checked_neg,
+        UnaryKind::Abs => i64::checked_abs,
+        _ => return g.unary(Unary::of(kind), x),
+    };
+    let Some(integers) = g.constant(x).and_then(|tensor| tensor.as_i64()) else {
+        return g.unary(Unary::of(kind), x);
+    };
+    let integers: Option<Vec<i64>> = integers.iter().copied().map(by).collect();
+    let integers = integers.ok_or("overflows")?;
+    let shape = g.known_shape(x).unwrap_or_default();
+    Ok(g.add_const(Arc::new(Tensor::i64(&shape, integers))))
+}
+
 /// Whether a number that is computed stands for an integer of the file.
 fn is_whole(g: &Graph, id: Id) -> bool {
     let inputs = &g.node(id).inputs;

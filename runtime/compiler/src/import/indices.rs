@@ -4,7 +4,7 @@ use super::Operands;
 use super::attributes::Attributes;
 use super::operators::Outputs;
 use super::shapes::{axis, integers, wanted, within};
-use crate::graph::{Graph, Id, Type};
+use crate::graph::{Dim, Graph, Id, Type};
 
 pub(super) fn split(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let value = x.get(0)?;
@@ -153,5 +153,46 @@ pub(super) fn gather(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, 
     let picked: Option<Vec<usize>> = indices.iter().map(|&row| within(row, len)).collect();
     let picked = picked.ok_or_else(|| format!("has indices outside 0..{len}"))?;
     let picked = rows(g, value, along, &picked)?;
+    g.reshape(picked, &shape)
+}
+
+/// Rows by all indices of a row of `indices` at once: constants, or one that is computed of the first axis.
+pub(super) fn gather_nd(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> {
+    a.only("batch_dims", 0)?;
+    let (value, index) = (x.get(0)?, x.get(1)?);
+    let from = g.known_shape(value).ok_or("supports static shapes only")?;
+    let index_shape = g.shape(index).to_vec();
+    let depth = index_shape.last().and_then(|dim| dim.known());
+    let (Some(depth @ 1..), [outer @ .., _]) = (depth, &index_shape[..]) else {
+        return Err("needs indices of static shape".into());
+    };
+    if depth > from.len() {
+        return Err("has indices of more axes than its data".into());
+    }
+    let shape = [outer, &g.shape(value)[depth..]].concat();
+    let Some(indices) = g.constant(index).and_then(|tensor| tensor.as_i64()) else {
+        if depth != 1 {
+            return Err("supports an index of one axis only where it is computed".into());
+        }
+        let index = match g.ty(index) {
+            Type::F32 => g.to_index(index)?,
+            Type::I64 => index,
+        };
+        let row = g.gather_row(value, index)?;
+        return g.reshape(row, &shape);
+    };
+    let axes = &from[..depth];
+    let picked: Option<Vec<usize>> = indices
+        .chunks(depth)
+        .map(|at| {
+            let mut pairs = at.iter().zip(axes);
+            pairs.try_fold(0, |row, (&i, &dim)| Some(row * dim + within(i, dim)?))
+        })
+        .collect();
+    let picked = picked.ok_or_else(|| format!("has indices outside of {axes:?}"))?;
+    let mut flat = vec![Dim::of(axes.iter().product())];
+    flat.extend_from_slice(&g.shape(value)[depth..]);
+    let table = g.reshape(value, &flat)?;
+    let picked = rows(g, table, 0, &picked)?;
     g.reshape(picked, &shape)
 }

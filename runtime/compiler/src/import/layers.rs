@@ -62,7 +62,7 @@ pub(super) fn matmul(g: &mut Graph, x: &Operands) -> Outputs {
         shape.pop();
     }
     if from_a.len() == 1 {
-        shape.remove(shape.len() + from_b.len().min(2) - 3);
+        shape.remove(shape.len() - from_b.len().min(2));
     }
     g.reshape(y, &shape).map(|y| vec![y])
 }

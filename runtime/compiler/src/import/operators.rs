@@ -12,7 +12,7 @@ use super::layers::{gemm, log_softmax, matmul, softmax};
 use super::logic::{Comparison, both, compare, either, not, select};
 use super::norms::{batch_norm, group_norm, instance_norm, layer_norm, rms_norm};
 use super::reductions::{arg, reduce};
-use super::{Operands, recurrent, shapes};
+use super::{Operands, arithmetic, recurrent, shapes};
 use crate::graph::{Graph, Id, Op, Unary};
 
 /// Values that a node gives.
@@ -20,7 +20,7 @@ pub(super) type Outputs = Result<Vec<Id>, String>;
 
 /// Adds a node's operations to the graph.
 pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attributes) -> Outputs {
-    let unary = |g: &mut Graph, kind| g.unary(Unary::of(kind), x.get(0)?).map(|y| vec![y]);
+    let unary = |g: &mut Graph, kind| arithmetic::unary(g, kind, x.get(0)?).map(|y| vec![y]);
     match operator {
         "Add" => fold(g, x, BinaryKind::Add, 2),
         "Sub" => fold(g, x, BinaryKind::Sub, 2),

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::Operands;
 use super::attributes::Attributes;
 use super::constants::{cast, constant, eye_like, filled, range};
-use super::indices::{gather, slice, split};
+use super::indices::{gather, gather_nd, slice, split};
 use super::operators::Outputs;
 use super::parts::{pad, scatter, tile};
 use crate::graph::{Dim, Graph, Id, show};
@@ -93,6 +93,7 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
         "Tile" => one(tile(g, x)),
         "ScatterND" => one(scatter(g, x, a)),
         "Gather" => one(gather(g, x, a)),
+        "GatherND" => one(gather_nd(g, x, a)),
         _ => Err(UNKNOWN.into()),
     }
 }
