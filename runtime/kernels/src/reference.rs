@@ -17,8 +17,7 @@ pub fn activation(activation: Activation, x: f64) -> f64 {
         Activation::LeakyRelu(alpha) => x.max(0.0) + f64::from(alpha) * x.min(0.0),
         Activation::Tanh => libm::tanh(x),
         Activation::Sigmoid => 1.0 / (1.0 + libm::exp(-x)),
-        Activation::Elu(alpha) if x < 0.0 => f64::from(alpha) * libm::expm1(x),
-        Activation::Elu(_) => x,
+        Activation::Elu(alpha) => x.max(0.0) + f64::from(alpha) * libm::expm1(x.min(0.0)),
         Activation::Softplus => softplus(x),
         Activation::Mish => x * libm::tanh(softplus(x)),
     }

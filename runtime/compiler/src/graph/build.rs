@@ -391,7 +391,7 @@ impl Graph {
     }
 
     /// One number as an integer, without its fraction.
-    pub fn to_index(&mut self, x: Id) -> Built {
+    pub fn index_of(&mut self, x: Id) -> Built {
         self.floats(&[x])?;
         let shape = self.shape(x).to_vec();
         if shape.iter().any(|dim| !dim.is_one()) {
@@ -404,7 +404,7 @@ impl Graph {
     }
 
     /// One integer as a number.
-    pub fn from_index(&mut self, x: Id) -> Built {
+    pub fn number_of(&mut self, x: Id) -> Built {
         let shape = self.shape(x).to_vec();
         if self.ty(x) != Type::I64 || shape.iter().any(|dim| !dim.is_one()) {
             return Err(format!("reads {} as one integer", show(self.shape(x))));

@@ -78,7 +78,7 @@ pub(super) fn number(g: &mut Graph, id: Id) -> Result<Id, String> {
     let Some(tensor) = g.constant(id) else {
         return match g.ty(id) {
             Type::F32 => Ok(id),
-            Type::I64 => g.from_index(id),
+            Type::I64 => g.number_of(id),
         };
     };
     let Data::I64(integers) = &tensor.data else {

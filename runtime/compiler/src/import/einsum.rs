@@ -44,18 +44,15 @@ pub(super) fn einsum(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
         }
         terms.push(Term { id, axes });
     }
-    let output: Vec<char> = match right {
-        Some(right) => right.chars().collect(),
-        None => {
-            // What is named once, in the order of the alphabet.
-            let count = |name: char| left.chars().filter(|&c| c == name).count();
-            let mut once: Vec<char> = left
-                .chars()
-                .filter(|&c| c != ',' && count(c) == 1)
-                .collect();
-            once.sort_unstable();
-            once
-        }
+    let output: Vec<char> = if let Some(right) = right {
+        right.chars().collect()
+    } else {
+        // What is named once, in the order of the alphabet.
+        let count = |name: char| left.chars().filter(|&c| c == name).count();
+        let once = left.chars().filter(|&c| c != ',' && count(c) == 1);
+        let mut once: Vec<char> = once.collect();
+        once.sort_unstable();
+        once
     };
     let known = |name: &char| terms.iter().any(|term| term.axes.contains(name));
     if !output.iter().all(known) {

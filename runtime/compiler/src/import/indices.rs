@@ -129,7 +129,7 @@ pub(super) fn gather(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, 
     let index_shape = g.shape(index).to_vec();
     // An integer that was computed is a number.
     let index = match g.ty(index) {
-        Type::F32 => g.to_index(index)?,
+        Type::F32 => g.index_of(index)?,
         Type::I64 => index,
     };
     let before = g.shape(value)[..along].to_vec();
@@ -175,7 +175,7 @@ pub(super) fn gather_nd(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<I
             return Err("supports an index of one axis only where it is computed".into());
         }
         let index = match g.ty(index) {
-            Type::F32 => g.to_index(index)?,
+            Type::F32 => g.index_of(index)?,
             Type::I64 => index,
         };
         let row = g.gather_row(value, index)?;

@@ -67,7 +67,7 @@ impl Lowering<'_> {
             }
             Op::Record { layer, .. } => self.record(x[0], x[1], layer),
             Op::ToIndex => self.arg(id, x[0], |x, out| ToIndex { x, out }.into()),
-            Op::FromIndex => self.from_index(id, x[0]),
+            Op::FromIndex => self.number_of(id, x[0]),
             Op::ArgMin => self.arg(id, x[0], |x, out| ArgMin { x, out }.into()),
             Op::ArgMax => self.arg(id, x[0], |x, out| ArgMax { x, out }.into()),
             Op::Shift(_) => Err("adds to an integer that is none".into()),
@@ -364,7 +364,7 @@ impl Lowering<'_> {
         Ok(())
     }
 
-    fn from_index(&mut self, id: Id, x: Id) -> Done {
+    fn number_of(&mut self, id: Id, x: Id) -> Done {
         let shape = self.shape(id)?;
         let &(index, shift) = self
             .ints
