@@ -341,7 +341,8 @@ fn matmul(a: &ArrayD<f64>, b: &ArrayD<f64>, shape: &[usize]) -> Option<ArrayD<f6
     let k = *a.shape().last()?;
     let spread = |x: &ArrayD<f64>, rows: usize, cols: usize| {
         let wanted = [batch, &[rows, cols]].concat();
-        let wide = x.broadcast(IxDyn(&wanted))?.to_owned();
+        let wide = x.broadcast(IxDyn(&wanted))?;
+        let wide = wide.as_standard_layout().into_owned();
         wide.into_shape_with_order((batch.iter().product::<usize>(), rows, cols))
             .ok()
     };
