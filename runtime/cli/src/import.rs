@@ -32,7 +32,7 @@ pub struct Request {
     /// An input and the output that is its value in the next control step; zeros when an episode begins
     #[arg(long, value_name = "INPUT=OUTPUT", value_parser = pair)]
     state: Vec<(String, String)>,
-    /// An output of one file and the input of another that reads it: FILE:NAME or FILE:NUMBER where a name alone is not enough
+    /// An output of one file and the input of another that reads it; with its file and a colon in front where a name alone is not enough
     #[arg(long, value_name = "OUTPUT=INPUT", value_parser = pair)]
     wire: Vec<(String, String)>,
     /// A recorded run (.csv) to be the golden steps, with a column CHANNEL.ELEMENT for all that was observed and action.ELEMENT for all
@@ -107,6 +107,8 @@ fn refusal(model: &Path, error: ImportError) -> Refusal {
             ),
         ),
         ImportError::File(error) => Refusal::of(chain(&error)),
-        error => Refusal::with_remedy_inside(model.display(), chain(&error)),
+        error @ ImportError::Compile(_) => {
+            Refusal::with_remedy_inside(model.display(), chain(&error))
+        }
     }
 }

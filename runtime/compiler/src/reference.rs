@@ -374,7 +374,6 @@ fn apply(unary: Unary, x: f64) -> f64 {
     match unary.kind.0 {
         UnaryKind::Relu => x.max(0.0),
         UnaryKind::LeakyRelu if x < 0.0 => alpha * x,
-        UnaryKind::LeakyRelu => x,
         UnaryKind::Tanh => x.tanh(),
         UnaryKind::Sigmoid => 1.0 / (1.0 + (-x).exp()),
         UnaryKind::Exp => x.exp(),
@@ -387,7 +386,7 @@ fn apply(unary: Unary, x: f64) -> f64 {
         UnaryKind::Erf => libm::erf(x),
         UnaryKind::Square => x * x,
         UnaryKind::Elu if x < 0.0 => alpha * x.exp_m1(),
-        UnaryKind::Elu => x,
+        UnaryKind::LeakyRelu | UnaryKind::Elu => x,
         UnaryKind::Softplus => x.max(0.0) + (-x.abs()).exp().ln_1p(),
         UnaryKind::Mish => x * (x.max(0.0) + (-x.abs()).exp().ln_1p()).tanh(),
         UnaryKind::Trunc => x.trunc(),

@@ -1,7 +1,7 @@
 //! The bundle's graph: the policy's own nodes, and in front of and behind them what turns raw sensor values into its inputs and its
 //! output into what the robot gets.
 //!
-//! Everything added is made of Add, Concat, Div, Gather, Identity, MatMul, Max, Min, Mul, Reshape, Sqrt, Sub, Transpose and Cast, which
+//! Everything added is made of `Add Cast Concat Div Gather Identity MatMul Max Min Mul Reshape Sqrt Sub Transpose`, which
 //! mean the same in every operator set. Values of the policy keep their names behind the number of their file; nothing else of the files
 //! is taken over. What can fail: files of different operator sets.
 
@@ -62,7 +62,7 @@ pub(crate) fn build(
                     let flat = pieces.input(&mut net, terms, *stack);
                     net.clipped(flat, clip.as_ref())
                 }
-                Feed::State(number) => net.entry(&states::name(*number)),
+                Feed::State(number) => entry(&states::name(*number)),
                 Feed::Constant(value) => net.floats(&[1, edge.len()], &vec![*value; edge.len()]),
                 Feed::Wire(output) => inside(output),
             };
@@ -92,6 +92,11 @@ pub(crate) fn build(
         metadata_props: vec![],
     };
     Some((model, net.kept))
+}
+
+/// The name of a value of the entry.
+fn entry(name: &str) -> String {
+    format!("{ENTRY}/{name}")
 }
 
 /// What a value of a policy's file is called in the bundle.
@@ -198,18 +203,13 @@ impl Net {
         name
     }
 
-    /// The name of a value of the entry.
-    fn entry(&self, name: &str) -> String {
-        format!("{ENTRY}/{name}")
-    }
-
     fn input(&mut self, name: &str, shape: &[usize]) {
-        let value = declared(&self.entry(name), shape);
+        let value = declared(&entry(name), shape);
         self.graph.input.push(value);
     }
 
     fn output(&mut self, name: &str, value: &str, shape: &[usize]) {
-        let full = self.entry(name);
+        let full = entry(name);
         self.node("Identity", &[value], &full, vec![]);
         self.graph.output.push(declared(&full, shape));
     }

@@ -319,7 +319,8 @@ fn differences(
     for (step, (a, b)) in graph.iter().zip(other).enumerate() {
         for (i, (a, b)) in a.iter().zip(b).enumerate() {
             let difference = (a - b).abs();
-            if !(difference <= plan.tolerance) && problems.is_empty() {
+            let close = difference <= plan.tolerance;
+            if !close && problems.is_empty() {
                 problems.add(
                     format!("action `{}`", plan.action.elements[i].name),
                     format!(

@@ -212,7 +212,7 @@ fn external(
     };
     let number = |key: &str| {
         field(key)
-            .map(|text| text.parse::<u64>())
+            .map(str::parse::<u64>)
             .transpose()
             .map_err(|_| format!("says a {key} of external data that is no number"))
     };
@@ -227,13 +227,10 @@ fn external(
         ));
     }
     let path = folder.join(relative);
-    let (resolved, home) = match (path.canonicalize(), folder.canonicalize()) {
-        (Ok(resolved), Ok(home)) => (resolved, home),
-        _ => {
-            return Err(format!(
-                "has external data in `{location}`, which is missing; put that file beside the model"
-            ));
-        }
+    let (Ok(resolved), Ok(home)) = (path.canonicalize(), folder.canonicalize()) else {
+        return Err(format!(
+            "has external data in `{location}`, which is missing; put that file beside the model"
+        ));
     };
     if !resolved.starts_with(&home) || !resolved.is_file() {
         return Err(format!(

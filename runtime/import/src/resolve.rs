@@ -90,6 +90,53 @@ pub(crate) fn resolve(
     let joints = Joints::of(robot, problems);
     let action = action::resolve(edges, robot, &joints, problems);
     let states = states(edges, robot, problems);
+    let (mut feeds, open) = otherwise_fed(edges, robot, wires, &states, problems);
+    let mut channels = vec![];
+    let action_width = action.as_ref().map(|action| action.scale.len());
+    let mut context = terms::Context {
+        edges,
+        robot,
+        joints: &joints,
+        action_width,
+        channels: &mut channels,
+        problems,
+    };
+    let by_input = assigned(&mut context, &open);
+    for (input, terms) in open.iter().zip(by_input) {
+        if let Some(feed) = terms::feed(&mut context, input, &terms) {
+            feeds.push(((*input).clone(), feed));
+        }
+    }
+    terms::check_channels(&channels, problems);
+    check_head(robot, problems);
+    if problems.all().len() > before {
+        return None;
+    }
+    let action = action?;
+    let range = |element: &crate::plan::Element| element.max - element.min;
+    let smallest = action.elements.iter().map(range).fold(f64::MAX, f64::min);
+    Some(Plan {
+        environment: robot
+            .environment
+            .as_ref()
+            .map(|known| (known.id.clone(), known.version.clone()))?,
+        period: robot.control_period_s?,
+        channels,
+        feeds,
+        states,
+        tolerance: robot.action.tolerance.unwrap_or(smallest * 1e-3),
+        action,
+    })
+}
+
+/// The inputs that states, constants and wires feed, and those that are left for terms.
+fn otherwise_fed<'e>(
+    edges: &'e Edges,
+    robot: &Robot,
+    wires: &[(String, String)],
+    states: &[State],
+    problems: &mut Problems,
+) -> (Vec<(Edge, Feed)>, Vec<&'e Edge>) {
     let mut feeds: Vec<(Edge, Feed)> = vec![];
     let mut open: Vec<&Edge> = vec![];
     for input in &edges.inputs {
@@ -138,25 +185,12 @@ pub(crate) fn resolve(
             problems.add(format!("constant.{}", constant.input), problem);
         }
     }
-    let mut channels = vec![];
-    let action_width = action.as_ref().map(|action| action.scale.len());
-    let mut context = terms::Context {
-        edges,
-        robot,
-        joints: &joints,
-        action_width,
-        channels: &mut channels,
-        problems,
-    };
-    let by_input = assigned(&mut context, &open);
-    for (input, terms) in open.iter().zip(by_input) {
-        if let Some(feed) = terms::feed(&mut context, input, &terms) {
-            feeds.push(((*input).clone(), feed));
-        }
-    }
-    terms::check_channels(&channels, problems);
-    let period = robot.control_period_s;
-    match period {
+    (feeds, open)
+}
+
+/// What a policy was made for, and how often it runs.
+fn check_head(robot: &Robot, problems: &mut Problems) {
+    match robot.control_period_s {
         None => problems.add(
             "control_period_s",
             "is not said: the time from one control step to the next, in seconds",
@@ -169,28 +203,12 @@ pub(crate) fn resolve(
         }
         Some(_) => {}
     }
-    let environment = robot.environment.as_ref();
-    if environment.is_none() {
+    if robot.environment.is_none() {
         problems.add(
             "environment",
             "is not said: `{ id = \"my-robot\", version = \"1\" }`, what the policy was made for",
         );
     }
-    if problems.all().len() > before {
-        return None;
-    }
-    let action = action?;
-    let range = |element: &crate::plan::Element| element.max - element.min;
-    let smallest = action.elements.iter().map(range).fold(f64::MAX, f64::min);
-    Some(Plan {
-        environment: environment.map(|known| (known.id.clone(), known.version.clone()))?,
-        period: period?,
-        channels,
-        feeds,
-        states,
-        tolerance: robot.action.tolerance.unwrap_or(smallest * 1e-3),
-        action,
-    })
 }
 
 fn states(edges: &Edges, robot: &Robot, problems: &mut Problems) -> Vec<State> {

@@ -240,7 +240,9 @@ pub(crate) struct Robot {
     pub control_period_s: Option<f64>,
     pub quaternion_order: Option<QuaternionOrder>,
     pub joints: Option<Vec<String>>,
-    pub robot_joints: Option<Vec<String>>,
+    /// `robot_joints` in the file: the robot's joints, in its order.
+    #[serde(rename = "robot_joints")]
+    pub wired_joints: Option<Vec<String>>,
     /// For each of the policy's joints, its index among the robot's.
     pub joint_ids_map: Option<Vec<usize>>,
     pub default_position: Option<Vec<f64>>,
@@ -272,7 +274,7 @@ impl Robot {
     /// Takes over what another source says where this one says nothing. Terms are the same if they have the same name; other names in
     /// another number are a contradiction, which is returned.
     pub fn fill(&mut self, other: Robot) -> Result<(), String> {
-        fill!(self, other, environment control_period_s quaternion_order joints robot_joints joint_ids_map default_position);
+        fill!(self, other, environment control_period_s quaternion_order joints wired_joints joint_ids_map default_position);
         match (&mut self.history, other.history) {
             (Some(mine), Some(other)) => {
                 fill!(mine, other, length layout order start);

@@ -109,9 +109,9 @@ fn flat(values: &Value, source: &str, problems: &mut Problems) -> Said {
     };
     let (stiffness, damping) = (numbers(stiffness), numbers(damping));
     robot.action.scale = numbers(scale).map(|(_, each)| each);
-    robot.default_position = numbers(posture).and_then(|(_, each)| match each {
-        Each::Many(values) => Some(values),
-        Each::One(value) => Some(vec![value]),
+    robot.default_position = numbers(posture).map(|(_, each)| match each {
+        Each::Many(values) => values,
+        Each::One(value) => vec![value],
     });
     robot.control_period_s = numbers(period).and_then(|(_, each)| single(&each));
     let rate = numbers(rate).and_then(|(_, each)| single(&each));
@@ -147,8 +147,7 @@ fn rounded_away(each: &Each) -> bool {
         Each::One(value) => std::slice::from_ref(value),
         Each::Many(values) => values,
     };
-    values.iter().any(|&value| value == 0.0)
-        || (values.len() > 1 && values.iter().all(|&value| value == 1.0))
+    values.contains(&0.0) || (values.len() > 1 && values.iter().all(|&value| value == 1.0))
 }
 
 fn named(name: String) -> Term {

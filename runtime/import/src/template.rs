@@ -37,7 +37,7 @@ pub(crate) fn template(edges: &Edges, robot: &Robot) -> String {
         "[\"hip\", \"knee\"]",
         "in the policy's order",
     );
-    if robot.joint_ids_map.is_some() || robot.robot_joints.is_some() {
+    if robot.joint_ids_map.is_some() || robot.wired_joints.is_some() {
         form.field(
             "joint_ids_map",
             robot.joint_ids_map.as_ref().map(|map| format!("{map:?}")),
@@ -46,7 +46,7 @@ pub(crate) fn template(edges: &Edges, robot: &Robot) -> String {
         );
         form.field(
             "robot_joints",
-            robot.robot_joints.as_deref().map(texts),
+            robot.wired_joints.as_deref().map(texts),
             "[\"hip\", \"knee\"]",
             "all of the robot's joints, in its own order",
         );

@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{Case, HEAD, mirror, model, node, says, value, weight, wide_action};
+use common::{Case, HEAD, mirror, model, node, says, step, value, weight, wide_action};
 use lads_compiler::onnx::StringStringEntryProto;
 use lads_import::{Request, template};
 use prost::Message as _;
@@ -188,7 +188,7 @@ fn neighbours_are_read_and_have_to_agree() {
         [[term]]\nname = \"joint_pos_rel\"\nmin = -3\nmax = 3\n[action]\nmin = -3\nmax = 3\n";
     let case = Case::new(&mirror(2), robot);
     case.put("params/deploy.yaml", deploy.as_bytes());
-    let actions = case.actions(&[Some(vec![vec![0.6, 0.5]]), Some(vec![vec![1.6, 2.5]])]);
+    let actions = case.actions(&[step(&[&[0.6, 0.5]]), step(&[&[1.6, 2.5]])]);
     // Left and right are 0.6 and 0.5 at rest, and go back where they are.
     common::close(&actions[0], &[0.6, 0.5]);
     common::close(&actions[1], &[1.1, 1.0]);
@@ -284,7 +284,7 @@ fn weights_beside_the_model_are_brought_in_and_never_from_elsewhere() {
             .contains("`policy.onnx.data`, which is missing")
     );
     case.put("policy.onnx.data", &weights);
-    let actions = case.actions(&[Some(vec![vec![1.0, 10.0]])]);
+    let actions = case.actions(&[step(&[&[1.0, 10.0]])]);
     common::close(&actions[0], &[31.0, 42.0]);
     case.put("policy.onnx.data", &weights[..19]);
     assert!(case.refused().contains("needs bytes 4 to 20"));

@@ -2,11 +2,9 @@
 
 mod common;
 
-use common::{Case, HEAD, close, mirror, model, node, value, weight, wide_action};
-
-fn step(rows: &[&[f32]]) -> Option<Vec<Vec<f32>>> {
-    Some(rows.iter().map(|row| row.to_vec()).collect())
-}
+use common::{
+    Case, HEAD, Happens::Reset, close, mirror, model, node, step, value, weight, wide_action,
+};
 
 const SENSOR: &str = "unit = \"1\"\nmin = -100\nmax = 100\n";
 
@@ -71,7 +69,7 @@ fn history(layout: &str, order: &str, start: &str) -> Vec<Vec<f32>> {
         [4.0, 14.0, 24.0],
     ];
     let mut steps: Vec<_> = rows.iter().map(|row| step(&[&row[..]])).collect();
-    steps.insert(3, None);
+    steps.insert(3, Reset);
     case.actions(&steps)
 }
 
@@ -138,7 +136,7 @@ fn the_runtime_feeds_the_last_raw_action_itself() {
     );
     let case = Case::new(&graph, &robot);
     let one = || step(&[&[1.0]]);
-    let actions = case.actions(&[one(), one(), one(), step(&[&[4.0]]), one(), None, one()]);
+    let actions = case.actions(&[one(), one(), one(), step(&[&[4.0]]), one(), Reset, one()]);
     let flat: Vec<f32> = actions.concat();
     // Raw 2, 4, 6, then 8 of 14, then 8 of 10; limits bound what the robot gets, not what is fed back.
     close(&flat, &[1.2, 1.4, 1.6, 1.6, 1.6, 1.2]);
@@ -173,7 +171,7 @@ fn the_clock_the_step_and_the_first_step_are_the_runtimes() {
     let case = Case::new(&mirror(5), &robot);
     let one = || step(&[&[7.0]]);
     let mut steps: Vec<_> = (0..400).map(|_| one()).collect();
-    steps.extend([None, one()]);
+    steps.extend([Reset, one()]);
     let actions = case.actions(&steps);
     close(&actions[0], &[0.0, 0.0, 0.0, 1.0, 7.0]);
     close(&actions[1], &[1.0, -1.0, 1.0, 0.0, 7.0]);
@@ -215,7 +213,7 @@ fn states_of_the_graph_are_kept_and_cleared() {
         })
         .unwrap_or_else(|error| panic!("{error}"));
     let one = || step(&[&[2.0]]);
-    let actions = common::run(&imported.bundle, &[one(), one(), None, one()]);
+    let actions = common::run(&imported.bundle, &[one(), one(), Reset, one()]);
     close(&actions.concat(), &[2.0, 4.0, 2.0]);
 }
 

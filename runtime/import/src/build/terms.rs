@@ -5,7 +5,7 @@
 
 use std::collections::HashMap;
 
-use super::{Kept, Net};
+use super::{Kept, Net, entry};
 use crate::plan::{Bounds, Feed, Plan, Source, Stack, Term};
 use crate::robot::{Layout, Order, Start, Wave};
 
@@ -170,15 +170,12 @@ impl<'p> Pieces<'p> {
             let raw = self.ring(net, channel, term.history);
             return self.processed(net, channel, term, raw);
         }
-        let now = match channel {
-            Some(channel) => {
-                let raw = net.entry(&self.plan.channels[channel].name);
-                self.processed(net, channel, term, raw)
-            }
-            None => {
-                let raw = self.own(net, term).unwrap_or_default();
-                finished(net, term, raw)
-            }
+        let now = if let Some(channel) = channel {
+            let raw = entry(&self.plan.channels[channel].name);
+            self.processed(net, channel, term, raw)
+        } else {
+            let raw = self.own(net, term).unwrap_or_default();
+            finished(net, term, raw)
         };
         if term.history == 1 {
             return now;
@@ -188,7 +185,7 @@ impl<'p> Pieces<'p> {
         let before = [term.history - 1, width];
         net.input(&name, &before);
         net.kept.push(Kept::plain(&name, &before));
-        let known = net.entry(&name);
+        let known = entry(&name);
         let all = net.joined(&[known, now], 0);
         let later: Vec<i64> = (1..term.history as i64).collect();
         let later = net.gathered(&all, &later, 0);
@@ -211,7 +208,7 @@ impl<'p> Pieces<'p> {
             });
             longest
         });
-        let value = net.entry(&name);
+        let value = entry(&name);
         if rows == history {
             return value;
         }
@@ -253,7 +250,7 @@ impl<'p> Pieces<'p> {
                     net.input(LAST_ACTION, &shape);
                     net.kept.push(Kept::plain(LAST_ACTION, &shape));
                 }
-                net.entry(LAST_ACTION)
+                entry(LAST_ACTION)
             }
             Source::Phase { turn, hands } => self.clock(net, *turn, hands),
             Source::Step => self.steps(net),
@@ -276,7 +273,7 @@ impl<'p> Pieces<'p> {
             net.input(STEPS, &[1, 1]);
             net.kept.push(Kept::plain(STEPS, &[1, 1]));
         }
-        net.entry(STEPS)
+        entry(STEPS)
     }
 
     /// Sines and cosines of the clock, from a state of `cos - 1, sin` that is zero at first and turns by a constant angle.
@@ -308,7 +305,7 @@ impl<'p> Pieces<'p> {
             net.output(&format!("next_{LAST_ACTION}"), raw_action, &[1, width]);
         }
         if self.steps {
-            let (now, one) = (net.entry(STEPS), net.floats(&[1, 1], &[1.0]));
+            let (now, one) = (entry(STEPS), net.floats(&[1, 1], &[1.0]));
             let next = net.op("Add", &[&now, &one], vec![]);
             net.output(&format!("next_{STEPS}"), &next, &[1, 1]);
         }
@@ -331,7 +328,7 @@ impl<'p> Pieces<'p> {
 
 /// Cosine and sine of the clock, `[1, 2]`.
 fn clock_now(net: &mut Net) -> String {
-    let state = net.entry(CLOCK);
+    let state = entry(CLOCK);
     net.moved("Add", state, &[1.0, 0.0])
 }
 

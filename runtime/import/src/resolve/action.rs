@@ -2,6 +2,7 @@
 
 use super::Edges;
 use super::elements::{Joints, bounds, limits, spread};
+use crate::model::Edge;
 use crate::plan::{Action, Element};
 use crate::problem::Problems;
 use crate::robot::Robot;
@@ -14,21 +15,7 @@ pub(crate) fn resolve(
     problems: &mut Problems,
 ) -> Option<Action> {
     let said = &robot.action;
-    let edge = match (&said.output, &edges.outputs[..]) {
-        (Some(name), outputs) => edges
-            .find(outputs, name)
-            .map_err(|problem| problems.add("action.output", problem))
-            .ok()?,
-        (None, [edge]) => edge,
-        (None, outputs) => {
-            let names: Vec<String> = outputs.iter().map(|edge| edges.name(edge)).collect();
-            problems.add(
-                "action.output",
-                format!("is not said: which of {} is the action", names.join(", ")),
-            );
-            return None;
-        }
-    };
+    let edge = output(edges, robot, problems)?;
     let width = edge.len();
     let of_joints = said.joints.as_ref().or(if said.elements.is_some() {
         None
@@ -115,4 +102,23 @@ pub(crate) fn resolve(
         order,
         reference: said.reference.clone().unwrap_or_default(),
     })
+}
+
+/// Which output is the action.
+fn output<'e>(edges: &'e Edges, robot: &Robot, problems: &mut Problems) -> Option<&'e Edge> {
+    match (&robot.action.output, &edges.outputs[..]) {
+        (Some(name), outputs) => edges
+            .find(outputs, name)
+            .map_err(|problem| problems.add("action.output", problem))
+            .ok(),
+        (None, [edge]) => Some(edge),
+        (None, outputs) => {
+            let names: Vec<String> = outputs.iter().map(|edge| edges.name(edge)).collect();
+            problems.add(
+                "action.output",
+                format!("is not said: which of {} is the action", names.join(", ")),
+            );
+            None
+        }
+    }
 }

@@ -15,7 +15,7 @@ pub(crate) struct Joints {
 impl Joints {
     pub fn of(robot: &Robot, problems: &mut Problems) -> Self {
         let mut policy = robot.joints.clone().unwrap_or_default();
-        let order = robot.robot_joints.clone();
+        let order = robot.wired_joints.clone();
         if let (true, Some(order), Some(map)) = (policy.is_empty(), &order, &robot.joint_ids_map) {
             let named: Option<Vec<String>> = map.iter().map(|&id| order.get(id).cloned()).collect();
             match named {

@@ -529,7 +529,6 @@ fn gravity(context: &mut Context, term: &robot::Term, about: &str) -> Option<Sou
 }
 
 /// The channel of a term, and where the term's elements lie in it if another input reads them too: the first, and how many.
-#[expect(clippy::type_complexity, reason = "a place in a channel")]
 fn place(
     context: &mut Context,
     term: &robot::Term,
@@ -546,17 +545,15 @@ fn place(
         );
         return None;
     }
-    let channel = match context.channels.iter().position(|known| known.name == name) {
-        Some(channel) => channel,
-        None => {
-            context.channels.push(Channel {
-                name: name.into(),
-                elements: vec![],
-                quaternion_order: None,
-            });
-            context.channels.len() - 1
-        }
-    };
+    let known = context.channels.iter().position(|known| known.name == name);
+    let channel = known.unwrap_or_else(|| {
+        context.channels.push(Channel {
+            name: name.into(),
+            elements: vec![],
+            quaternion_order: None,
+        });
+        context.channels.len() - 1
+    });
     let elements = &context.channels[channel].elements;
     let prefix = format!("{}.", term.name);
     let mine = |element: &Element| element.name == term.name || element.name.starts_with(&prefix);

@@ -166,14 +166,26 @@ impl Case {
         }
     }
 
-    /// The actions for the values of all channels in each step; `None` starts another episode.
-    pub fn actions(&self, steps: &[Option<Vec<Vec<f32>>>]) -> Vec<Vec<f32>> {
+    /// The actions of all steps.
+    pub fn actions(&self, steps: &[Happens]) -> Vec<Vec<f32>> {
         let imported = self.import().unwrap_or_else(|error| panic!("{error}"));
         run(&imported.bundle, steps)
     }
 }
 
-pub fn run(bundle: &[u8], steps: &[Option<Vec<Vec<f32>>>]) -> Vec<Vec<f32>> {
+/// What happens in a control period.
+pub enum Happens {
+    /// A step with the values of all channels.
+    Step(Vec<Vec<f32>>),
+    /// Another episode begins.
+    Reset,
+}
+
+pub fn step(rows: &[&[f32]]) -> Happens {
+    Happens::Step(rows.iter().map(|row| row.to_vec()).collect())
+}
+
+pub fn run(bundle: &[u8], steps: &[Happens]) -> Vec<Vec<f32>> {
     let opened = lads_host::from_bytes(bundle).unwrap_or_else(|error| panic!("{error}"));
     let mut loaded = opened.load().expect("memory");
     let mut controller = loaded.controller();
@@ -186,7 +198,7 @@ pub fn run(bundle: &[u8], steps: &[Option<Vec<Vec<f32>>>]) -> Vec<Vec<f32>> {
     let mut action = vec![0.0; contract.action_len()];
     let mut all = vec![];
     for step in steps {
-        let Some(rows) = step else {
+        let Happens::Step(rows) = step else {
             controller.reset();
             continue;
         };
