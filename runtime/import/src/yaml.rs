@@ -236,7 +236,8 @@ mod tests {
         let mut laughs = String::from("a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n");
         for i in 1..10 {
             let before = vec![format!("*a{}", i - 1); 10].join(", ");
-            laughs += &format!("a{i}: &a{i} [{before}]\n");
+            let row = format!("a{i}: &a{i} [{before}]\n");
+            laughs.push_str(&row);
         }
         assert!(read(&laughs).unwrap_err().contains("aliases"));
         assert!(read(&"[".repeat(100)).unwrap_err().contains("deep"));
