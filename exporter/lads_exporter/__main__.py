@@ -57,7 +57,7 @@ def _train(arguments):
 
     if arguments.threads:
         torch.set_num_threads(arguments.threads)
-    setting = config.load(arguments.config)
+    setting = config.load(arguments.config, *arguments.system)
     data = dataset.load(arguments.data, setting)
     device = _device(arguments.device)
     trainer = training.Trainer(setting, data, _encode(setting), arguments.out, device, arguments.seed)
@@ -94,8 +94,7 @@ def _card(arguments, saved, sha256):
 
 
 def _export(arguments):
-    from . import acceptance, bundle, training
-    from .model import Lads
+    from . import acceptance, bundle, systems, training
 
     _check_card(arguments, [arguments.output])
     saved, setting = training.load_run(arguments.run)
@@ -103,16 +102,17 @@ def _export(arguments):
     identity = saved["identity"]
     if encoded.sha256 != identity["language_sha256"]:
         raise UserError(f"{arguments.run} was trained with other weights of {encoded.encoder}")
-    lads = Lads(setting, encoded)
-    lads.load_state_dict(saved["lads"])
-    names = training.STAGES[setting.config.training.schedule]
+    system = systems.of(setting.config)
+    networks = system.Networks(setting, encoded)
+    networks.load_state_dict(saved["networks"])
+    names = system.Training.stages(setting.config)
     provenance = {
         "dataset_sha256": identity["dataset_sha256"],
         "seed": identity["seed"],
-        "steps": {name: getattr(setting.config.training, name).steps for name in names},
+        "steps": {name: system.Training.settings(setting.config, name).steps for name in names},
     }
     candidates = ((instruction, observations.numpy()) for instruction, observations in saved["golden"])
-    model = bundle.assemble(lads, setting, encoded, provenance, candidates)
+    model = bundle.assemble(networks, setting, encoded, provenance, candidates)
     calibrated = acceptance.beside(arguments.output)
     if calibrated:
         acceptance.into(model, calibrated)
@@ -196,6 +196,7 @@ def _parser():
 
     train = commands.add_parser("train", help="train a policy from a dataset")
     train.add_argument("--config", required=True, help="one TOML file per setting, in exporter/configs")
+    train.add_argument("--system", action="append", default=[], metavar="FILE", help="values of a system over those of --config, such as configs/kitchen/lisa.toml")
     train.add_argument("--data", required=True, help=".safetensors of lads-collect, or D4RL kitchen .hdf5")
     train.add_argument("--out", required=True, help="folder of the run: checkpoint, curves, summary")
     train.add_argument("--resume", action="store_true", help="continue from the run's checkpoint")

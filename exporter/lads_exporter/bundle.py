@@ -12,7 +12,7 @@ import onnx
 from onnx import helper
 from safetensors.numpy import save as save_safetensors
 
-from . import __version__, contract as contracts, graphs, twin
+from . import __version__, contract as contracts, systems, twin
 from .config import UserError
 from .output import write_atomically
 
@@ -48,25 +48,19 @@ def describe(family, environment, instructions, encoded, provenance, layer=-1, p
     return found
 
 
-def contract(setting, encoded, provenance):
-    """The contract of a LADS policy."""
+def contract(setting, encoded, provenance, exported):
+    """The contract of a trained policy."""
     config, environment = setting.config, setting.environment
-    high, encoder = config.high_level, config.encoder
-    family = {
-        "kind": "lads",
-        "horizon": encoder.horizon,
-        "codebook": {"size": encoder.codebook_size, "dim": encoder.codebook_dim},
-        "decision": {"rule": config.decision, "temperature": 1.0, "seed": 0},
-    }
+    high = config.high_level
     return describe(
-        family,
+        exported.family,
         environment,
         setting.instructions,
         encoded,
         {"setting": config.name, **provenance},
         layer=config.language.layer,
         pooling="mean" if config.language.pool else "none",
-        channels=contracts.channels(environment, words=[encoded.max_words, encoded.dim], segment=encoder.horizon),
+        channels=contracts.channels(environment, [encoded.max_words, encoded.dim], exported.noise, exported.segment),
         context={"words": encoded.max_words, "steps": high.context_steps, "beyond": config.beyond_context},
         network={"layers": high.layers, "heads": high.heads, "head_dim": high.hidden // high.heads},
     )
@@ -128,11 +122,11 @@ def seal(model, found, candidates):
     return model
 
 
-def assemble(lads, setting, encoded, provenance, candidates):
+def assemble(networks, setting, encoded, provenance, candidates):
     """The complete, checked bundle. `candidates` yields (instruction index, observations) for the golden episode."""
-    lads.eval()
-    model = graphs.build(lads, encoded, setting.config.encoder.horizon)
-    return seal(model, contract(setting, encoded, provenance), candidates)
+    networks.eval()
+    exported = systems.of(setting.config).export(networks, setting, encoded)
+    return seal(exported.model, contract(setting, encoded, provenance, exported), candidates)
 
 
 def save(model, path):

@@ -255,7 +255,8 @@ class Alignment(nn.Module):
 class Lads(nn.Module):
     """All networks of one policy. `forward` is not defined: the parts are trained and exported separately."""
 
-    def __init__(self, setting, encoded):
+    def __init__(self, setting, encoded, head=None):
+        """head: the high level's outputs, if they are no logits over the codes."""
         super().__init__()
         config, o, a = setting.config, setting.observation_len, setting.action_len
         encoder = config.encoder
@@ -263,6 +264,6 @@ class Lads(nn.Module):
         self.encoder = TrajectoryEncoder(encoder.hidden, o, a, encoder.codebook_dim, encoder.observed or o, encoder.relative)
         self.codebook = Codebook(encoder)
         self.low_level = LowLevelPolicy(config.low_level, o, encoder.codebook_dim, a)
-        self.high_level = HighLevelPolicy(config.high_level, encoded.dim, o, a, encoder.codebook_size)
+        self.high_level = HighLevelPolicy(config.high_level, encoded.dim, o, a, head or encoder.codebook_size)
         sentence_dim = len(encoded.instructions[0].sentence)
         self.alignment = Alignment(config.alignment, encoder.codebook_dim, sentence_dim)

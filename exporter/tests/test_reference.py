@@ -61,7 +61,7 @@ def test_the_purpose_is_what_it_is_for(tiny):
 def test_only_the_bundles_own_run_is_rolled_out(policy, monkeypatch):
     setting, encoded, lads, model = policy
     contract = contracts.of(model)
-    saved = {"identity": {"dataset_sha256": contract["provenance"]["dataset_sha256"]}, "lads": lads.state_dict()}
+    saved = {"identity": {"dataset_sha256": contract["provenance"]["dataset_sha256"]}, "networks": lads.state_dict()}
     monkeypatch.setattr(training, "load_run", lambda folder: (saved, setting))
     monkeypatch.setattr(reference.language, "encode", lambda language, texts: encoded)
     acting, source = reference._acting(model, contract, "run")
