@@ -26,10 +26,10 @@ class Contexts:
         observations, executed = corpus.observations[at, :length], corpus.executed[at, :length]
         return self._cut(words, marks, observations, executed)
 
-    def places(self, episodes):
-        """Marks that name each step: episode * T + step, [B, T]; -1 beyond an episode's end."""
+    def places(self, episodes, rows=None):
+        """Marks that name each step: row * T + step, [B, T]; -1 beyond an episode's end. A row is the episode itself, or what `rows` says."""
         steps = torch.arange(self.corpus.steps)
-        named = episodes[:, None] * self.corpus.steps + steps
+        named = (episodes if rows is None else rows)[:, None] * self.corpus.steps + steps
         return torch.where(steps < self.corpus.lengths[episodes][:, None], named, -1).to(self.corpus.device)
 
     def _cut(self, words, marks, observations, executed):

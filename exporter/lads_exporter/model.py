@@ -86,6 +86,15 @@ class Block(nn.Module):
         return x + self.drop(self.down(F.relu(self.up(self.norm2(x)))))
 
 
+def start_weights(transformer):
+    """Weights of all linear layers and tables N(0, 0.02), biases 0."""
+    for module in transformer.modules():
+        if isinstance(module, (nn.Linear, nn.Embedding)):
+            nn.init.normal_(module.weight, 0.0, 0.02)
+        if isinstance(module, nn.Linear):
+            nn.init.zeros_(module.bias)
+
+
 class HighLevelPolicy(nn.Module):
     """pi_h: a causal transformer over words, states and actions; plan logits at every state token (equation 8).
 
@@ -104,11 +113,7 @@ class HighLevelPolicy(nn.Module):
         self.blocks = nn.ModuleList(Block(hidden, config.heads, config.dropout) for _ in range(config.layers))
         self.norm = nn.LayerNorm(hidden)
         self.head = nn.Linear(hidden, codes)
-        for module in self.modules():
-            if isinstance(module, (nn.Linear, nn.Embedding)):
-                nn.init.normal_(module.weight, 0.0, 0.02)
-            if isinstance(module, nn.Linear):
-                nn.init.zeros_(module.bias)
+        start_weights(self)
 
     def forward(self, words, observations, actions=None):
         """words: B tensors [L_i, E]; observations [B, T, O]; actions [B, T, A], or None -> logits [B, T, M].

@@ -5,6 +5,10 @@ from dataclasses import dataclass
 import torch
 
 from ..contexts import Contexts
+from ..kinds.common import Sizes
+
+
+HELD_OUT = 512  # episodes that losses of whole contexts are validated on
 
 
 @dataclass(frozen=True)
@@ -15,6 +19,31 @@ class Exported:
     family: dict
     noise: list | None = None  # the shape of one draw
     segment: int | None = None  # control steps that the trajectory encoder reads
+
+
+def sizes(setting, encoded):
+    """The sizes of a system's networks, from its configuration."""
+    config = setting.config
+    high, encoder = config.high_level, config.encoder
+    return Sizes(
+        observation=setting.observation_len,
+        action=setting.action_len,
+        words=encoded,
+        hidden=high.hidden,
+        layers=high.layers,
+        heads=high.heads,
+        dropout=high.dropout,
+        steps=high.context_steps,
+        horizon=encoder.horizon,
+        codes=encoder.codebook_size,
+        plan=encoder.codebook_dim,
+        low_level_layers=getattr(config.system, "low_level_layers", 0),
+    )
+
+
+def decision(setting):
+    """How a plan is picked from logits."""
+    return {"rule": setting.config.decision, "temperature": 1.0, "seed": 0}
 
 
 class Training:
@@ -78,6 +107,10 @@ class Training:
         """Training episodes of similar length for a step."""
         batch = self.settings(self.config, stage).batch
         return self.corpus.draw_alike(batch, step, lambda draw: self.generator(stage, draw))
+
+    def held_out(self):
+        """Episodes for validation, no more than fit a batch."""
+        return self.corpus.validation[:HELD_OUT]
 
     def half(self):
         """Where the transformers run in bfloat16."""

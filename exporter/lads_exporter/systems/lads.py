@@ -184,7 +184,7 @@ def family(setting):
         "kind": "lads",
         "horizon": encoder.horizon,
         "codebook": {"size": encoder.codebook_size, "dim": encoder.codebook_dim},
-        "decision": {"rule": setting.config.decision, "temperature": 1.0, "seed": 0},
+        "decision": base.decision(setting),
     }
 
 
