@@ -97,7 +97,7 @@ def _export(arguments):
     from . import acceptance, bundle, systems, training
 
     _check_card(arguments, [arguments.output])
-    saved, setting = training.load_run(arguments.run)
+    saved, setting = training.load_run(arguments.run, *arguments.system)
     encoded = _encode(setting)
     identity = saved["identity"]
     if encoded.sha256 != identity["language_sha256"]:
@@ -169,6 +169,17 @@ def _calibrate(arguments):
     print(f"{arguments.output}: written")
 
 
+def _table(arguments):
+    from .tables import run
+
+    chosen = {key: getattr(arguments, key) for key in ("data", "runs", "lads_run", "models")}
+    if not run.run(arguments.table, at_once=arguments.jobs, **chosen):
+        print("stopped; the same command goes on", file=sys.stderr)
+        return 130
+    print(f"{arguments.models}/TABLES.md: written")
+    return 0
+
+
 def _parser():
     parser = argparse.ArgumentParser(prog="python -m lads_exporter", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
@@ -213,6 +224,7 @@ def _parser():
         command.add_argument("--results", help="JSON of lads-run --json for this bundle")
         command.add_argument("--beside", action="append", default=[], metavar="LABEL=FILE", help="results of another run")
         command.set_defaults(run_command=function)
+    export.add_argument("--system", action="append", default=[], metavar="FILE", help="export as this system's values say: its sampler or rule of decision")
 
     rollouts = commands.add_parser("reference", help="reference rollouts: PyTorch in the official environment, for lads-run verify")
     rollouts.add_argument("--model", required=True, help="the bundle whose policy is rolled out")
@@ -241,6 +253,15 @@ def _parser():
     calibrate.add_argument("--sentences", required=True, help="sentences that ask for what the policy knows, and others: configs/*.sentences.json")
     calibrate.add_argument("-o", "--output", required=True, help="models/NAME.acceptance.json; `export` takes the one beside the bundle")
     calibrate.set_defaults(run_command=_calibrate)
+
+    table = commands.add_parser("table", help="the paper's tables: trains, exports and evaluates every system; goes on where it was stopped")
+    table.add_argument("table", metavar="TABLE", help="exporter/tables/kitchen.toml or lorel.toml")
+    table.add_argument("--data", help="the dataset; left out, the one that the table names")
+    table.add_argument("--runs", default="runs/tables", help="where jobs are kept (runs/tables)")
+    table.add_argument("--lads-run", default="target/release/lads-run", help="the built program (target/release/lads-run)")
+    table.add_argument("--models", default="models", help="where TABLES.md and tables.json go (models)")
+    table.add_argument("--jobs", type=int, default=1, help="trainings at a time, of one thread each (1)")
+    table.set_defaults(run_command=_table)
     return parser
 
 

@@ -8,6 +8,7 @@ import csv
 import io
 import json
 import math
+import pickle
 import signal
 import time
 import zlib
@@ -121,7 +122,7 @@ class Trainer:
         path = self.out / CHECKPOINT
         if not path.is_file():
             raise UserError(f"nothing to resume: {path} does not exist")
-        saved = torch.load(path, map_location=self.corpus.device, weights_only=True)
+        saved = _read(path, self.corpus.device)
         for key, value in self.identity.items():
             if saved["identity"][key] != value:
                 raise UserError(f"{path} was made with another {key.removesuffix('_sha256')}; train into a new folder")
@@ -254,16 +255,28 @@ def _short(validation):
     return {name: f"{value:.3g}" for name, value in validation.items()}
 
 
-def load_run(folder):
-    """A finished or interrupted run's checkpoint and its setting."""
+def _read(path, device="cpu"):
+    """A checkpoint's contents."""
+    try:
+        saved = torch.load(path, map_location=device, weights_only=True)
+    except (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError) as error:
+        raise UserError(f"{path}: half written or damaged ({type(error).__name__}); it stays as it is: move its folder away and train anew") from error
+    if not isinstance(saved, dict) or "networks" not in saved:
+        raise UserError(f"{path} was made by an earlier version of this exporter; train it again")
+    return saved
+
+
+def load_run(folder, *over):
+    """A finished run's checkpoint and its setting; `over` are files of a system's values to export it with."""
     path = Path(folder) / CHECKPOINT
     if not path.is_file():
         raise UserError(f"no run in {folder}: {path} does not exist; train one first (make train)")
-    saved = torch.load(path, map_location="cpu", weights_only=True)
-    setting = configuration.from_tables(*saved["identity"]["tables"], path)
+    saved = _read(path)
+    table, *beside = saved["identity"]["tables"]
+    for one in over:
+        table = configuration.layered(table, configuration.read_toml(one))
+    setting = configuration.from_tables(table, *beside, path)
     names = systems.of(setting.config).Training.stages(setting.config)
-    if "networks" not in saved:
-        raise UserError(f"{path} was made by an earlier version of this exporter; train it again")
     if saved["position"]["stage"] < len(names):
         raise UserError(f"{folder} is not finished (stage {names[saved['position']['stage']]}); continue it with --resume")
     return saved, setting
