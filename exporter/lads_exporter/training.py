@@ -175,7 +175,7 @@ class Trainer:
         steps, begun, saved = stage.settings.steps, time.monotonic(), time.monotonic()
         spent = self.seconds.get(stage.name, 0.0)
         sums, latest, counted_from = defaultdict(list), {}, time.monotonic()
-        bar = tqdm(total=steps, initial=self.position["step"], desc=stage.name, disable=quiet, unit="step")
+        bar = tqdm(total=steps, initial=self.position["step"], desc=stage.name, disable=quiet or None, unit="step")
         with bar:
             while self.position["step"] < steps and not self.stop:
                 step = self.position["step"]
