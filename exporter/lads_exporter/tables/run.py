@@ -5,6 +5,7 @@ their checkpoints.
 """
 
 import signal
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -75,10 +76,11 @@ def run(path, data=None, runs="runs/tables", lads_run="target/release/lads-run",
     known = {job: job.numbers() for job in jobs if job.finished}
     progress = Progress(len(jobs), len(known))
     progress.say(f"{table.title}: jobs in {place.runs / table.name}")
-    failures = []
+    failures, writing = [], threading.Lock()
 
     def write():
-        render.write(models, table, place, [(job, known.get(job)) for job in jobs], floor(table, place, jobs, processes))
+        with writing:
+            render.write(models, table, place, [(job, known.get(job)) for job in jobs], floor(table, place, jobs, processes))
 
     def work(group):
         for job in group:
