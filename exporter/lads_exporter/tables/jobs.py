@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from .. import card, config, language
@@ -86,7 +87,7 @@ class Job:
     def folder(self):
         return self.place.runs / self.table.name / self.track.name / f"{self.trained.id}-seed{self.seed}-{self.inputs[:12]}"
 
-    @property
+    @cached_property
     def inputs(self):
         """The hash of all that the trained weights depend on."""
         setting = config.load(*self.table.configuration(self.track, self.trained))
