@@ -67,8 +67,8 @@ def test_only_the_bundles_own_run_is_rolled_out(policy, monkeypatch):
     acting, source = reference._acting(model, contract, "run")
     assert source == "the run's checkpoint" and torch.equal(acting.codes, lads.codebook.codes)
     # The same plans with another high level are another run.
-    saved["lads"] = {name: value.clone() for name, value in lads.state_dict().items()}
-    saved["lads"]["high_level.head.weight"][0, 0] += 1
+    saved["networks"] = {name: value.clone() for name, value in lads.state_dict().items()}
+    saved["networks"]["high_level.head.weight"][0, 0] += 1
     with pytest.raises(config.UserError, match="run is not the run that the bundle was exported from"):
         reference._acting(model, contract, "run")
 

@@ -98,6 +98,9 @@ def load(path):
     missing = [key for key in parts if key not in table]
     if missing:
         raise UserError(f"{path}: [{missing[0]}] is missing")
+    for key in ("track", "system"):
+        if not isinstance(table[key], list) or not all(isinstance(row, dict) for row in table[key]):
+            raise UserError(f"{path}: {key}s are a list of tables, [[{key}]]")
     table["evaluation"] = _row(Evaluation, table["evaluation"], f"{path}[evaluation]")
     for key, many in (("track", "tracks"), ("system", "systems")):
         table[many] = [_row(parts[key], row, f"{path}[[{key}]] {row.get('id', row.get('name', ''))}") for row in table.pop(key)]
@@ -112,6 +115,12 @@ def _check(table, path):
         problems.append(f"measure = {table.measure!r}: must be one of {', '.join(MEASURES)}")
     if len(table.splits) != len(table.headings):
         problems.append("splits and headings must be as many")
+    if table.evaluation.episodes < 1:
+        problems.append(f"evaluation.episodes = {table.evaluation.episodes}: must be at least 1")
+    for row in (*table.tracks, *table.systems):
+        lists = [row.seeds] if isinstance(row, Track) else row.seeds.values()
+        if not all(isinstance(seeds, list) and seeds and all(type(seed) is int and seed >= 0 for seed in seeds) for seeds in lists):
+            problems.append(f"seeds of {getattr(row, 'id', None) or row.name!r}: must be lists of whole numbers from 0 on")
     ids, tracks = [row.id for row in table.systems], [row.name for row in table.tracks]
     problems += [f"system {id!r} stands twice" for id in {id for id in ids if ids.count(id) > 1}]
     for row in table.systems:

@@ -66,6 +66,8 @@ def floor(table, place, jobs, processes):
 
 def run(path, data=None, runs="runs/tables", lads_run="target/release/lads-run", models="models", at_once=1):
     """Runs a table's file to its end, or until it is stopped -> whether it reached the end."""
+    if at_once < 1:
+        raise UserError(f"--jobs {at_once}: must be at least 1")
     table = load(path)
     place = _place(table, data, runs, lads_run)
     render.check(models)
