@@ -48,8 +48,8 @@ fn run() -> Result<(), Box<dyn Error>> {
 
     // Memory of the guards; from the first step on nothing allocates.
     let mut memory = [vec![], vec![]];
-    let contract = stand.policy().contract();
-    let rates = vec![MAX_RATE; contract.action_len()];
+    let joints = stand.opened().policy().contract().action_len();
+    let rates = vec![MAX_RATE; joints];
     let config = GuardConfig {
         fallback: Fallback::Decay {
             time_constant_s: 0.2,
@@ -65,8 +65,9 @@ fn run() -> Result<(), Box<dyn Error>> {
     let mut running = guarded(&mut stand, &config, first)?;
     let mut next = guarded(&mut walk, &config, second)?;
 
+    let contract = running.controller().policy().contract();
     let mut robot = Robot::new(&contract);
-    let mut action = vec![0.0; contract.action_len()];
+    let mut action = vec![0.0; joints];
     let mut digest = Digest::default();
     let period = Duration::from_secs_f32(contract.control_period_s());
     let start = Instant::now();
@@ -112,7 +113,10 @@ fn guarded<'a, 'm>(
 where
     'a: 'm,
 {
-    memory.resize(GuardedController::memory_len(loaded.policy()), 0.0);
+    memory.resize(
+        GuardedController::memory_len(&loaded.opened().policy()),
+        0.0,
+    );
     let mut guarded = GuardedController::new(loaded.controller(), config, memory)?;
     guarded.self_test()?;
     Ok(guarded)
