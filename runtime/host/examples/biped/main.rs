@@ -66,7 +66,7 @@ fn run() -> Result<(), Box<dyn Error>> {
     let mut next = guarded(&mut walk, &config, second)?;
 
     let contract = running.controller().policy().contract();
-    let mut robot = Robot::new(&contract);
+    let mut robot = Robot::new(contract);
     let mut action = vec![0.0; joints];
     let mut digest = Digest::default();
     let period = Duration::from_secs_f32(contract.control_period_s());
