@@ -40,7 +40,7 @@ fn an_imported_policy_goes_through_every_door() {
     assert_eq!(answer(&["act", "--model", image], &rows), actions);
     let source = folder.path().join("walk.c");
     answer(&["compile", out, "--emit-c", source.to_str().unwrap()], "");
-    answer(&["bench", out, "--seconds", "0.2"], "");
+    answer(&["bench", "--model", out, "--seconds", "0.2"], "");
 }
 
 #[test]

@@ -216,9 +216,7 @@ fn entries(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked<W
         )
         .map_err(|error| ScheduleError::Program { entry: at, error })?;
         let appends = entry.tokens > 0;
-        // One without operations hands its inputs on as they lie.
-        let idle = program.is_empty() && tables.outputs(&entry).next().is_none();
-        if idle || appends != cache.is_some() {
+        if program.is_empty() || appends != cache.is_some() {
             return Err(ScheduleError::Entry { entry: at });
         }
         if let Some(end) = used.get_mut(entry.cache as usize) {

@@ -263,10 +263,20 @@ fn an_encoder_and_a_policy_become_one() {
 fn commands_are_a_channel_of_their_own() {
     let robot = format!(
         "{HEAD}[[term]]\nname = \"base_ang_vel\"\nmin = -9\nmax = 9\n\
-         [[term]]\nname = \"velocity_commands\"\nelements = [\"x\", \"y\"]\nunit = \"m/s\"\nmin = -1\nmax = 1\n{}",
+         [[term]]\nname = \"velocity_commands\"\nelements = [\"x\", \"y\"]\nunit = \"m/s\"\nscale = 2\nmin = -1\nmax = 1\n{}",
         wide_action(5)
     );
     let case = Case::new(&mirror(5), &robot);
     let actions = case.actions(&[step(&[&[1.0, 2.0, 3.0], &[0.5, -0.5]])]);
-    close(&actions[0], &[1.0, 2.0, 3.0, 0.5, -0.5]);
+    close(&actions[0], &[1.0, 2.0, 3.0, 1.0, -1.0]);
+}
+
+#[test]
+fn a_policy_that_computes_nothing_is_refused() {
+    let robot = format!(
+        "{HEAD}[[term]]\nname = \"a\"\nwidth = 1\n{SENSOR}[[term]]\nname = \"b\"\nwidth = 1\nchannel = \"other\"\n{SENSOR}{}",
+        wide_action(2)
+    );
+    let told = Case::new(&mirror(2), &robot).refused();
+    assert!(told.contains("it computes nothing"), "{told}");
 }
