@@ -24,7 +24,7 @@ use crate::tensor::{Data, Tensor};
 
 #[cfg(test)]
 pub(crate) use eval::apply;
-pub(crate) use eval::{MAX_FOLDING, cost, evaluate};
+pub(crate) use eval::{MAX_FOLDING, Value, cost, evaluate, fold};
 pub(crate) use rewrite::{Rewriter, topological};
 
 /// Length of an axis: `fixed`, or `P + fixed`.

@@ -5,8 +5,7 @@
 //!
 //! What can fail: [`decode`] tells a file that is no ONNX model from one that was cut off.
 
-// Fields are named and explained by `onnx.proto3`.
-#![allow(missing_docs)]
+#![allow(missing_docs, reason = "`onnx.proto3` names and explains the fields")]
 
 mod envelope;
 

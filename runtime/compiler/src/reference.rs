@@ -1,22 +1,20 @@
 //! A plain policy computed in double precision, straight from its graph: what a compiled policy is compared with.
 //!
-//! Nothing is fused, planned or rounded to 32 bits, and `ndarray` holds the values, so that of the compiler only the reading of ONNX is
-//! shared with what is compared. What can fail: the bytes are no bundle of the family `plain`, or a value has another shape than the
+//! Nothing is fused, planned or rounded to 32 bits: of the compiler only the reading of ONNX and the folding of constants are shared with
+//! what is compared. What can fail: the bytes are no bundle of the family `plain`, or a value has another shape than the
 //! contract says.
 
 use std::collections::HashMap;
 
 use bytes::Bytes;
-use lads_image::op::{BinaryKind, ReduceKind, UnaryKind};
-use ndarray::{ArrayD, Axis, IxDyn, Slice, Zip, concatenate};
+use ndarray::{ArrayD, Axis, IxDyn, Slice, concatenate};
 
 use crate::contract::{Contract, Fill, StateKind};
 use crate::entries;
 use crate::error::{BundleError, CompileError};
-use crate::graph::{Dim, Graph, Id, Op, Unary, topological};
+use crate::graph::{Graph, Id, Type, Value, evaluate, topological};
 use crate::import::Model;
 use crate::onnx;
-use crate::tensor::Data;
 
 /// A plain policy in double precision.
 pub struct Reference {
@@ -26,16 +24,9 @@ pub struct Reference {
     outputs: Vec<(String, Id)>,
     /// Nodes that the outputs need, operands first.
     order: Vec<Id>,
-    constants: HashMap<Id, Value>,
+    constants: HashMap<Id, Value<f64>>,
     /// Plain states as a whole; the rows of rings that have been seen.
     states: HashMap<String, ArrayD<f64>>,
-}
-
-/// A value of the graph.
-#[derive(Debug, Clone)]
-enum Value {
-    Float(ArrayD<f64>),
-    Int(ArrayD<i64>),
 }
 
 impl Reference {
@@ -66,7 +57,7 @@ impl Reference {
         let order = topological(&imported.graph, &roots, &HashMap::new());
         let constants = order
             .iter()
-            .filter_map(|&id| Some((id, constant(&imported.graph, id)?)))
+            .filter_map(|&id| Some((id, Value::of(imported.graph.constant(id)?)?)))
             .collect();
         let mut reference = Self {
             contract,
@@ -123,7 +114,7 @@ impl Reference {
                     .map(|state| state.iter().copied().collect())
             };
             let given = given.unwrap_or_else(|| vec![0.0; shape.iter().product()]);
-            let integer = self.graph.ty(*id) == crate::graph::Type::I64;
+            let integer = self.graph.ty(*id) == Type::I64;
             let array = ArrayD::from_shape_vec(IxDyn(&shape), given)
                 .map_err(|error| refused(format!("`{name}`: {error}")))?;
             let value = if integer {
@@ -185,101 +176,15 @@ impl Reference {
         all
     }
 
-    fn node(&self, id: Id, values: &HashMap<Id, Value>) -> Option<Value> {
+    fn node(&self, id: Id, values: &HashMap<Id, Value<f64>>) -> Option<Value<f64>> {
         let node = self.graph.node(id);
-        let x = |i: usize| values.get(node.inputs.get(i)?);
-        let float = |i: usize| match x(i)? {
-            Value::Float(array) => Some(array),
-            Value::Int(_) => None,
-        };
-        let shape: Vec<usize> = node.shape.iter().map(|dim: &Dim| dim.fixed).collect();
-        let y = match &node.op {
-            Op::Shift(by) => match x(0)? {
-                Value::Int(array) => return Some(Value::Int(array.mapv(|x| x + by))),
-                Value::Float(_) => return None,
-            },
-            Op::ToIndex => return Some(Value::Int(float(0)?.mapv(|x| x.trunc() as i64))),
-            Op::FromIndex => match x(0)? {
-                Value::Int(array) => array.mapv(|x| x as f64),
-                Value::Float(_) => return None,
-            },
-            Op::ArgMin | Op::ArgMax => {
-                let largest = node.op == Op::ArgMax;
-                return Some(Value::Int(ArrayD::from_elem(
-                    IxDyn(&shape),
-                    best(float(0)?, largest),
-                )));
-            }
-            Op::Reshape => match x(0)? {
-                Value::Int(array) => {
-                    let data = array.iter().copied().collect();
-                    return Some(Value::Int(
-                        ArrayD::from_shape_vec(IxDyn(&shape), data).ok()?,
-                    ));
-                }
-                Value::Float(array) => {
-                    ArrayD::from_shape_vec(IxDyn(&shape), array.iter().copied().collect()).ok()?
-                }
-            },
-            Op::Transpose(perm) => float(0)?.clone().permuted_axes(IxDyn(perm)),
-            Op::Slice { axis, start } => float(0)?
-                .slice_axis(Axis(*axis), Slice::from(*start..start + shape[*axis]))
-                .to_owned(),
-            Op::Concat { axis } => {
-                let parts: Option<Vec<_>> = (0..node.inputs.len())
-                    .map(|i| Some(float(i)?.view()))
-                    .collect();
-                concatenate(Axis(*axis), &parts?).ok()?
-            }
-            Op::Expand => float(0)?.broadcast(IxDyn(&shape))?.to_owned(),
-            Op::Unary(unary) => float(0)?.mapv(|x| apply(*unary, x)),
-            Op::Binary(kind) => {
-                let (a, b) = (
-                    float(0)?.broadcast(IxDyn(&shape))?,
-                    float(1)?.broadcast(IxDyn(&shape))?,
-                );
-                Zip::from(a)
-                    .and(b)
-                    .map_collect(|&a, &b| binary(kind.0, a, b))
-            }
-            Op::Reduce(kind, axis) => float(0)?.map_axis(Axis(*axis), |row| match kind.0 {
-                ReduceKind::Sum => row.sum(),
-                ReduceKind::Mean => row.sum() / row.len() as f64,
-                ReduceKind::Max => row.fold(f64::NEG_INFINITY, |a, &b| a.max(b)),
-                ReduceKind::Min => row.fold(f64::INFINITY, |a, &b| a.min(b)),
-                ReduceKind::Prod => row.product(),
-            }),
-            Op::MatMul => matmul(float(0)?, float(1)?, &shape)?,
-            Op::Softmax => rows(float(0)?, |mut row| {
-                let most = row.fold(f64::NEG_INFINITY, |a, &b| a.max(b));
-                row.mapv_inplace(|x| (x - most).exp());
-                let sum = row.sum();
-                row.mapv_inplace(|x| x / sum);
-            }),
-            Op::LayerNorm { eps } => {
-                let eps = f64::from(f32::from_bits(*eps));
-                let mut y = rows(float(0)?, |mut row| {
-                    let mean = row.sum() / row.len() as f64;
-                    let var =
-                        row.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / row.len() as f64;
-                    row.mapv_inplace(|x| (x - mean) / (var + eps).sqrt());
-                });
-                y = y * float(1)?.broadcast(IxDyn(&shape))?;
-                y + float(2)?.broadcast(IxDyn(&shape))?
-            }
-            Op::GatherRow => {
-                let Value::Int(index) = x(1)? else {
-                    return None;
-                };
-                let table = float(0)?;
-                let row = usize::try_from(*index.first()?).ok()?;
-                let row = (row < table.shape()[0]).then(|| table.index_axis(Axis(0), row))?;
-                ArrayD::from_shape_vec(IxDyn(&shape), row.iter().copied().collect()).ok()?
-            }
-            // What later passes of the compiler make, and inputs, which are there already.
-            _ => return None,
-        };
-        Some(Value::Float(y))
+        let operands: Option<Vec<_>> = node
+            .inputs
+            .iter()
+            .map(|input| Some(values.get(input)?.view()))
+            .collect();
+        let shape: Option<Vec<usize>> = node.shape.iter().map(|dim| dim.known()).collect();
+        evaluate(&node.op, &operands?, &shape?)
     }
 }
 
@@ -288,18 +193,6 @@ fn refused(problem: String) -> CompileError {
         entry: "policy/act".into(),
         problem: problem.into(),
     }
-}
-
-fn constant(graph: &Graph, id: Id) -> Option<Value> {
-    let tensor = graph.constant(id)?;
-    let shape = IxDyn(&tensor.shape);
-    Some(match &tensor.data {
-        Data::F32(data) => {
-            let data = data.iter().map(|&x| f64::from(x)).collect();
-            Value::Float(ArrayD::from_shape_vec(shape, data).ok()?)
-        }
-        Data::I64(data) => Value::Int(ArrayD::from_shape_vec(shape, data.clone()).ok()?),
-    })
 }
 
 /// The rows of a ring with one more, at most so many.
@@ -313,82 +206,4 @@ fn appended(known: Option<&ArrayD<f64>>, row: &[f64], most: usize) -> Result<Arr
         concatenate(Axis(0), &[known.view(), row.view()]).map_err(|error| error.to_string())?;
     let surplus = all.shape()[0].saturating_sub(most);
     Ok(all.slice_axis(Axis(0), Slice::from(surplus..)).to_owned())
-}
-
-/// A copy whose rows over the last axis were changed.
-fn rows(x: &ArrayD<f64>, change: impl Fn(ndarray::ArrayViewMut1<f64>)) -> ArrayD<f64> {
-    let mut y = x.clone();
-    let last = Axis(y.ndim().saturating_sub(1));
-    y.lanes_mut(last).into_iter().for_each(change);
-    y
-}
-
-/// Index of the first smallest or largest element.
-fn best(x: &ArrayD<f64>, largest: bool) -> i64 {
-    let better = |a: f64, b: f64| if largest { a > b } else { a < b };
-    let mut found = (0, f64::NAN);
-    for (i, &value) in x.iter().enumerate() {
-        if i == 0 || better(value, found.1) {
-            found = (i as i64, value);
-        }
-    }
-    found.0
-}
-
-/// Products over the last two axes, the others broadcast.
-fn matmul(a: &ArrayD<f64>, b: &ArrayD<f64>, shape: &[usize]) -> Option<ArrayD<f64>> {
-    let (batch, &[m, n]) = shape.split_last_chunk::<2>()?;
-    let k = *a.shape().last()?;
-    let spread = |x: &ArrayD<f64>, rows: usize, cols: usize| {
-        let wanted = [batch, &[rows, cols]].concat();
-        let wide = x.broadcast(IxDyn(&wanted))?;
-        let wide = wide.as_standard_layout().into_owned();
-        wide.into_shape_with_order((batch.iter().product::<usize>(), rows, cols))
-            .ok()
-    };
-    let (a, b) = (spread(a, m, k)?, spread(b, k, n)?);
-    let products = a
-        .outer_iter()
-        .zip(b.outer_iter())
-        .flat_map(|(a, b)| a.dot(&b).into_iter().collect::<Vec<f64>>());
-    ArrayD::from_shape_vec(IxDyn(shape), products.collect()).ok()
-}
-
-fn binary(kind: BinaryKind, a: f64, b: f64) -> f64 {
-    match kind {
-        BinaryKind::Add => a + b,
-        BinaryKind::Sub => a - b,
-        BinaryKind::Mul => a * b,
-        BinaryKind::Div => a / b,
-        BinaryKind::Max => a.max(b),
-        BinaryKind::Min => a.min(b),
-        BinaryKind::Pow => a.powf(b),
-        BinaryKind::Greater => f64::from(u8::from(a > b)),
-        BinaryKind::Keep if b == 0.0 => 0.0,
-        BinaryKind::Keep => a,
-    }
-}
-
-fn apply(unary: Unary, x: f64) -> f64 {
-    let alpha = f64::from(f32::from_bits(unary.alpha));
-    match unary.kind.0 {
-        UnaryKind::Relu => x.max(0.0),
-        UnaryKind::LeakyRelu if x < 0.0 => alpha * x,
-        UnaryKind::Tanh => x.tanh(),
-        UnaryKind::Sigmoid => 1.0 / (1.0 + (-x).exp()),
-        UnaryKind::Exp => x.exp(),
-        UnaryKind::Log => x.ln(),
-        UnaryKind::Sqrt => x.sqrt(),
-        UnaryKind::Rsqrt => 1.0 / x.sqrt(),
-        UnaryKind::Neg => -x,
-        UnaryKind::Abs => x.abs(),
-        UnaryKind::Recip => 1.0 / x,
-        UnaryKind::Erf => libm::erf(x),
-        UnaryKind::Square => x * x,
-        UnaryKind::Elu if x < 0.0 => alpha * x.exp_m1(),
-        UnaryKind::LeakyRelu | UnaryKind::Elu => x,
-        UnaryKind::Softplus => x.max(0.0) + (-x.abs()).exp().ln_1p(),
-        UnaryKind::Mish => x * (x.max(0.0) + (-x.abs()).exp().ln_1p()).tanh(),
-        UnaryKind::Trunc => x.trunc(),
-    }
 }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use lads_image::op::{BinaryKind, ReduceKind};
 
-use super::{Dim, Graph, Id, Kind, MAX_FOLDING, Op, Type, Unary, cost, evaluate, show};
+use super::{Dim, Graph, Id, Kind, MAX_FOLDING, Op, Type, Unary, cost, fold, show};
 use crate::tensor::{MAX_RANK, Tensor, elements};
 
 /// A node, or why its operands do not fit.
@@ -76,7 +76,7 @@ impl Graph {
                     "computes with constants alone, and with the entry's others that takes more than {MAX_FOLDING} operations"
                 ));
             }
-            if let Some(tensor) = evaluate(&op, &operands, &known) {
+            if let Some(tensor) = fold(&op, &operands, &known) {
                 return Ok(self.add_const(Arc::new(tensor)));
             }
         }
