@@ -12,6 +12,7 @@
 #![forbid(unsafe_code)]
 
 mod build;
+mod checked;
 mod contract;
 mod golden;
 mod known;
@@ -27,16 +28,13 @@ mod yaml;
 use std::path::{Path, PathBuf};
 
 use lads_compiler::onnx::StringStringEntryProto;
-use lads_compiler::{Bundle, BundleError, CompileError, Reference};
-use lads_core::{ChannelId, Data};
+use lads_compiler::{BundleError, CompileError, Reference};
 use prost::Message as _;
 
-use crate::golden::Episode;
 use crate::model::Model;
-use crate::plan::Plan;
 use crate::resolve::Edges;
 use crate::robot::Robot;
-use crate::said::Said;
+use crate::said::{Gain, Said};
 
 pub use problem::{Problem, Problems};
 
@@ -118,12 +116,7 @@ pub fn import(request: &Request) -> Result<Imported, ImportError> {
         mut problems,
     } = known(request)?;
     for model in &models {
-        for operator in &model.survey.missing.operators {
-            problems.add(
-                format!("node `{}`", operator.node),
-                format!("operator {} {}", operator.operator, operator.problem),
-            );
-        }
+        model.operators(&robot.axes, &mut problems)?;
     }
     let edges = Edges::of(&models, &robot.axes, &mut problems);
     let plan = resolve::resolve(&edges, &robot, &request.wires, &mut problems);
@@ -148,11 +141,11 @@ pub fn import(request: &Request) -> Result<Imported, ImportError> {
     };
     say("lads.contract", contract::contract(&models, &plan, &states));
     let mut reference = Reference::new(&model.encode_to_vec())?;
-    let episode = episode(&mut reference, &plan, recording, &mut problems)?;
+    let steps = checked::steps(&mut reference, &plan, recording, &mut problems)?;
     if !problems.is_empty() {
         return Err(ImportError::Problems { problems });
     }
-    match episode.golden(&plan, plan.tolerance) {
+    match steps.episode.golden(&plan, steps.tolerance) {
         Ok(value) => model.metadata_props.push(StringStringEntryProto {
             key: "lads.golden".into(),
             value,
@@ -160,23 +153,23 @@ pub fn import(request: &Request) -> Result<Imported, ImportError> {
         Err(problem) => problems.add("golden steps", problem),
     }
     let bundle = model.encode_to_vec();
-    let largest = compared(&bundle, &plan, &episode, &mut problems)?;
+    let largest = checked::compared(&bundle, &plan, &steps, &mut problems)?;
     if !problems.is_empty() {
         return Err(ImportError::Problems { problems });
     }
     notes.push(format!(
-        "{} steps of two episodes equal a double-precision evaluation of the graph within {largest:.1e} (tolerance {:.1e})",
-        episode.len(),
-        plan.tolerance
+        "{} steps equal a double-precision evaluation of the graph within {largest:.1e} (tolerance {:.1e})",
+        steps.episode.len(),
+        steps.tolerance
     ));
     Ok(Imported { bundle, notes })
 }
 
-/// The form to fill in: all that is known, and all that is missing with what it means.
+/// The form to fill in: all that is known, all that is missing with what it means, and what is wrong with the files.
 pub fn template(request: &Request) -> Result<String, ImportError> {
     let mut known = known(request)?;
     let edges = Edges::of(&known.models, &known.robot.axes, &mut known.problems);
-    Ok(template::template(&edges, &known.robot))
+    Ok(template::template(&edges, &known.robot, &known.problems))
 }
 
 /// Reads all files.
@@ -216,47 +209,43 @@ fn known(request: &Request) -> Result<Known, ImportError> {
             cleared_by: robot::ClearedBy::Episode,
         });
     }
+    let mut lost: Vec<(String, Gain)> = vec![];
     let mut take = |said: Said, source: &str, problems: &mut Problems| {
         if !said.used.is_empty() {
             notes.push(format!("{source}: read {}", said.used.join(", ")));
         }
+        let named = |(name, gain)| (format!("{source}, `{name}`"), gain);
+        lost.extend(said.lost.into_iter().map(named));
         if let Err(problem) = robot.fill(said.robot) {
             problems.add(source, problem);
         }
     };
     for path in neighbours(request) {
         let source = path.display().to_string();
-        let text = match read_text(&path) {
-            Ok(text) => text,
-            Err(problem) => {
-                problems.add(source, problem);
-                continue;
-            }
-        };
         let json = path.extension().is_some_and(|ending| ending == "json");
-        let said = if json {
-            said::manifest(&text, &source, &mut problems)
-        } else {
-            said::deploy(&text, &source, &mut problems)
-        };
-        take(said, &source, &mut problems);
-    }
-    for model in &models {
-        // What is wrong there does not matter where a person says better.
-        let mut own = Problems::default();
-        let said = said::metadata(model.metadata(), &mut own);
-        take(said, "metadata", &mut problems);
-        for problem in own.all() {
-            problems.add(&problem.about, &problem.wrong);
+        let read = if json { said::manifest } else { said::deploy };
+        match read_text(&path) {
+            Ok(text) => take(read(&text, &source, &mut problems), &source, &mut problems),
+            Err(problem) => problems.add(source, problem),
         }
     }
-    // Gains that were lost in a file are no problem once somebody has said them.
-    let problems = problems.without(|problem| {
-        let said = |field: &str, value: &Option<robot::Each>| {
-            value.is_some() && problem.wrong.contains(&format!("say `action.{field}`"))
+    for model in &models {
+        let said = said::metadata(model.metadata(), &mut problems);
+        take(said, "metadata", &mut problems);
+    }
+    // No problem once somebody has said them.
+    for (about, gain) in lost {
+        let (field, said) = match gain {
+            Gain::Stiffness => ("stiffness", &robot.action.stiffness),
+            Gain::Damping => ("damping", &robot.action.damping),
         };
-        said("stiffness", &robot.action.stiffness) || said("damping", &robot.action.damping)
-    });
+        if said.is_none() {
+            problems.add(
+                about,
+                format!("has been rounded until nothing is left of it (all 1, or a 0): say `action.{field}`"),
+            );
+        }
+    }
     Ok(Known {
         models,
         robot,
@@ -279,106 +268,4 @@ fn neighbours(request: &Request) -> Vec<PathBuf> {
     }
     all.dedup();
     all
-}
-
-/// The golden steps: recorded ones, which have to be what the graph does, or made-up ones.
-fn episode(
-    reference: &mut Reference,
-    plan: &Plan,
-    recording: Option<Episode>,
-    problems: &mut Problems,
-) -> Result<Episode, CompileError> {
-    let Some(recording) = recording else {
-        let mut episode = golden::made_up(plan);
-        episode.actions = golden::computed(reference, &episode)?;
-        for (step, action) in episode.actions.iter().enumerate() {
-            if let Some(i) = action.iter().position(|value| !value.is_finite()) {
-                problems.add(
-                    format!("action `{}`", plan.action.elements[i].name),
-                    format!("is no number in step {step} of observations inside their limits"),
-                );
-                break;
-            }
-        }
-        return Ok(episode);
-    };
-    let wanted = golden::computed(reference, &recording)?;
-    differences(&wanted, &recording.actions, plan, "the recording", problems);
-    Ok(recording)
-}
-
-/// The largest difference; the first one beyond the tolerance is a problem.
-fn differences(
-    graph: &[Vec<f64>],
-    other: &[Vec<f64>],
-    plan: &Plan,
-    what: &str,
-    problems: &mut Problems,
-) -> f64 {
-    let mut largest = 0.0_f64;
-    for (step, (a, b)) in graph.iter().zip(other).enumerate() {
-        for (i, (a, b)) in a.iter().zip(b).enumerate() {
-            let difference = (a - b).abs();
-            let close = difference <= plan.tolerance;
-            if !close && problems.is_empty() {
-                problems.add(
-                    format!("action `{}`", plan.action.elements[i].name),
-                    format!(
-                        "is {b} in step {step} of {what}, the graph gives {a}: more than the tolerance {:e} apart (`action.tolerance`)",
-                        plan.tolerance
-                    ),
-                );
-            }
-            largest = largest.max(difference);
-        }
-    }
-    largest
-}
-
-/// Runs the compiled policy over the episode and returns how far its actions are from the graph's.
-fn compared(
-    bundle: &[u8],
-    plan: &Plan,
-    episode: &Episode,
-    problems: &mut Problems,
-) -> Result<f64, ImportError> {
-    let unloaded = |error: &dyn std::fmt::Display| CompileError::Entry {
-        entry: "policy/act".into(),
-        problem: error.to_string().into(),
-    };
-    let image = lads_compiler::compile(&Bundle::from_bytes(bundle)?)?;
-    let opened = lads_host::from_bytes(image.as_bytes()).map_err(|error| unloaded(&error))?;
-    let mut loaded = opened.load().map_err(|error| unloaded(&error))?;
-    let mut controller = loaded.controller();
-    let mut actions = vec![];
-    for step in 0..episode.len() {
-        if episode.begins[step] {
-            controller.reset();
-        }
-        let values: Vec<Vec<f32>> = episode
-            .observed(step)
-            .iter()
-            .map(|row| row.iter().map(|&value| value as f32).collect())
-            .collect();
-        let given: Vec<(ChannelId, Data)> = controller
-            .policy()
-            .contract()
-            .observations()
-            .map(|channel| channel.id())
-            .zip(values.iter().map(|row| Data::F32(row)))
-            .collect();
-        let mut action = vec![0.0; plan.action.elements.len()];
-        controller
-            .step_with(&given, &mut action)
-            .map_err(|error| unloaded(&error))?;
-        actions.push(action.into_iter().map(f64::from).collect());
-    }
-    let what = "the compiled policy";
-    Ok(differences(
-        &episode.actions,
-        &actions,
-        plan,
-        what,
-        problems,
-    ))
 }

@@ -3,7 +3,7 @@
 //! What can fail: a file is no ONNX model, or one that is cut off; external data is missing, short, larger than it says, or lies outside the
 //! model's folder; names are given twice, nodes form a cycle, a weight is no number. Each is a problem with its name.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Component, Path, PathBuf};
@@ -12,7 +12,7 @@ use bytes::Bytes;
 use lads_compiler::onnx::{
     self, DimensionProto, GraphProto, ModelProto, TensorProto, ValueInfoProto, data_type,
 };
-use lads_compiler::{BundleError, Survey, survey};
+use lads_compiler::{BundleError, survey};
 use prost::Message as _;
 
 use crate::problem::Problems;
@@ -24,8 +24,6 @@ pub(crate) struct Model {
     pub path: PathBuf,
     pub proto: ModelProto,
     pub sha256: String,
-    /// What the compiler does not take of it.
-    pub survey: Survey,
 }
 
 /// A value that a graph reads or gives.
@@ -65,16 +63,38 @@ impl Model {
             bring_in(graph, folder.unwrap_or(Path::new(".")), problems);
             check(graph, problems);
         }
-        // With the weights inside, so that only what is not supported is told.
-        let survey = survey(&proto.encode_to_vec()).map_err(named)?;
         let stem = path.file_stem().unwrap_or_default();
         Ok(Self {
             stem: stem.to_string_lossy().into_owned(),
             path: path.into(),
             proto,
             sha256,
-            survey,
         })
+    }
+
+    /// Nodes that the compiler does not take, with the lengths of the axes that are known by now.
+    pub fn operators(
+        &self,
+        axes: &BTreeMap<String, usize>,
+        problems: &mut Problems,
+    ) -> Result<(), BundleError> {
+        let mut proto = self.proto.clone();
+        let inputs = proto.graph.iter_mut().flat_map(|graph| &mut graph.input);
+        let shapes =
+            inputs.filter_map(|value| value.r#type.as_mut()?.tensor_type.as_mut()?.shape.as_mut());
+        for dim in shapes.flat_map(|shape| &mut shape.dim) {
+            let name = dim.dim_param.as_deref().unwrap_or("");
+            if let Some(&len) = axes.get(name) {
+                (dim.dim_value, dim.dim_param) = (Some(len as i64), None);
+            }
+        }
+        for operator in survey(&proto.encode_to_vec())?.missing.operators {
+            problems.add(
+                format!("node `{}`", operator.node),
+                format!("operator {} {}", operator.operator, operator.problem),
+            );
+        }
+        Ok(())
     }
 
     pub fn graph(&self) -> &GraphProto {
@@ -96,7 +116,7 @@ impl Model {
     pub fn edges(
         &self,
         file: usize,
-        axes: &std::collections::BTreeMap<String, usize>,
+        axes: &BTreeMap<String, usize>,
         problems: &mut Problems,
     ) -> (Vec<Edge>, Vec<Edge>) {
         let graph = self.graph();
@@ -130,7 +150,7 @@ impl Model {
 fn edge(
     file: usize,
     value: &ValueInfoProto,
-    axes: &std::collections::BTreeMap<String, usize>,
+    axes: &BTreeMap<String, usize>,
 ) -> Result<Edge, String> {
     let tensor = value.r#type.as_ref().and_then(|ty| ty.tensor_type.as_ref());
     let tensor = tensor.ok_or("is no tensor; export the policy with tensors at its edge")?;
@@ -162,7 +182,7 @@ fn edge(
 fn length(
     axis: usize,
     dim: &DimensionProto,
-    axes: &std::collections::BTreeMap<String, usize>,
+    axes: &BTreeMap<String, usize>,
 ) -> Result<usize, String> {
     let name = dim.dim_param.as_deref().unwrap_or("");
     if let Some(&len) = axes.get(name) {

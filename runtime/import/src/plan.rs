@@ -23,7 +23,17 @@ pub(crate) struct Element {
 pub(crate) struct Channel {
     pub name: String,
     pub elements: Vec<Element>,
+    /// Which elements each term brought, in their order.
+    pub parts: Vec<Part>,
     pub quaternion_order: Option<QuaternionOrder>,
+}
+
+/// The elements of a channel that a term brought: `first..first + len`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Part {
+    pub term: String,
+    pub first: usize,
+    pub len: usize,
 }
 
 /// Where the raw values of a term come from.
@@ -118,5 +128,6 @@ pub(crate) struct Plan {
     pub feeds: Vec<(Edge, Feed)>,
     pub states: Vec<State>,
     pub action: Action,
-    pub tolerance: f64,
+    /// Largest difference of an action that counts as equal, where a person says one.
+    pub tolerance: Option<f64>,
 }

@@ -30,16 +30,6 @@ impl Problems {
         }
     }
 
-    /// The same without some.
-    pub(crate) fn without(self, drop: impl Fn(&Problem) -> bool) -> Self {
-        Self(
-            self.0
-                .into_iter()
-                .filter(|problem| !drop(problem))
-                .collect(),
-        )
-    }
-
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()

@@ -2,7 +2,9 @@
 
 mod action;
 mod elements;
+mod sources;
 mod terms;
+mod widths;
 
 use std::collections::BTreeMap;
 
@@ -107,14 +109,12 @@ pub(crate) fn resolve(
             feeds.push(((*input).clone(), feed));
         }
     }
-    terms::check_channels(&channels, problems);
+    sources::check_channels(&channels, problems);
     check_head(robot, problems);
     if problems.all().len() > before {
         return None;
     }
     let action = action?;
-    let range = |element: &crate::plan::Element| element.max - element.min;
-    let smallest = action.elements.iter().map(range).fold(f64::MAX, f64::min);
     Some(Plan {
         environment: robot
             .environment
@@ -124,7 +124,7 @@ pub(crate) fn resolve(
         channels,
         feeds,
         states,
-        tolerance: robot.action.tolerance.unwrap_or(smallest * 1e-3),
+        tolerance: robot.action.tolerance,
         action,
     })
 }

@@ -4,9 +4,13 @@
 //! unitree's tools, and JSON manifests with the same names. Only the names listed here are read: paths, robot descriptions and whatever
 //! else an author's machine has left in a file go nowhere. What can fail: a value is not what its name says, which is a problem.
 
+mod deploy;
+
 use crate::problem::Problems;
-use crate::robot::{Clip, Each, History, Layout, Order, Robot, Start, Term};
+use crate::robot::{Each, Robot, Term};
 use crate::yaml::Value;
+
+pub(crate) use deploy::deploy;
 
 /// What one source says.
 #[derive(Debug, Default)]
@@ -14,6 +18,15 @@ pub(crate) struct Said {
     pub robot: Robot,
     /// Names that were understood, for the notes.
     pub used: Vec<String>,
+    /// Gains that were printed with too few decimals: what the source calls them, and which they are.
+    pub lost: Vec<(String, Gain)>,
+}
+
+/// A gain of the joints' own controllers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Gain {
+    Stiffness,
+    Damping,
 }
 
 /// Names under which exporters put the same thing.
@@ -118,18 +131,14 @@ fn flat(values: &Value, source: &str, problems: &mut Problems) -> Said {
     if robot.control_period_s.is_none() {
         robot.control_period_s = rate.filter(|&rate| rate > 0.0).map(|rate| 1.0 / rate);
     }
-    for (found, field, place) in [
-        (stiffness, "stiffness", &mut robot.action.stiffness),
-        (damping, "damping", &mut robot.action.damping),
+    for (found, gain, place) in [
+        (stiffness, Gain::Stiffness, &mut robot.action.stiffness),
+        (damping, Gain::Damping, &mut robot.action.damping),
     ] {
-        let Some((name, each)) = found else { continue };
-        if rounded_away(&each) {
-            problems.add(
-                format!("{source}, `{name}`"),
-                format!("has been rounded until nothing is left of it (all 1, or a 0): say `action.{field}`"),
-            );
-        } else {
-            *place = Some(each);
+        match found {
+            Some((name, each)) if rounded_away(&each) => said.lost.push((name, gain)),
+            Some((_, each)) => *place = Some(each),
+            None => {}
         }
     }
     if let Some((name, value)) = terms {
@@ -195,124 +204,6 @@ fn each(value: &Value, joints: Option<&[String]>) -> Option<Each> {
         .map(Each::Many)
 }
 
-/// `deploy.yaml`: positions, scales and offsets are in the policy's order, gains in the robot's.
-pub(crate) fn deploy(text: &str, source: &str, problems: &mut Problems) -> Said {
-    let document = match crate::yaml::read(text) {
-        Ok(document) => document,
-        Err(problem) => {
-            problems.add(source, problem);
-            return Said::default();
-        }
-    };
-    let mut said = Said::default();
-    let robot = &mut said.robot;
-    let mut used = |name: &str| {
-        let value = document.get(name)?;
-        said.used.push(name.into());
-        Some(value)
-    };
-    robot.control_period_s = used("step_dt").and_then(Value::number);
-    robot.default_position = used("default_joint_pos").and_then(Value::numbers);
-    let map: Option<Vec<usize>> = used("joint_ids_map")
-        .and_then(Value::numbers)
-        .map(|ids| ids.iter().map(|&id| id as usize).collect());
-    let by_policy = |values: Vec<f64>| -> Option<Each> {
-        let Some(map) = &map else {
-            return Some(Each::Many(values));
-        };
-        // The robot's joints that the policy moves, in the robot's order.
-        let mut sorted = map.clone();
-        sorted.sort_unstable();
-        let place = |id| sorted.iter().position(|known| known == id);
-        let values: Option<Vec<f64>> = map
-            .iter()
-            .map(|id| values.get(place(id)?).copied())
-            .collect();
-        values.map(Each::Many)
-    };
-    robot.action.stiffness = used("stiffness")
-        .and_then(Value::numbers)
-        .and_then(by_policy);
-    robot.action.damping = used("damping").and_then(Value::numbers).and_then(by_policy);
-    robot.joint_ids_map.clone_from(&map);
-    let commands = used("commands").cloned().unwrap_or_default();
-    if let Some(action) = used("actions").and_then(|actions| actions.get("JointPositionAction")) {
-        robot.action.scale = action.get("scale").and_then(|value| each(value, None));
-        robot.action.offset = action.get("offset").and_then(|value| each(value, None));
-        robot.action.interface = Some("position".into());
-        robot.action.unit = Some("rad".into());
-        // The clip of a processed action is what its limits are.
-        if let Some((low, high)) = action.get("clip").and_then(bounds) {
-            (robot.action.min, robot.action.max) = (Some(low), Some(high));
-        }
-    }
-    let terms = used("observations").map_or(&[][..], Value::pairs);
-    for (name, row) in terms {
-        let mut term = named(name.clone());
-        term.scale = row.get("scale").and_then(|value| each(value, None));
-        if let Some((low, high)) = row.get("clip").and_then(bounds) {
-            term.clip = Some(Clip::Between([low, high]));
-        }
-        term.history = row
-            .get("history_length")
-            .and_then(Value::number)
-            .map(|length| length.max(1.0) as usize);
-        let command = row
-            .get("params")
-            .and_then(|params| params.get("command_name"))
-            .and_then(Value::text);
-        if let Some(ranges) = command
-            .and_then(|command| commands.get(command))
-            .and_then(|command| command.get("ranges"))
-        {
-            ranged(&mut term, ranges);
-        }
-        robot.terms.push(term);
-    }
-    let longest = robot.terms.iter().filter_map(|term| term.history).max();
-    if longest.is_some_and(|length| length > 1) {
-        robot.history = Some(History {
-            length: None,
-            layout: Some(Layout::Term),
-            order: Some(Order::OldestFirst),
-            start: Some(Start::First),
-        });
-    }
-    said
-}
-
-/// `[low, high]`, or a list of such pairs.
-fn bounds(value: &Value) -> Option<(Each, Each)> {
-    if let Some(&[low, high]) = value.numbers().as_deref() {
-        return Some((Each::One(low), Each::One(high)));
-    }
-    let pairs = value.list()?.iter().map(Value::numbers);
-    let pairs: Option<Vec<(f64, f64)>> = pairs
-        .map(|pair| match pair.as_deref() {
-            Some(&[low, high]) => Some((low, high)),
-            _ => None,
-        })
-        .collect();
-    let (low, high) = pairs?.into_iter().unzip();
-    Some((Each::Many(low), Each::Many(high)))
-}
-
-/// Names and limits of a command's elements; one without a range is not given to the policy.
-fn ranged(term: &mut Term, ranges: &Value) {
-    let rows: Vec<(&String, Vec<f64>)> = ranges
-        .pairs()
-        .iter()
-        .filter_map(|(name, range)| Some((name, range.numbers()?)))
-        .filter(|(_, range)| range.len() == 2)
-        .collect();
-    if rows.is_empty() {
-        return;
-    }
-    term.elements = Some(rows.iter().map(|(name, _)| (*name).clone()).collect());
-    term.min = Some(Each::Many(rows.iter().map(|(_, range)| range[0]).collect()));
-    term.max = Some(Each::Many(rows.iter().map(|(_, range)| range[1]).collect()));
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -337,12 +228,8 @@ mod tests {
         assert_eq!(robot.action.scale, Some(Each::One(0.25)));
         assert_eq!(robot.terms.len(), 2);
         assert!(!said.used.iter().any(|name| name == "run_path"));
-        let told = problems.to_string();
-        assert!(
-            told.contains("joint_stiffness") && told.contains("action.stiffness"),
-            "{told}"
-        );
-        assert_eq!(problems.all().len(), 1);
+        assert_eq!(said.lost, [("joint_stiffness".into(), Gain::Stiffness)]);
+        assert!(problems.is_empty(), "{problems}");
     }
 
     #[test]
@@ -359,30 +246,5 @@ mod tests {
             Some(Each::Many(vec![20.0, 30.0]))
         );
         assert!(problems.is_empty(), "{problems}");
-    }
-
-    #[test]
-    fn deploy_files_are_read_in_the_orders_that_they_use() {
-        let text = "joint_ids_map: [2, 0]\nstep_dt: 0.02\nstiffness: [10, 20]\ndefault_joint_pos: [0.5, 0.6]\n\
-            commands: {base: {ranges: {x: [-1, 1], heading: null}}}\n\
-            actions: {JointPositionAction: {scale: [0.25, 0.5], offset: [0.5, 0.6], clip: [[-1, 1], [-2, 2]]}}\n\
-            observations:\n  zeta: {scale: [1, 1, 1], clip: null, history_length: 5}\n\
-            \x20 alpha: {scale: 2.0, clip: [-3, 3], history_length: 5, params: {command_name: base, slice: !!python/object/apply:builtins.slice [1, 2]}}\n";
-        let mut problems = Problems::default();
-        let said = deploy(text, "deploy.yaml", &mut problems);
-        assert!(problems.is_empty(), "{problems}");
-        let robot = said.robot;
-        assert_eq!(robot.control_period_s, Some(0.02));
-        // The policy's first joint is the robot's last.
-        assert_eq!(robot.action.stiffness, Some(Each::Many(vec![20.0, 10.0])));
-        assert_eq!(robot.action.max, Some(Each::Many(vec![1.0, 2.0])));
-        let names: Vec<&str> = robot.terms.iter().map(|term| term.name.as_str()).collect();
-        assert_eq!(
-            names,
-            ["zeta", "alpha"],
-            "the graph reads them in the file's order"
-        );
-        assert_eq!(robot.terms[1].elements, Some(vec!["x".into()]));
-        assert_eq!(robot.history.expect("a history").start, Some(Start::First));
     }
 }

@@ -4,11 +4,12 @@ use std::fmt::{self, Display, Write};
 
 use crate::known::known;
 use crate::model::Edge;
+use crate::problem::Problems;
 use crate::resolve::Edges;
 use crate::robot::{Clip, Each, From, History, Layout, Order, Robot, Start, Term};
 
 /// The whole form.
-pub(crate) fn template(edges: &Edges, robot: &Robot) -> String {
+pub(crate) fn template(edges: &Edges, robot: &Robot, problems: &Problems) -> String {
     let mut form = Form::default();
     form.line("# What stands between sensors and policy. Take away the `#` in front of a field and say what it asks for.");
     form.line(format_args!(
@@ -16,6 +17,12 @@ pub(crate) fn template(edges: &Edges, robot: &Robot) -> String {
         listed(edges, &edges.inputs),
         listed(edges, &edges.outputs)
     ));
+    if !problems.is_empty() {
+        form.line("# What is wrong with the files so far:");
+    }
+    for problem in problems.all() {
+        form.line(format_args!("#   {}: {}", problem.about, problem.wrong));
+    }
     form.line("");
     match &robot.environment {
         Some(known) => form.line(format_args!(

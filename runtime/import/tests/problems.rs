@@ -209,6 +209,13 @@ fn neighbours_are_read_and_have_to_agree() {
             .refused()
             .contains("dof_pos here and joint_pos_rel there")
     );
+    // The form says so too, instead of leaving a file out without a word.
+    let form = template(&Request {
+        models: vec![&other.path("policy.onnx")],
+        beside: vec![&other.path("policy.onnx")],
+        ..Request::default()
+    });
+    assert!(form.expect("a form").contains("wrong with the files"));
     let bomb = Case::new(&mirror(2), robot);
     bomb.put("deploy.yaml", "[".repeat(10_000).as_bytes());
     let told = bomb.refused();

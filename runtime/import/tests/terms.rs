@@ -280,3 +280,52 @@ fn a_policy_that_computes_nothing_is_refused() {
     let told = Case::new(&mirror(2), &robot).refused();
     assert!(told.contains("it computes nothing"), "{told}");
 }
+
+#[test]
+fn terms_are_told_apart_by_their_whole_names() {
+    let robot = format!(
+        "{HEAD}[[term]]\nname = \"arm.x\"\nwidth = 1\n{SENSOR}[[term]]\nname = \"arm\"\nwidth = 1\nscale = 3\n{SENSOR}{}",
+        wide_action(2)
+    );
+    let case = Case::new(&mirror(2), &robot);
+    let actions = case.actions(&[step(&[&[1.0, 2.0]])]);
+    close(&actions[0], &[1.0, 6.0]);
+}
+
+#[test]
+fn named_axes_have_the_length_that_is_said() {
+    let mut graph = model(
+        vec![value("obs", &[1, -1, 2])],
+        vec![
+            node("Reshape", &["obs", "shape"], &["flat"]),
+            node("Neg", &["flat"], &["actions"]),
+        ],
+        vec![lads_compiler::onnx::TensorProto {
+            dims: vec![2],
+            data_type: 7,
+            name: "shape".into(),
+            int64_data: vec![1, 6],
+            ..Default::default()
+        }],
+        vec![value("actions", &[1, 6])],
+    );
+    let shape = graph.graph.as_mut().expect("a graph").input[0]
+        .r#type
+        .as_mut();
+    let shape = shape
+        .expect("a type")
+        .tensor_type
+        .as_mut()
+        .expect("a tensor");
+    shape.shape.as_mut().expect("a shape").dim[1].dim_param = Some("T".into());
+    let robot = format!(
+        "{HEAD}history = {{ length = 3, layout = \"time\", order = \"oldest_first\", start = \"zero\" }}\n\
+         [axes]\nT = 3\n[[term]]\nname = \"a\"\nwidth = 2\n{SENSOR}{}",
+        wide_action(6)
+    );
+    let case = Case::new(&graph, &robot);
+    let actions = case.actions(&[step(&[&[1.0, 2.0]]), step(&[&[3.0, 4.0]])]);
+    close(&actions[1], &[0.0, 0.0, -1.0, -2.0, -3.0, -4.0]);
+    let told = Case::new(&graph, &robot.replace("T = 3", "")).refused();
+    assert!(told.contains("`axes.T = LENGTH`"), "{told}");
+}

@@ -57,8 +57,14 @@ fn vectors_without_a_batch_axis_are_layers_too() {
         .input("b", &[2, 6, 5])
         .node("MatMul", &["a", "b"], &["y"], &[])
         .output("y", &[2, 5]);
-    // tract has no product of two vectors to compare with.
     agrees(row);
+    // tract has no product of two vectors to compare with.
+    let product = Small::new()
+        .input("a", &[3])
+        .weights("b", &[3], &[2.0, -3.0, 0.5])
+        .node("MatMul", &["a", "b"], &["y"], &[])
+        .output("y", &[]);
+    assert_eq!(run(&product, &[1.0, 2.0, 4.0]), [-2.0]);
 }
 
 #[test]
@@ -244,4 +250,25 @@ fn what_loses_bits_or_has_no_bound_is_refused() {
         .node("Einsum", &["a"], &["y"], &[text("equation", "ii->i")])
         .output("y", &[2]);
     refused(&twice, &["Einsum", "ii"]);
+}
+
+#[test]
+fn picked_columns_go_into_the_matrix() {
+    let small = Small::new()
+        .input("a", &[1, 4])
+        .input("b", &[1, 3])
+        .integers("left", &[3, 1])
+        .integers("right", &[2, 0])
+        .random("w", &[7, 5])
+        .node("Gather", &["a", "left"], &["p"], &[int("axis", 1)])
+        .node("Gather", &["a", "right"], &["q"], &[int("axis", 1)])
+        .node("Concat", &["p", "b", "q"], &["x"], &[int("axis", 1)])
+        .node("MatMul", &["x", "w"], &["y"], &[])
+        .output("y", &[1, 5]);
+    let made = names(&agrees(small));
+    // Both inputs as they lie, then the layer.
+    assert!(
+        made.last().map(AsRef::as_ref) == Some("Linear") && made.len() <= 3,
+        "{made:?}"
+    );
 }

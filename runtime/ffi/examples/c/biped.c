@@ -10,6 +10,8 @@
  */
 #define _POSIX_C_SOURCE 200809L
 
+#include "files.h"
+
 #include <lads.h>
 
 #include <stdio.h>
@@ -28,31 +30,6 @@ typedef struct {
 static int refuse(const char *thing, lads_status status) {
     fprintf(stderr, "biped: %s: status %d\n", thing, (int)status);
     return 2;
-}
-
-/* Memory that starts on a cache line. */
-static void *lines(size_t bytes) {
-    void *memory = NULL;
-    return posix_memalign(&memory, LADS_WORKSPACE_ALIGN, bytes) == 0 ? memory : NULL;
-}
-
-static unsigned char *read_file(const char *path, size_t *bytes) {
-    FILE *file = fopen(path, "rb");
-    unsigned char *content = NULL;
-    long end = -1;
-    if (file != NULL && fseek(file, 0, SEEK_END) == 0 && (end = ftell(file)) > 0) {
-        *bytes = (size_t)end;
-        content = lines(*bytes);
-        rewind(file);
-        if (content != NULL && fread(content, 1, *bytes, file) != *bytes) {
-            free(content);
-            content = NULL;
-        }
-    }
-    if (file != NULL) {
-        fclose(file);
-    }
-    return content;
 }
 
 /* Opens an image, and sets a controller up that has passed its self-test. */
