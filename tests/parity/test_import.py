@@ -2,6 +2,10 @@
 
 The files are made by `forms.py`. ONNX Runtime runs the file as it is, its states fed back by hand; the runtime has only the bundle and raw
 values. 200 steps with resets. Skipped where ONNX Runtime or cargo is missing.
+
+    python tests/parity/test_import.py FOLDER
+
+writes all forms and what a person says of each, for the edits of `runtime/import/tests/hostile.rs`.
 """
 
 import os
@@ -123,3 +127,13 @@ def test_every_form_is_imported_and_does_what_onnx_runtime_does(lads, tmp_path):
     print(f"{count} forms agree; without convolutions are left: {', '.join(left)}")
     assert not failed, "\n".join(failed)
     assert count > 60
+
+
+if __name__ == "__main__":
+    folder = pathlib.Path(sys.argv[1])
+    folder.mkdir(parents=True, exist_ok=True)
+    for form in forms.forms():
+        onnx.save(form.model, folder / f"{form.name}.onnx")
+        action = next(value for value in form.model.graph.output if value.name == form.action)
+        width = int(np.prod([dim.dim_value or 1 for dim in action.type.tensor_type.shape.dim]))
+        (folder / f"{form.name}.toml").write_text(described(form, width))

@@ -77,7 +77,11 @@ fn value(text: &str) -> Value {
 /// A JSON manifest.
 pub(crate) fn manifest(text: &str, source: &str, problems: &mut Problems) -> Said {
     match serde_json::from_str::<serde_json::Value>(text) {
-        Ok(json) => flat(&json.into(), source, problems),
+        Ok(json) if json.is_object() => flat(&json.into(), source, problems),
+        Ok(_) => {
+            problems.add(source, "holds no fields");
+            Said::default()
+        }
         Err(error) => {
             problems.add(source, format!("is no JSON: {error}"));
             Said::default()
