@@ -126,7 +126,7 @@ fn edited_files_are_imported_or_reported() {
         match import(&request) {
             Ok(_) => imported += 1,
             Err(ImportError::Problems { problems }) => {
-                assert!(!problems.is_empty(), "script {scripts}")
+                assert!(!problems.is_empty(), "script {scripts}");
             }
             Err(error) => assert!(!error.to_string().is_empty(), "script {scripts}"),
         }
