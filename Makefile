@@ -76,7 +76,7 @@ test-runtime:
 	cargo test $(RUNTIME) -p lads-language
 
 test-rust: setup
-	cargo test $(ALL)
+	cargo test $(ALL) --no-fail-fast
 
 # Tests of what has unsafe code or untrusted input, in a build with AddressSanitizer, whose run-time library comes with the toolchain,
 # and under valgrind, which also sees the use of memory that was never written. Debug assertions and the checks of the preconditions of
