@@ -4,6 +4,7 @@
 //! A pass changes how a value is computed, never which value it is, up to the rounding of folded scales.
 
 mod attention;
+mod columns;
 mod conv;
 mod images;
 mod linear;

@@ -21,6 +21,7 @@ mod conv;
 mod copy;
 mod depthwise;
 mod gather_row;
+mod index;
 mod layer_norm;
 mod linear;
 mod matmul;
@@ -45,6 +46,7 @@ pub use conv::Conv;
 pub use copy::Copy;
 pub use depthwise::Depthwise;
 pub use gather_row::GatherRow;
+pub use index::{FromIndex, ToIndex};
 pub use layer_norm::LayerNorm;
 pub use linear::{Activation, Linear, WeightFormat};
 pub use matmul::MatMul;
@@ -261,11 +263,13 @@ ops! {
     Copy = 10,
     ArgMin = 11 if "arg",
     ArgMax = 12 if "arg",
-    Conv = 13 if "conv",
-    Depthwise = 14 if "conv",
-    Border = 15 if "conv",
-    Pool = 16 if "pool",
-    Resize = 17 if "resize",
+    ToIndex = 14,
+    FromIndex = 15,
+    Conv = 16 if "conv",
+    Depthwise = 17 if "conv",
+    Border = 18 if "conv",
+    Pool = 19 if "pool",
+    Resize = 20 if "resize",
 }
 
 #[cfg(test)]

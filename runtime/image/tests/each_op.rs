@@ -5,9 +5,9 @@ use std::collections::BTreeSet;
 use lads_image::codec::Field;
 use lads_image::op::{
     Activation, ArgMax, ArgMin, Attention, Binary, BinaryKind, Border, CacheFormat, Conv, Copy,
-    Depthwise, GatherRow, INT_SLOTS, IntSlot, LayerNorm, Linear, MatMul, OP_WORDS, Op, Operand,
-    Pair, Picture, Pool, PoolKind, Reduce, ReduceKind, Resize, Softmax, Space, Span, StateSpan,
-    Unary, UnaryKind, WeightFormat, WeightSpan, Window,
+    Depthwise, FromIndex, GatherRow, INT_SLOTS, IntSlot, LayerNorm, Linear, MatMul, OP_WORDS, Op,
+    Operand, Pair, Picture, Pool, PoolKind, Reduce, ReduceKind, Resize, Softmax, Space, Span,
+    StateSpan, ToIndex, Unary, UnaryKind, WeightFormat, WeightSpan, Window,
 };
 use lads_image::{Access, AccessKind, Checker, Fault, Isa, Machine, Program, Spaces, Work};
 use lads_kernels::{attention_scratch_len, conv_packed_len, depthwise_packed_len, packed_len};
@@ -196,6 +196,16 @@ fn samples() -> Vec<Op> {
     let (x, out) = (span(10, 12), IntSlot(7));
     ops.push(ArgMin { x, out }.into());
     ops.push(ArgMax { x, out }.into());
+    let (one, index) = (span(10, 1), IntSlot(7));
+    ops.push(ToIndex { x: one, out }.into());
+    ops.push(
+        FromIndex {
+            index,
+            shift: -3,
+            y: one,
+        }
+        .into(),
+    );
     ops.extend(images());
     ops
 }
@@ -333,7 +343,12 @@ fn outside_the_arena(op: &mut Op) -> Vec<(&mut u32, u32, usize)> {
         Op::Depthwise(op) => vec![weights(&mut op.w), weights(&mut op.bias)],
         Op::Border(op) => op.value.as_mut().into_iter().map(weights).collect(),
         Op::Resize(op) => vec![weights(&mut op.rows), weights(&mut op.cols)],
-        Op::Softmax(_) | Op::ArgMin(_) | Op::ArgMax(_) | Op::Pool(_) => vec![],
+        Op::Softmax(_)
+        | Op::ArgMin(_)
+        | Op::ArgMax(_)
+        | Op::Pool(_)
+        | Op::ToIndex(_)
+        | Op::FromIndex(_) => vec![],
     }
 }
 
@@ -524,9 +539,10 @@ fn accesses_are_what_a_run_does() {
             let may = slots.written == Some(IntSlot(slot as u8));
             assert!(int == 1 || may, "{op:?} writes slot {slot}");
         }
-        let index = matches!(op, Op::ArgMin(_) | Op::ArgMax(_));
+        let index = matches!(op, Op::ArgMin(_) | Op::ArgMax(_) | Op::ToIndex(_));
         assert_eq!(slots.written.is_some(), index);
-        assert_eq!(slots.read.is_some(), matches!(op, Op::GatherRow(_)));
+        let reads = matches!(op, Op::GatherRow(_) | Op::FromIndex(_));
+        assert_eq!(slots.read.is_some(), reads);
     }
 }
 

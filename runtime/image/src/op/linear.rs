@@ -20,7 +20,10 @@ impl Field for Activation {
             Self::LeakyRelu(alpha) => (2, alpha),
             Self::Tanh => (3, 0.0),
             Self::Sigmoid => (4, 0.0),
-            Self::Clipped(bound) => (5, bound),
+            Self::Elu(alpha) => (5, alpha),
+            Self::Softplus => (6, 0.0),
+            Self::Mish => (7, 0.0),
+            Self::Clipped(bound) => (8, bound),
         };
         out.word(kind);
         alpha.put(out);
@@ -35,7 +38,10 @@ impl Field for Activation {
             2 => return Some(Self::LeakyRelu(alpha)),
             3 => Self::Tanh,
             4 => Self::Sigmoid,
-            5 => return Some(Self::Clipped(alpha)),
+            5 => return Some(Self::Elu(alpha)),
+            6 => Self::Softplus,
+            7 => Self::Mish,
+            8 => return Some(Self::Clipped(alpha)),
             _ => return None,
         };
         (alpha.to_bits() == 0).then_some(plain)
