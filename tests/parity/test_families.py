@@ -54,16 +54,16 @@ def test_every_family_replays(families):
     assert passed == 4 * len(KINDS), "beside ONNX Runtime, bits, allocations, damaged images"
 
 
-def test_edited_images(families):
-    """The image fuzz target's function on edit scripts of a seeded generator, on images of every family."""
+def test_edited_images_and_bundles(families):
+    """The fuzz targets' functions on edit scripts of a seeded generator: images of every family, and the bundle of a policy that sees images."""
     if not shutil.which("cargo"):
         pytest.skip("cargo is not installed")
-    command = ["cargo", "test", *SELECTION, "--test", "hostile", "--", "--nocapture", "edited_images"]
+    command = ["cargo", "test", *SELECTION, "--test", "hostile", "--", "--nocapture", "edited"]
     more = {"LADS_FAMILIES": str(families), "LADS_FUZZ_SECONDS": "30"}
     done = subprocess.run(command, cwd=ROOT, env=os.environ | more, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    scripts = re.search(r"image: \d+ kept scripts, (\d+) generated ones", done.stdout)
-    assert int(scripts[1]) > 100
+    scripts = dict(re.findall(r"(image|bundle): \d+ kept scripts, (\d+) generated ones", done.stdout))
+    assert min(map(int, scripts.values())) > 100 and len(scripts) == 2
 
 
 def test_instruction_counts(families):

@@ -28,8 +28,6 @@ import forms  # noqa: E402
 # The Makefile's: with another one cargo would build its dependencies once more.
 SELECTION = ("--workspace", "--features", "lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language")
 STEPS, RESETS = 200, (70, 140)
-# The one kind of form that the compiler does not take yet.
-CONVOLUTIONS = "conv1d"
 # Inputs that say that an episode begins.
 BEGINS = ("is_init",)
 
@@ -88,7 +86,7 @@ def stepped(session, form, rows):
 
 
 def test_every_form_is_imported_and_does_what_onnx_runtime_does(lads, tmp_path):
-    random, failed, left, count = np.random.default_rng(3), [], [], 0
+    random, failed, count = np.random.default_rng(3), [], 0
     for form in forms.forms():
         path = tmp_path / f"{form.name}.onnx"
         onnx.save(form.model, path)
@@ -104,9 +102,6 @@ def test_every_form_is_imported_and_does_what_onnx_runtime_does(lads, tmp_path):
         robot.write_text(described(form, wanted.shape[1]))
         bundle = tmp_path / f"{form.name}.lads.onnx"
         made = subprocess.run([lads, "import", path, "--contract", robot, "-o", bundle], capture_output=True, text=True)
-        if form.name.startswith(CONVOLUTIONS) and "operator Conv is not supported" in made.stderr:
-            left.append(form.name)
-            continue
         if made.returncode:
             failed.append(f"{form.name}: {made.stderr.strip()}")
             continue
@@ -124,7 +119,7 @@ def test_every_form_is_imported_and_does_what_onnx_runtime_does(lads, tmp_path):
         if not difference <= bound:
             failed.append(f"{form.name}: off by {difference:.2e}")
         count += 1
-    print(f"{count} forms agree; without convolutions are left: {', '.join(left)}")
+    print(f"{count} forms agree")
     assert not failed, "\n".join(failed)
     assert count > 60
 

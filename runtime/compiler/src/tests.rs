@@ -2,6 +2,7 @@
 
 mod attention;
 mod bombs;
+mod doubles;
 mod field;
 mod images;
 mod layers;

@@ -18,6 +18,7 @@ fn activation() -> impl Strategy<Value = Activation> {
         Activation::LeakyRelu(0.1),
         Activation::Clipped(0.5),
         Activation::Tanh,
+        Activation::Elu(0.7),
     ];
     select(all.to_vec())
 }

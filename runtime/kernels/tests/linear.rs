@@ -108,6 +108,7 @@ fn activation() -> impl Strategy<Value = Activation> {
         Activation::None,
         Activation::Relu,
         Activation::LeakyRelu(0.2),
+        Activation::Clipped(0.5),
         Activation::Tanh,
         Activation::Sigmoid,
         Activation::Elu(0.8),

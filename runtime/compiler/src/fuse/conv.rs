@@ -16,6 +16,7 @@ use std::sync::Arc;
 use lads_image::op::{BinaryKind, UnaryKind};
 
 use super::Fused;
+use super::linear::is_activation;
 use crate::graph::{ConvOp, Graph, Id, Op, Rewriter, Type, Unary, topological};
 use crate::tensor::Tensor;
 
@@ -295,14 +296,10 @@ fn bounded(g: &mut Graph, kind: BinaryKind, own: Id, other: Id) -> Result<Option
 
 /// An activation after a convolution that has none yet.
 fn activated(g: &mut Graph, unary: Unary, x: Id) -> Result<Option<Id>, String> {
-    let fits = matches!(
-        unary.kind.0,
-        UnaryKind::Relu | UnaryKind::LeakyRelu | UnaryKind::Tanh | UnaryKind::Sigmoid
-    );
     let Op::Conv(conv) = *g.op(x) else {
         return Ok(None);
     };
-    if !fits || conv.activation.is_some() {
+    if !is_activation(unary) || conv.activation.is_some() {
         return Ok(None);
     }
     let conv = ConvOp {

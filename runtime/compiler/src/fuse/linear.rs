@@ -195,9 +195,9 @@ fn folded(
     .map(Some)
 }
 
-/// An activation after a layer that has none yet.
-fn activated(g: &mut Graph, unary: Unary, x: Id) -> Result<Option<Id>, String> {
-    let fits = matches!(
+/// Whether layers and convolutions compute it at their end.
+pub(super) fn is_activation(unary: Unary) -> bool {
+    matches!(
         unary.kind.0,
         UnaryKind::Relu
             | UnaryKind::LeakyRelu
@@ -206,9 +206,13 @@ fn activated(g: &mut Graph, unary: Unary, x: Id) -> Result<Option<Id>, String> {
             | UnaryKind::Elu
             | UnaryKind::Softplus
             | UnaryKind::Mish
-    );
+    )
+}
+
+/// An activation after a layer that has none yet.
+fn activated(g: &mut Graph, unary: Unary, x: Id) -> Result<Option<Id>, String> {
     let own = unshaped(g, x);
-    let Some((bias, None)) = layer(g, own).filter(|_| fits) else {
+    let Some((bias, None)) = layer(g, own).filter(|_| is_activation(unary)) else {
         return Ok(None);
     };
     let (inputs, shape) = (g.node(own).inputs.clone(), g.shape(x).to_vec());

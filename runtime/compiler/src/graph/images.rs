@@ -5,6 +5,7 @@
 use lads_image::op::PoolKind;
 
 use super::{Dim, Graph, Id, Kind, Op, Type, Unary, show};
+use crate::tensor::{MAX_ELEMENTS, elements};
 
 /// How a window moves over an image: rows, then columns; a sequence has one row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -93,6 +94,13 @@ impl Graph {
         }
         shape[0] = self.shape(x)[0];
         shape[last] = channels;
+        let lens: Vec<usize> = shape.iter().map(|dim| dim.fixed).collect();
+        if elements(&lens).is_none() {
+            return Err(format!(
+                "gives {}, more than {MAX_ELEMENTS} elements",
+                show(&shape)
+            ));
+        }
         Ok(shape)
     }
 

@@ -15,6 +15,9 @@ use crate::tensor::Tensor;
 /// The longest side of an image, and the largest number that says how a window moves.
 pub(super) const MAX_SIDE: usize = u16::MAX as usize;
 
+/// The most images of a node, times its groups: each is an operation of its own.
+const MAX_PARTS: usize = 1 << 12;
+
 /// Adds a node's operations to the graph.
 pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attributes) -> Outputs {
     match operator {
@@ -43,11 +46,12 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
 pub(super) fn sides(g: &Graph, x: Id) -> Result<Vec<usize>, String> {
     let shape = g.known_shape(x).filter(|shape| {
         (3..=4).contains(&shape.len())
+            && shape[0] <= MAX_PARTS
             && shape[2..].iter().all(|side| (1..=MAX_SIDE).contains(side))
     });
     shape.map(|shape| shape[2..].to_vec()).ok_or_else(|| {
         format!(
-            "supports [N, C, columns] and [N, C, rows, columns] of known size, with sides up to {MAX_SIDE}, not {}",
+            "supports [N, C, columns] and [N, C, rows, columns] of known size, N up to {MAX_PARTS} and sides up to {MAX_SIDE}, not {}",
             show(g.shape(x))
         )
     })
@@ -156,13 +160,22 @@ fn conv(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let shape = g.known_shape(weights).unwrap_or_default();
     let (outputs, inputs, kernel) = (shape[0], shape[1], &shape[2..]);
     let groups = usize::try_from(a.int("group", 1)?).unwrap_or(0);
-    let channels = g.known_shape(image).unwrap_or_default()[1];
-    if groups == 0
+    let &[images, channels, ..] = &g.known_shape(image).unwrap_or_default()[..] else {
+        return Err("needs channels".into());
+    };
+    if shape.contains(&0)
+        || groups == 0
         || groups.checked_mul(inputs) != Some(channels)
         || !outputs.is_multiple_of(groups)
     {
         return Err(format!(
             "has weights {shape:?} in {groups} groups for {channels} channels"
+        ));
+    }
+    let depthwise = groups == channels && outputs == channels;
+    if !depthwise && images.saturating_mul(groups) > MAX_PARTS {
+        return Err(format!(
+            "has {images} images in {groups} groups, together at most {MAX_PARTS} are supported"
         ));
     }
     let named = numbers(a, "kernel_shape", sides.len(), 0, 1)?;

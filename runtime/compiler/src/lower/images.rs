@@ -11,6 +11,7 @@ use super::Lowering;
 use super::compute::{Done, activation_of, product};
 use super::view::View;
 use crate::graph::{ConvOp, Id, Op, Windows};
+use crate::tensor::{MAX_ELEMENTS, elements};
 
 /// The batch, rows, columns and channels of images or sequences.
 fn four(shape: &[usize]) -> Result<[usize; 4], String> {
@@ -99,6 +100,11 @@ impl Lowering<'_> {
         let [n, rows, cols, c] = four(shape)?;
         let [top, left, bottom, right] = border;
         let whole = [n, top + rows + bottom, left + cols + right, c];
+        if elements(&whole).is_none() {
+            return Err(format!(
+                "needs an image with its border, {whole:?}, of more than {MAX_ELEMENTS} elements"
+            ));
+        }
         let buffer = self.buffer(product(&whole));
         let all = View::contiguous(buffer, 0, &whole);
         let [each, row, pixel] = [all.strides[0], all.strides[1], c];

@@ -192,6 +192,57 @@ fn encoders_become_convolutions_alone() {
     assert_eq!(names, others);
 }
 
+/// Convolutions over the steps of a history, as policies of legged robots have them: time is the columns, and nothing has to be moved.
+#[test]
+fn histories_are_images_of_one_row() {
+    let small = Small::new()
+        .input("a", &[1, 60])
+        .random("w", &[8, 3, 6])
+        .random("bias", &[8])
+        .random("v", &[5, 8, 3])
+        .random("f", &[15, 4])
+        .integers("steps", &[1, 20, 3])
+        .node("Reshape", &["a", "steps"], &["a0"], &[])
+        .node("Transpose", &["a0"], &["a1"], &[ints("perm", &[0, 2, 1])])
+        .node(
+            "Conv",
+            &["a1", "w", "bias"],
+            &["b0"],
+            &[ints("strides", &[3])],
+        )
+        .node("Elu", &["b0"], &["b1"], &[])
+        .node("Conv", &["b1", "v"], &["c0"], &[])
+        .node("Elu", &["c0"], &["c1"], &[float("alpha", 0.5)])
+        .node("Flatten", &["c1"], &["c2"], &[])
+        .node("MatMul", &["c2", "f"], &["y"], &[])
+        .output("y", &[1, 4]);
+    assert_eq!(names(&agrees(small)), ["Conv", "Conv", "Linear"]);
+    // Depthwise, with gaps and padding, and what is taken of all steps.
+    let small = Small::new()
+        .input("a", &[1, 4, 12])
+        .random("w", &[4, 1, 3])
+        .node(
+            "Conv",
+            &["a", "w"],
+            &["b0"],
+            &[
+                int("group", 4),
+                ints("dilations", &[2]),
+                ints("pads", &[4, 0]),
+            ],
+        )
+        .node("Tanh", &["b0"], &["b1"], &[])
+        .node(
+            "AveragePool",
+            &["b1"],
+            &["b2"],
+            &[ints("kernel_shape", &[3]), ints("strides", &[3])],
+        )
+        .node("GlobalMaxPool", &["b2"], &["y"], &[])
+        .output("y", &[1, 4, 1]);
+    agrees(small);
+}
+
 #[test]
 fn what_somebody_else_reads_stays() {
     let small = Small::new()
@@ -240,6 +291,27 @@ fn images_that_are_refused() {
     refused(
         &with(ints("kernel_shape", &[2, 3])),
         &["kernel_shape [2, 3]"],
+    );
+    let empty = image().weights("w", &[2, 4, 0, 3], &[]);
+    refused(
+        &y(empty.node("Conv", &["a", "w"], &["y"], &[])),
+        &["Conv", "[2, 4, 0, 3]"],
+    );
+    // What a few bytes of a file can ask for.
+    let many =
+        Small::new()
+            .input("a", &[1 << 20, 4, 5, 5])
+            .node("GlobalMaxPool", &["a"], &["y"], &[]);
+    refused(&many.output("y", &[1 << 20, 4, 1, 1]), &["N up to 4096"]);
+    let wide = [
+        ints("strides", &[60_000, 60_000]),
+        ints("pads", &[60_000, 60_000, 60_000, 60_000]),
+    ];
+    refused(
+        &w(image())
+            .node("Conv", &["a", "w"], &["y"], &wide)
+            .output("y", &[1, 2, 3, 3]),
+        &["its border", "120003"],
     );
     let volume = Small::new()
         .input("a", &[1, 4, 5, 5, 5])

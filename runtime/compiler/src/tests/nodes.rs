@@ -13,7 +13,7 @@ use lads_image::{Machine, Program, Spaces};
 use prost::Message;
 
 use super::models::ENTRY;
-use super::{Compiled, compiled};
+use super::{Compiled, compiled, doubles};
 use crate::entries::{Signature, Value};
 use crate::error::CompileError;
 use crate::graph::{Dim, Type};
@@ -55,7 +55,7 @@ impl Case {
     }
 
     /// The inputs from the `runtime`-th on become constants: what an exporter would have made of a scale or of axes.
-    fn compile(&self, runtime: usize) -> Result<Compiled, CompileError> {
+    fn exported(&self, runtime: usize) -> (ModelProto, Signature) {
         let mut model = self.model.clone();
         let graph = model.graph.as_mut().expect("a graph");
         let mut inputs: Vec<&String> = self.given.keys().collect();
@@ -101,11 +101,22 @@ impl Case {
                 .map(|&name| value(name, &self.expected[name]))
                 .collect(),
         };
-        let names: Vec<&str> = outputs.iter().map(|name| name.as_str()).collect();
-        compiled(&model, &signature, &names, Cache::NONE)
+        (model, signature)
     }
 
-    /// Runs the program in the core and compares; the tolerance is that of ONNX's own runner.
+    /// Evaluates the graph in double precision and compares.
+    fn check_evaluated(&self, name: &str, (model, signature): &(ModelProto, Signature)) {
+        let numbers = |(name, tensor): (&String, &Tensor)| {
+            let data = tensor.as_f32().expect("inputs are floats");
+            (name.clone(), data.to_vec())
+        };
+        let given = self.given.iter().map(numbers).collect();
+        for (output, got) in doubles::outputs(model, signature, &given) {
+            same(&format!("{name} evaluated"), &got, &self.expected[&output]);
+        }
+    }
+
+    /// Runs the program in the core and compares.
     fn check(&self, name: &str, program: &Compiled) {
         let placed = &program.placed;
         let ops: Vec<_> = placed.ops.iter().map(Op::encode).collect();
@@ -143,21 +154,29 @@ impl Case {
                     Place::Span(span) => arena[span.range()].to_vec(),
                     Place::Int(slot) => vec![ints[usize::from(slot.0)] as f32],
                 };
-                let expected: Vec<f32> = match &expected.data {
-                    Data::F32(data) => data.clone(),
-                    Data::I64(data) => data.iter().map(|&x| x as f32).collect(),
-                };
-                assert_eq!(got.len(), expected.len(), "{name}");
-                for (got, expected) in got.into_iter().zip(expected) {
-                    let same = got == expected || got.is_nan() && expected.is_nan();
-                    let near = (got - expected).abs() <= 1e-7 + 1e-3 * expected.abs();
-                    assert!(
-                        same || near,
-                        "{name} on {isa:?}: {got} instead of {expected}"
-                    );
-                }
+                same(&format!("{name} on {isa:?}"), &got, expected);
             }
         }
+    }
+}
+
+fn compile((model, signature): &(ModelProto, Signature)) -> Result<Compiled, CompileError> {
+    let outputs = signature.outputs.iter();
+    let names: Vec<&str> = outputs.map(|output| output.name.as_str()).collect();
+    compiled(model, signature, &names, Cache::NONE)
+}
+
+/// Compares; the tolerance is that of ONNX's own runner.
+fn same(what: &str, got: &[f32], expected: &Tensor) {
+    let expected: Vec<f32> = match &expected.data {
+        Data::F32(data) => data.clone(),
+        Data::I64(data) => data.iter().map(|&x| x as f32).collect(),
+    };
+    assert_eq!(got.len(), expected.len(), "{what}");
+    for (&got, expected) in got.iter().zip(expected) {
+        let same = got == expected || got.is_nan() && expected.is_nan();
+        let near = (got - expected).abs() <= 1e-7 + 1e-3 * expected.abs();
+        assert!(same || near, "{what}: {got} instead of {expected}");
     }
 }
 
@@ -181,14 +200,16 @@ fn onnx_node_cases() {
         // As many inputs as possible are given when the program runs.
         let attempts = (0..=case.given.len())
             .rev()
-            .map(|runtime| case.compile(runtime));
+            .map(|runtime| case.exported(runtime));
         let mut last = None;
-        let program = attempts
-            .into_iter()
-            .find_map(|attempt| attempt.map_err(|error| last = Some(error)).ok());
-        match (program, last) {
-            (Some(program), _) => {
+        let found = attempts.into_iter().find_map(|exported| {
+            let program = compile(&exported).map_err(|error| last = Some(error));
+            Some((program.ok()?, exported))
+        });
+        match (found, last) {
+            (Some((program, exported)), _) => {
                 case.check(&name, &program);
+                case.check_evaluated(&name, &exported);
                 for operator in operators {
                     *passed.entry(operator).or_default() += 1;
                 }

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use super::machine::Machine;
 use super::models::{Small, float, int, ints, text};
 use super::oracle::{Oracle, close, integer, tensor};
-use super::{Compiled, compiled};
+use super::{Compiled, compiled, doubles};
 use crate::error::CompileError;
 use crate::graph::{Dim, Type};
 use crate::lower::Cache;
@@ -20,7 +20,7 @@ pub(super) fn compile(small: &Small) -> Result<Compiled, CompileError> {
     compiled(&small.model(18), &small.signature, &outputs, Cache::NONE)
 }
 
-/// Compiles, runs and compares.
+/// Compiles, runs and compares, and evaluates the graph in double precision.
 #[track_caller]
 pub(super) fn agrees(small: Small) -> Compiled {
     agrees_at(18, small)
@@ -37,21 +37,25 @@ pub(super) fn agrees_at(opset: i64, mut small: Small) -> Compiled {
         .unwrap_or_else(|error| panic!("{error}"));
     let oracle = Oracle::new(&small.bytes(opset));
     let mut machine = Machine::new(&program.placed, &program.weights, vec![]);
-    let mut inputs = HashMap::new();
+    let (mut inputs, mut given) = (HashMap::new(), HashMap::new());
     for input in small.signature.inputs.clone() {
         let shape: Vec<usize> = input.shape.iter().map(|dim| dim.fixed).collect();
         if input.ty == Type::I64 {
             machine.set(&program.placed, &input.name, &[2.0]);
             inputs.insert(input.name.clone(), integer(2));
+            given.insert(input.name, vec![2.0]);
         } else {
             let values = small.numbers(shape.iter().product());
             machine.set(&program.placed, &input.name, &values);
             inputs.insert(input.name.clone(), tensor(&shape, &values));
+            given.insert(input.name, values);
         }
     }
     machine.run(&program.placed, 0);
+    let evaluated = doubles::outputs(&small.model(opset), &small.signature, &given);
     for (name, wanted) in oracle.run(&inputs) {
         close(&name, &machine.output(&program.placed, &name), &wanted);
+        close(&name, &evaluated[&name], &wanted);
     }
     program
 }
