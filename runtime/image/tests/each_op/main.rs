@@ -7,7 +7,7 @@ use std::collections::BTreeSet;
 
 use lads_image::codec::Field;
 use lads_image::op::{
-    Attention, INT_SLOTS, IntSlot, OP_WORDS, Op, Operand, Space, Span, WeightSpan,
+    Attention, INT_SLOTS, IntSlot, MatMul, OP_WORDS, Op, Operand, Space, Span, WeightSpan,
 };
 use lads_image::{Access, AccessKind, Checker, Fault, Isa, Machine, Program, Spaces, Work};
 use samples::{attention, samples, span, weight};
