@@ -66,6 +66,28 @@ fn inner(g: &Graph, id: Id) -> Option<Id> {
     is_turn.then_some(source)
 }
 
+/// Whether axes in this order have the channels last.
+fn is_last(perm: &[usize]) -> bool {
+    perm.iter()
+        .copied()
+        .eq([0].into_iter().chain(2..perm.len()).chain([1]))
+}
+
+/// A value with its channels last; what lies between constants, as padding makes it, turns itself, and not with them.
+fn padded(g: &mut Graph, x: Id) -> Result<Id, String> {
+    let Op::Concat { axis } = *g.op(x) else {
+        return channels_last(g, x);
+    };
+    let (parts, rank) = (g.node(x).inputs.clone(), g.shape(x).len());
+    let computed = parts.iter().filter(|&&part| g.constant(part).is_none());
+    if computed.count() > 1 {
+        return channels_last(g, x);
+    }
+    let last = parts.into_iter().map(|part| padded(g, part));
+    let last = last.collect::<Result<Vec<_>, _>>()?;
+    g.concat(&last, axis_of(rank, axis))
+}
+
 /// Where an axis of a turned view is in the value with channels last.
 fn axis_of(rank: usize, axis: usize) -> usize {
     match axis {
@@ -116,6 +138,9 @@ fn turned(g: &mut Graph, old: &Graph, id: Id, x: &[Id]) -> Result<Option<Id>, St
             };
         }
         (Op::MatMul, _) => return product(g, x),
+        (Op::Transpose(perm), _) if is_last(perm) && matches!(g.op(x[0]), Op::Concat { .. }) => {
+            return padded(g, x[0]).map(Some);
+        }
         _ => return Ok(None),
     };
     channels_first(g, new).map(Some)

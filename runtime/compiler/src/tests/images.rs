@@ -180,6 +180,8 @@ fn encoders_become_convolutions_alone() {
         "Border",
         "Depthwise",
         "Conv",
+        // What the last convolution is added to is what it reads.
+        "Copy",
         "Conv",
         "Linear",
     ];
