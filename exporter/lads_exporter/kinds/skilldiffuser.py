@@ -49,12 +49,12 @@ class InverseDynamics(nn.Module):
 
     def __init__(self, inputs, hidden, action):
         super().__init__()
-        self.first, self.second, self.last = nn.Linear(2 * inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, action)
+        self.first, self.second, self.head = nn.Linear(2 * inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, action)
 
     def forward(self, x):
         """x [..., L, c] -> actions [..., L - 1, A]."""
         pairs = torch.cat([x[..., :-1, :], x[..., 1:, :]], -1)
-        return self.last(F.relu(self.second(F.relu(self.first(pairs)))))
+        return self.head(F.relu(self.second(F.relu(self.first(pairs)))))
 
 
 class SkillDiffuser(nn.Module):
@@ -142,7 +142,7 @@ def build(policy, sizes):
     hidden = entry.op("Concat", [now, then], "pairs", axis=1)
     for name in ("first", "second"):
         hidden = entry.op("Relu", [dense(entry, hidden, getattr(policy.inverse, name), f"inverse.{name}", name)], f"{name}.relu")
-    dense(entry, hidden, policy.inverse.last, "inverse.last", "queue")
+    dense(entry, hidden, policy.inverse.head, "inverse.head", "queue")
     entry.output("queue", [rows - 1, sizes.action])
 
     entry = graphs.Entry(graph, "low_level/pop")
