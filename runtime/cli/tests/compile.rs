@@ -29,7 +29,7 @@ fn weights_of_fewer_bits_pass_a_gate() {
     // What only helps to choose the plan takes fewer bits with no other tolerance, and the self-test says so.
     let smaller = ["--weights", "f16", "--low-level", "f32", "--cache", "f16"];
     let said = answer(&compile(&smaller), "");
-    let stored = "f16 weights (low level f32) and an f16 cache: self-test passed";
+    let stored = "f16 weights (low_level/act f32) and an f16 cache: self-test passed";
     assert!(said.contains(stored), "{said}");
     answer(&["self-test", image], "");
     for (flag, value, known) in [

@@ -14,6 +14,7 @@ use crate::entries;
 use crate::error::BundleError;
 use crate::golden::Golden;
 use crate::onnx::{self, GraphProto, ModelProto};
+use crate::storage::Tuned;
 
 /// How many instructions are offered when one is not known.
 const NEAREST: usize = 3;
@@ -23,6 +24,7 @@ const NEAREST: usize = 3;
 pub struct Bundle {
     contract: Contract,
     golden: Golden,
+    tuned: Option<Tuned>,
     sha256: String,
     bytes: usize,
     pub(crate) model: ModelProto,
@@ -69,6 +71,7 @@ impl Bundle {
             problem: "missing from the model's metadata".into(),
         })?;
         let golden = Golden::parse(golden, &contract)?;
+        let tuned = Tuned::find(property)?;
         let graph = model.graph.as_ref().ok_or_else(|| BundleError::NotOnnx {
             problem: "it has no graph".into(),
         })?;
@@ -77,6 +80,7 @@ impl Bundle {
         Ok(Self {
             contract,
             golden,
+            tuned,
             sha256: sha256(bytes),
             bytes: bytes.len(),
             model,
@@ -91,6 +95,22 @@ impl Bundle {
     /// The recorded episode.
     pub fn golden(&self) -> &Golden {
         &self.golden
+    }
+
+    /// How an image's numbers are to be stored, and on what evidence; `None` until the bundle is tuned.
+    pub fn tuned(&self) -> Option<&Tuned> {
+        self.tuned.as_ref()
+    }
+
+    /// Names of the entry graphs whose outputs reach the action, not only the choice of an index.
+    pub fn acting_entries(&self) -> Vec<String> {
+        let blueprint = self.contract.family.kind().blueprint(&self.contract);
+        let acting = blueprint.entries.iter().filter(|entry| entry.acts);
+        let mut names: Vec<_> = acting
+            .filter_map(|entry| entry.graph().map(str::to_owned))
+            .collect();
+        names.dedup();
+        names
     }
 
     /// SHA-256 of the file, hexadecimal.

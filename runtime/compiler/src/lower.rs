@@ -20,6 +20,7 @@ use crate::contract::Network;
 use crate::error::CompileError;
 use crate::fuse::Fused;
 use crate::graph::{Graph, Id, Op, Type, topological};
+use crate::report::LayerReport;
 
 use view::View;
 pub(crate) use weights::Weights;
@@ -36,6 +37,7 @@ pub(crate) struct Lowered {
     pub inputs: Vec<(String, Place)>,
     pub outputs: Vec<(String, Place)>,
     pub tokens: usize,
+    pub layers: Vec<LayerReport>,
 }
 
 /// A KV cache: for each layer keys, in whole blocks of sixteen tokens, then values, `[capacity, heads * head_dim]`.
@@ -106,7 +108,7 @@ pub(crate) fn lower(
     entry: &str,
     fused: &Fused,
     cache: Cache,
-    weights: &mut Weights,
+    weights: &mut Weights<'_>,
 ) -> Result<Lowered, CompileError> {
     let order = topological(&fused.graph, &fused.roots(), &HashMap::new());
     let mut lowering = Lowering::new(fused, &order, cache, weights);
@@ -145,6 +147,7 @@ pub(crate) fn lower(
         buffers,
         input_ports,
         output_ports,
+        layers,
         ..
     } = lowering;
     Ok(Lowered {
@@ -153,6 +156,7 @@ pub(crate) fn lower(
         inputs: input_ports,
         outputs: output_ports,
         tokens: fused.tokens,
+        layers,
     })
 }
 
@@ -162,9 +166,9 @@ fn is_cache(name: &str) -> bool {
 }
 
 /// An entry on its way to ops.
-struct Lowering<'a> {
+struct Lowering<'a, 's> {
     g: &'a Graph,
-    weights: &'a mut Weights,
+    weights: &'a mut Weights<'s>,
     cache: Cache,
     ops: Vec<op::Op>,
     buffers: Vec<Span>,
@@ -182,10 +186,12 @@ struct Lowering<'a> {
     placed: HashMap<Id, (usize, usize)>,
     input_ports: Vec<(String, Place)>,
     output_ports: Vec<(String, Place)>,
+    /// The dense layers, in their order.
+    layers: Vec<LayerReport>,
 }
 
-impl<'a> Lowering<'a> {
-    fn new(fused: &'a Fused, order: &[Id], cache: Cache, weights: &'a mut Weights) -> Self {
+impl<'a, 's> Lowering<'a, 's> {
+    fn new(fused: &'a Fused, order: &[Id], cache: Cache, weights: &'a mut Weights<'s>) -> Self {
         let mut pending: HashMap<Id, usize> = HashMap::new();
         let uses = order
             .iter()
@@ -208,6 +214,7 @@ impl<'a> Lowering<'a> {
             placed: HashMap::new(),
             input_ports: vec![],
             output_ports: vec![],
+            layers: vec![],
         }
     }
 

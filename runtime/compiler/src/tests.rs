@@ -46,7 +46,8 @@ fn compiled(
     let entry = Model::new(model, graph)?.import(signature, &HashMap::new())?;
     let outputs: Vec<String> = outputs.iter().map(|&output| output.into()).collect();
     let fused = fuse(entry, signature, &outputs)?;
-    let mut weights = Weights::default();
+    let storage = Storage::default();
+    let mut weights = Weights::new(&storage);
     let lowered = lower(&signature.entry, &fused, cache, &mut weights)?;
     let placed = plan(&lowered);
     verify(&lowered, &placed).expect("the memory plan is proven");
