@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::time::{Duration, Instant};
 
-use lads_compiler::{Bundle, CacheFormat, Options, WeightFormat};
+use lads_compiler::{Bundle, CacheFormat, Options, Storage, WeightFormat};
 use serde_json::Value;
 
 /// A file of the project, by its path from the root.

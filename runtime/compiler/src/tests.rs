@@ -26,6 +26,7 @@ use crate::import::Model;
 use crate::lower::{Cache, Lowered, Weights, lower};
 use crate::onnx::ModelProto;
 use crate::plan::{Placed, plan};
+use crate::storage::Storage;
 use crate::verify::verify;
 
 /// A program as far as the stages before the image take it.
