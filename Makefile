@@ -18,7 +18,7 @@ RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-h
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report record viewer say language verify mutate test test-full setup lint test-rust test-runtime test-exporter sanitize collect train export table reference install bench clean help
+.PHONY: run report record viewer say language verify tune mutate test test-full setup lint test-rust test-runtime test-exporter sanitize collect train export table reference install bench clean help
 
 # Says before a build that takes long what it takes, where nothing of it is there yet: $(call first-build,a crate of it,what,minutes)
 first-build = @ls target/release/deps/lib$(1)-*.rlib >/dev/null 2>&1 || echo "The first build of $(2) takes some $(3) minutes of one core; later ones take seconds."
@@ -137,6 +137,10 @@ reference: $(VENV)/stamp
 ## verify: is the compiled policy the reference's? Fails unless EQUIVALENT; `lads-run verify` itself exits with 0, 1 DIFFERENT or 3 INCONCLUSIVE
 verify: setup
 	cargo run --release -p lads-sim --bin lads-run -- verify --model $(MODEL) $(ARGS)
+
+## tune: the smallest weights and caches that keep every plan of $(MODEL)'s reference, written into the bundle; ARGS="-o FILE" leaves it as it is
+tune: setup
+	cargo run --release -p lads-sim --bin lads-run -- tune --model $(MODEL) $(ARGS)
 
 ## mutate: changes of every kind to $(MODEL), what each moves and what its verification says; minutes
 mutate: setup
