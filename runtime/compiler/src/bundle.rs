@@ -9,12 +9,12 @@ use bytes::Bytes;
 use prost::Message;
 
 use crate::contract::Contract;
-use crate::digest::sha256;
+use crate::digest;
 use crate::entries;
 use crate::error::BundleError;
 use crate::golden::Golden;
 use crate::onnx::{self, GraphProto, ModelProto};
-use crate::storage::Tuned;
+use crate::storage::{Tuned, without_record};
 
 /// How many instructions are offered when one is not known.
 const NEAREST: usize = 3;
@@ -26,6 +26,7 @@ pub struct Bundle {
     golden: Golden,
     tuned: Option<Tuned>,
     sha256: String,
+    untuned_sha256: String,
     bytes: usize,
     pub(crate) model: ModelProto,
 }
@@ -72,6 +73,11 @@ impl Bundle {
         })?;
         let golden = Golden::parse(golden, &contract)?;
         let tuned = Tuned::find(property)?;
+        let sha256 = digest::sha256(bytes);
+        let untuned_sha256 = match tuned {
+            Some(_) => digest::sha256(&without_record(bytes)?),
+            None => sha256.clone(),
+        };
         let graph = model.graph.as_ref().ok_or_else(|| BundleError::NotOnnx {
             problem: "it has no graph".into(),
         })?;
@@ -81,7 +87,8 @@ impl Bundle {
             contract,
             golden,
             tuned,
-            sha256: sha256(bytes),
+            sha256,
+            untuned_sha256,
             bytes: bytes.len(),
             model,
         })
@@ -116,6 +123,11 @@ impl Bundle {
     /// SHA-256 of the file, hexadecimal.
     pub fn sha256(&self) -> &str {
         &self.sha256
+    }
+
+    /// SHA-256 of the file as it was before it was tuned: what a reference names, from which the bundle was tuned.
+    pub fn untuned_sha256(&self) -> &str {
+        &self.untuned_sha256
     }
 
     /// Size of the file.

@@ -160,14 +160,7 @@ impl Tuned {
 
     /// A bundle's file with this record instead of the one that it may have; all other bytes stay what they are.
     pub fn written_into(&self, bundle: &[u8]) -> Result<Vec<u8>, BundleError> {
-        let mut written = Vec::with_capacity(bundle.len() + 1024);
-        for field in fields(bundle)? {
-            let is_record = field.number == METADATA_FIELD
-                && StringStringEntryProto::decode(field.value).is_ok_and(|pair| pair.key == KEY);
-            if !is_record {
-                written.extend_from_slice(field.whole);
-            }
-        }
+        let mut written = without_record(bundle)?;
         let pair = StringStringEntryProto {
             key: KEY.into(),
             value: serde_json::to_string(self).map_err(|error| BundleError::Storage {
@@ -177,6 +170,19 @@ impl Tuned {
         prost::encoding::message::encode(METADATA_FIELD as u32, &pair, &mut written);
         Ok(written)
     }
+}
+
+/// A bundle's file as it was before it was tuned.
+pub(crate) fn without_record(bundle: &[u8]) -> Result<Vec<u8>, BundleError> {
+    let mut rest = Vec::with_capacity(bundle.len() + 1024);
+    for field in fields(bundle)? {
+        let is_record = field.number == METADATA_FIELD
+            && StringStringEntryProto::decode(field.value).is_ok_and(|pair| pair.key == KEY);
+        if !is_record {
+            rest.extend_from_slice(field.whole);
+        }
+    }
+    Ok(rest)
 }
 
 /// Formats by their names, as the record has them.

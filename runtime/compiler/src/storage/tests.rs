@@ -47,6 +47,10 @@ fn a_record_replaces_the_one_before_and_nothing_else() {
     assert_eq!(second.unwrap(), tuned(small()));
     // All other bytes are the file's.
     assert!(first.starts_with(TINY));
+    let [plain, bundle] = [TINY, &first].map(|bytes| Bundle::from_bytes(bytes).unwrap());
+    assert_eq!(bundle.untuned_sha256(), plain.sha256());
+    assert_eq!(plain.untuned_sha256(), plain.sha256());
+    assert_ne!(bundle.sha256(), plain.sha256());
 }
 
 #[test]
