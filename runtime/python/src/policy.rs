@@ -1,0 +1,286 @@
+//! Opening policies, and what can be asked of one that was opened.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use lads_compiler::{CacheFormat, Options, WeightFormat};
+use lads_core::{Data, Isa};
+use numpy::{PyArray1, PyArrayDyn, PyArrayMethods};
+use pyo3::prelude::*;
+use pyo3::sync::PyOnceLock;
+use pyo3::types::{PyBytes, PyDict};
+
+use crate::arrays;
+use crate::cell::{Checked, Working};
+use crate::controller::{Controller, Settings};
+use crate::errors::{OpenError, SelfTestError, WorkspaceError, opening};
+
+/// A policy that was read and checked. It never changes and may be used by any number of threads.
+#[pyclass(frozen, module = "lads")]
+pub struct Policy {
+    path: PathBuf,
+    checked: Arc<Checked>,
+    contract: PyOnceLock<Py<PyAny>>,
+}
+
+/// Opens a policy, a bundle (.onnx), which is compiled on the way, or a compiled image (.lads).
+///
+/// `weights` and `low_level` are 'f32', 'f16', 'bf16', 'int16' or 'int8', `cache` is 'f32' or 'f16'; fewer bits have to pass the
+/// gate: the golden episode replays with the same indices and with actions inside `tolerance` (in the action's units).
+#[pyfunction]
+#[pyo3(signature = (path, *, weights="f32", low_level=None, cache="f32", tolerance=None, force=false))]
+pub fn open(
+    py: Python<'_>,
+    path: PathBuf,
+    weights: &str,
+    low_level: Option<&str>,
+    cache: &str,
+    tolerance: Option<f32>,
+    force: bool,
+) -> PyResult<Policy> {
+    if tolerance.is_some_and(|tolerance| !(tolerance.is_finite() && tolerance > 0.0)) {
+        return Err(OpenError::new_err(
+            "tolerance: it has to be a positive number; give the largest difference of an action that is accepted",
+        ));
+    }
+    let weight = |what, name| format(what, name, WeightFormat::ALL, WeightFormat::name);
+    let options = Options {
+        weights: weight("weights", weights)?,
+        low_level: low_level
+            .map(|name| weight("low_level", name))
+            .transpose()?,
+        cache: format("cache", cache, CacheFormat::ALL, CacheFormat::name)?,
+        tolerance,
+        force,
+    };
+    let opened = py.detach(|| lads_host::open_with(&path, options));
+    let opened = opened.map_err(|error| opening(&error))?;
+    if options != Options::default() && !opened.is_bundle() {
+        return Err(OpenError::new_err(format!(
+            "{}: it is a compiled image already; give the bundle (.onnx)",
+            path.display()
+        )));
+    }
+    Ok(Policy::of(path, Checked::of(opened)))
+}
+
+/// Opens a policy from the bytes of its image, such as Policy.image; `path` names it in messages. This is what unpickling calls.
+#[pyfunction]
+pub fn from_image(py: Python<'_>, image: &[u8], path: PathBuf) -> PyResult<Policy> {
+    let opened = py.detach(|| lads_host::from_bytes(image));
+    let opened = opened.map_err(|error| {
+        opening(&lads_host::OpenError {
+            path: Some(path.clone()),
+            ..error
+        })
+    })?;
+    Ok(Policy::of(path, Checked::of(opened)))
+}
+
+/// The format with this name.
+fn format<T: Copy, const N: usize>(
+    what: &str,
+    name: &str,
+    known: [T; N],
+    name_of: fn(T) -> &'static str,
+) -> PyResult<T> {
+    let found = known.into_iter().find(|&format| name_of(format) == name);
+    found.ok_or_else(|| {
+        OpenError::new_err(format!(
+            "{what} '{name}': no such format; known are {}",
+            known.map(name_of).join(", ")
+        ))
+    })
+}
+
+impl Policy {
+    fn of(path: PathBuf, checked: Arc<Checked>) -> Self {
+        Self {
+            path,
+            checked,
+            contract: PyOnceLock::new(),
+        }
+    }
+
+    /// What was checked.
+    pub fn checked(&self) -> &Arc<Checked> {
+        &self.checked
+    }
+
+    /// A fresh controller on the widest instructions.
+    fn working(&self) -> PyResult<Working> {
+        Working::of(&self.checked, Isa::detect())
+            .map_err(|error| WorkspaceError::new_err(error.to_string()))
+    }
+
+    fn report(&self) -> String {
+        lads_cli::inspect_json(&self.path, self.checked.opened()).to_string()
+    }
+}
+
+#[pymethods]
+impl Policy {
+    /// The file that it was read from.
+    #[getter]
+    fn path(&self) -> String {
+        self.path.display().to_string()
+    }
+
+    /// The compiled image, what `lads compile` writes: bytes.
+    #[getter]
+    fn image<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
+        PyBytes::new(py, self.checked.opened().image())
+    }
+
+    /// What the policy expects and promises, as a lads.Contract.
+    #[getter]
+    fn contract(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
+        let read = self.contract.get_or_try_init(py, || {
+            let module = py.import("lads.contract")?;
+            let read = module.call_method1("read", (self.report(),))?;
+            Ok::<_, PyErr>(read.unbind())
+        })?;
+        Ok(read.clone_ref(py))
+    }
+
+    /// Everything that `lads inspect --json` prints: channels, schedule, programs, states, sizes in bytes.
+    fn inspect<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        py.import("json")?.call_method1("loads", (self.report(),))
+    }
+
+    /// The recorded episode that the self-test replays, as a lads.Golden; None for a policy without one.
+    #[getter]
+    fn golden<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        let view = self.checked.view();
+        let Some(golden) = view.golden() else {
+            return Ok(None);
+        };
+        let contract = view.contract();
+        let steps = golden.len();
+        let observations = PyDict::new(py);
+        for (place, channel) in contract.observations().enumerate() {
+            let mut shape = arrays::shape(&channel);
+            shape.insert(0, steps);
+            let rows: Vec<_> = golden.steps().collect();
+            let all = rows
+                .iter()
+                .filter_map(|step| step.observations().get(place));
+            let (mut floats, mut bytes, mut integers) = (vec![], vec![], vec![]);
+            for (_, data) in all {
+                match data {
+                    Data::F32(values) => floats.extend_from_slice(values),
+                    Data::U8(values) => bytes.extend_from_slice(values),
+                    Data::I32(values) => integers.extend_from_slice(values),
+                }
+            }
+            let array = match channel.dtype() {
+                lads_core::DType::F32 => shaped(py, &floats, &shape)?.into_any(),
+                lads_core::DType::U8 => shaped(py, &bytes, &shape)?.into_any(),
+                lads_core::DType::I32 => shaped(py, &integers, &shape)?.into_any(),
+            };
+            observations.set_item(channel.name(), array)?;
+        }
+        let selected: Vec<_> = golden.steps().filter_map(|step| step.selected).collect();
+        let noise: Vec<_> = golden
+            .steps()
+            .flat_map(|step| step.noise.to_vec())
+            .collect();
+        let actions: Vec<_> = golden
+            .steps()
+            .flat_map(|step| step.action.to_vec())
+            .collect();
+        let instruction = golden
+            .instruction()
+            .and_then(|id| contract.instruction(id as usize))
+            .map(|known| known.id);
+        let fields = PyDict::new(py);
+        fields.set_item("instruction", instruction)?;
+        fields.set_item("observations", observations)?;
+        fields.set_item("noise", shaped(py, &noise, &[steps, view.noise_len()])?)?;
+        let some = (!selected.is_empty()).then(|| PyArray1::from_slice(py, &selected));
+        fields.set_item("selected", some)?;
+        let len = contract.action_len();
+        fields.set_item("actions", shaped(py, &actions, &[steps, len])?)?;
+        fields.set_item("tolerance", golden.tolerance())?;
+        let class = py.import("lads.contract")?.getattr("Golden")?;
+        class.call((), Some(&fields)).map(Some)
+    }
+
+    /// Replays the golden episode on this machine and compares the indices in force and the actions -> lads.SelfTest.
+    fn self_test<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let view = self.checked.view();
+        let path = self.path.display();
+        let Some(golden) = view.golden() else {
+            return Err(SelfTestError::new_err(format!(
+                "{path}: it carries no golden episode, so nothing can be tested; export the bundle with one"
+            )));
+        };
+        let mut working = self.working()?;
+        let test = py.detach(|| working.with(|controller| controller.self_test()));
+        let test = test.map_err(|error| {
+            SelfTestError::new_err(format!(
+                "{path}: the self-test failed: {error}; do not run it on this machine; export and compile it again"
+            ))
+        })?;
+        let class = py.import("lads.contract")?.getattr("SelfTest")?;
+        class.call1((
+            test.steps,
+            f64::from(test.largest_error),
+            f64::from(golden.tolerance()),
+            format!("{:08x}", test.digest),
+        ))
+    }
+
+    /// A fresh controller with memory of its own.
+    ///
+    /// `instruction` is the id or the text of a known one, or word embeddings float32 [words, dim]; None for a policy that takes none, or to
+    /// give it later. `sample` is a seed: indices are sampled instead of following the contract's rule. `noise` is a seed:
+    /// standard normals for the noise channel instead of the contract's rule. `portable` runs on the kernels that every processor has, with
+    /// the same bits.
+    #[pyo3(signature = (instruction=None, *, sample=None, noise=None, portable=false))]
+    fn controller(
+        slf: &Bound<'_, Self>,
+        instruction: Option<Bound<'_, PyAny>>,
+        sample: Option<u64>,
+        noise: Option<u64>,
+        portable: bool,
+    ) -> PyResult<Controller> {
+        let settings = Settings {
+            sample,
+            noise,
+            portable,
+        };
+        let controller = Controller::of(slf, settings)?;
+        if let Some(instruction) = instruction {
+            controller.instruct(slf.py(), &instruction)?;
+        }
+        Ok(controller)
+    }
+
+    fn __reduce__<'py>(slf: &Bound<'py, Self>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
+        let py = slf.py();
+        let from_image = py.import("lads._lads")?.getattr("from_image")?;
+        let this = slf.get();
+        let arguments = (this.image(py), this.path()).into_pyobject(py)?;
+        Ok((from_image, arguments.into_any()))
+    }
+
+    pub fn __repr__(&self) -> String {
+        let contract = self.checked.view().contract();
+        format!(
+            "<lads.Policy '{}': {}, {}>",
+            self.path.display(),
+            contract.family(),
+            contract.environment_id()
+        )
+    }
+}
+
+/// Values as an array of this shape.
+fn shaped<'py, T: numpy::Element + Copy>(
+    py: Python<'py>,
+    values: &[T],
+    shape: &[usize],
+) -> PyResult<Bound<'py, PyArrayDyn<T>>> {
+    PyArray1::from_slice(py, values).reshape(shape)
+}
