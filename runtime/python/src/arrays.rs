@@ -112,7 +112,7 @@ pub fn read(
         return staged[0].read(given);
     }
     let names = || {
-        let names: Vec<_> = staged[..needed].iter().map(|row| row.name()).collect();
+        let names: Vec<_> = staged[..needed].iter().map(Staged::name).collect();
         names.join("`, `")
     };
     let Ok(named) = given.cast::<PyDict>() else {

@@ -367,7 +367,7 @@ impl Controller {
         })
     }
 
-    /// The action of the last step, or what executed() said: float32 [actions].
+    /// The action of the last step, or what `executed` said: float32 [actions].
     #[getter]
     fn last_action<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<f32>>> {
         self.work(|inner| {
@@ -390,7 +390,7 @@ impl Controller {
         })
     }
 
-    /// What instruct() was given last: the id of a known one, word embeddings, or None.
+    /// What `instruct` was given last: the id of a known one, word embeddings, or None.
     #[getter(_instruction)]
     fn told<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
         if let Some(id) = self.instruction()? {

@@ -181,12 +181,12 @@ fn ask(
             let Some(trace) = &recorded.trace else {
                 continue;
             };
-            let begun = controller.with(|controller| match number {
-                Some(number) => controller.set_instruction(lads_core::Instruction::Id(*number)),
-                None => {
-                    controller.reset();
-                    Ok(())
+            let begun = controller.with(|controller| {
+                if let Some(number) = number {
+                    return controller.set_instruction(lads_core::Instruction::Id(*number));
                 }
+                controller.reset();
+                Ok(())
             });
             begun.map_err(|error| refused_instruction(&error))?;
             // A reference that says nothing about indices is a black box: only its actions can be compared.

@@ -3,8 +3,12 @@
 //! What people import lies in `python/lads`; this module, `lads._lads`, gives it classes over lads-host and lads-proof. Invariants: every
 //! array is checked (type, shape, layout) and copied while the interpreter is held, so nothing here shares memory with Python; a
 //! controller is used by one thread at a time and only in the process that made it; whatever is refused is an exception of
-//! `lads.errors` that names the thing and the remedy, and leaves the controller as it was. No unsafe code: PyO3 and rust-numpy have it.
+//! `lads.errors` that names the thing and the remedy, and leaves the controller as it was. No unsafe code: `PyO3` and `rust-numpy` have it.
 #![deny(unsafe_code)]
+// `Controller::reset` is the method of one lifetime, the closure around it that of all.
+#![allow(clippy::redundant_closure_for_method_calls)]
+// What Python gives is owned by the call.
+#![allow(clippy::needless_pass_by_value)]
 
 mod arrays;
 mod batch;
