@@ -15,10 +15,10 @@ def inside(state):
 
 
 class Servo(gymnasium.Env):
-    """Three joints that follow the action at 20 Hz and five disturbances, observed as the random policies of the tests take it."""
+    """Three joints that follow the action at 50 Hz and five disturbances, observed as the random policies of the tests take it."""
 
     metadata = {}
-    dt = 0.05
+    dt = 0.02
     STEPS = 40
 
     def __init__(self, observe=8):
