@@ -6,12 +6,38 @@ threads, and `verify` compares one with the policy that was trained. Whatever is
 """
 
 import os
+from importlib import import_module
+from typing import TYPE_CHECKING
 
-from . import errors, gym, vector
+from . import errors
 from ._lads import Controller, Policy, Selected, StepReport, __version__, forked, from_image, open
-from .contract import Channel, Context, Contract, Element, Golden, Instruction, Language, SelfTest
 from .errors import LadsError
-from .verification import Certificate, Reply, verify
+
+if TYPE_CHECKING:
+    from . import gym, vector
+    from .contract import Channel, Context, Contract, Element, Golden, Instruction, Language, SelfTest
+    from .verification import Certificate, Reply, verify
+
+# What a control loop does not need is imported when it is first asked for: that is three quarters of the time of an import.
+_LATER = {
+    **dict.fromkeys(("gym", "vector"), None),
+    **dict.fromkeys(("Channel", "Context", "Contract", "Element", "Golden", "Instruction", "Language", "SelfTest"), "contract"),
+    **dict.fromkeys(("Certificate", "Reply", "verify"), "verification"),
+}
+
+
+def __getattr__(name):
+    if name not in _LATER:
+        raise AttributeError(f"module 'lads' has no attribute {name!r}")
+    module = _LATER[name]
+    found = import_module(f".{name}", __name__) if module is None else getattr(import_module(f".{module}", __name__), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__():
+    return sorted(__all__)
+
 
 # A controller that a fork has copied is refused in the child.
 if hasattr(os, "register_at_fork"):
