@@ -1,9 +1,9 @@
 """What the Python package costs: a step beside Rust and ONNX Runtime, an import, batches over threads, the size of a wheel.
 
     make wheel && .venv/bin/python -m pip install target/wheels/lads-*.whl
-    .venv/bin/python benches/python.py [--steps 20000] [--rust target/release/examples/step_cost]
+    .venv/bin/python benches/python.py [--seconds 10] [--rust target/release/examples/step_cost]
 
-Contenders are measured in turns, one share after the other, ten times; the fastest share of each counts when hot, the median at a control
+Contenders are measured in turns, a share of some milliseconds at a time; the fastest share of each counts when hot, the median at a control
 period. Needs the exporter's environment (PyTorch, ONNX Runtime).
 """
 
@@ -29,7 +29,8 @@ from lads.vector import Controllers  # noqa: E402
 from lads_exporter import bundle, contract as contracts, graphs, random_policy  # noqa: E402
 from lads_exporter.twin import Entry  # noqa: E402
 
-ROUNDS = 10
+# Seconds of a share: shorter than what a busy system gives a process at a time, so that the fastest one was not interrupted.
+SHARE = 0.002
 WIDTHS = (51, 512, 256, 128, 14)
 ENTRY = "policy/act"
 
@@ -76,17 +77,23 @@ def legged_policy(folder):
     raise SystemExit("neither compiles")
 
 
-def hot(contenders, steps):
-    """Microseconds of one call of each, the fastest of ten shares in turns."""
+def hot(contenders, seconds):
+    """Microseconds of one call of each and its share's calls, in turns, the fastest share."""
+    calls = {}
+    for name, call in contenders.items():
+        start = time.perf_counter()
+        for _ in range(20):
+            call()
+        calls[name] = max(1, int(SHARE * 20 / (time.perf_counter() - start)))
     best = dict.fromkeys(contenders, float("inf"))
-    for _ in range(ROUNDS):
+    deadline = time.perf_counter() + seconds
+    while time.perf_counter() < deadline:
         for name, call in contenders.items():
-            for _ in range(min(steps, 100)):
-                call()
+            count = range(calls[name])
             start = time.perf_counter()
-            for _ in range(steps):
+            for _ in count:
                 call()
-            best[name] = min(best[name], (time.perf_counter() - start) / steps * 1e6)
+            best[name] = min(best[name], (time.perf_counter() - start) / calls[name] * 1e6)
     return best
 
 
@@ -113,25 +120,33 @@ def stepper(policy):
     return lambda: controller.step(seen, out)
 
 
-def rust(program, path, steps):
-    done = subprocess.run([program, path, str(max(1, steps // ROUNDS))], check=True, capture_output=True, text=True)
-    return float(done.stdout) / 1000
+def beside_rust(program, path, policy, seconds):
+    """Microseconds of a step from Python and from Rust, in turns, the fastest share of each."""
+    call = stepper(policy)
+    python = native = float("inf")
+    deadline = time.perf_counter() + seconds
+    while time.perf_counter() < deadline:
+        python = min(python, hot({"python": call}, seconds / 20)["python"])
+        share = str(max(1, int(SHARE / (python * 1e-6))))
+        done = subprocess.run([program, path, share], check=True, capture_output=True, text=True)
+        native = min(native, float(done.stdout) / 1000)
+    return python, native
 
 
-def scaling(policy, count=8, steps=200):
-    """How many times faster a batch of 8 is on two threads than on one."""
+def scaling(policy, seconds, count=8):
+    """Microseconds of a step of 8 controllers on one thread and on two."""
     golden = policy.golden
     (seen,) = (np.repeat(values[:1], count, 0) for values in golden.observations.values())
     out = np.zeros((count, *policy.contract.action.shape), np.float32)
     batches = {threads: Controllers(policy, count, golden.instruction, threads=threads) for threads in (1, 2)}
-    best = hot({threads: lambda batch=batch: batch.step(seen, out) for threads, batch in batches.items()}, steps)
+    best = hot({threads: lambda batch=batch: batch.step(seen, out) for threads, batch in batches.items()}, seconds)
     return best[1], best[2]
 
 
 def importing():
     """Milliseconds that the package takes beyond numpy, the fastest of ten, interpreter's start apart."""
     code = "import numpy, time; start = time.perf_counter(); import lads; print((time.perf_counter() - start) * 1000)"
-    return min(float(subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout) for _ in range(ROUNDS))
+    return min(float(subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout) for _ in range(10))
 
 
 def leak(policy, controllers):
@@ -154,8 +169,7 @@ def leak(policy, controllers):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=20000)
-    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--seconds", type=float, default=10.0, help="for each comparison")
     parser.add_argument("--controllers", type=int, default=100_000)
     parser.add_argument("--rust", type=Path, help="the example step_cost of lads-host, built in release")
     arguments = parser.parse_args()
@@ -167,16 +181,15 @@ def main():
         given = {f"{ENTRY}/observation": seen[None]}
         print(f"policy {'-'.join(map(str, WIDTHS))}, {activation}")
         contenders = {"lads": stepper(plain), "onnxruntime": lambda: session.run(None, given)}
-        for name, found in (("hot", hot(contenders, arguments.steps)), ("at 50 Hz", paced(contenders, arguments.seconds))):
+        for name, found in (("hot", hot(contenders, arguments.seconds)), ("at 50 Hz", paced(contenders, arguments.seconds))):
             ratio = found["lads"] / found["onnxruntime"]
             print(f"  {name}: lads {found['lads']:.2f} us, onnxruntime {found['onnxruntime']:.2f} us, ratio {ratio:.2f}")
         kitchen = lads.open(PROJECT / "models/kitchen.onnx")
         if arguments.rust:
-            for name, policy, steps in ((str(path), plain, arguments.steps), (str(PROJECT / "models/kitchen.onnx"), kitchen, arguments.steps // 20)):
-                turns = [(hot({"python": stepper(policy)}, steps // ROUNDS)["python"], rust(arguments.rust, name, steps)) for _ in range(3)]
-                python, native = (min(turn) for turn in zip(*turns))
+            for name, policy in ((str(path), plain), (str(PROJECT / "models/kitchen.onnx"), kitchen)):
+                python, native = beside_rust(arguments.rust, name, policy, arguments.seconds)
                 print(f"  step of {Path(name).stem}: from Python {python:.2f} us, from Rust {native:.2f} us, {python - native:+.2f} us")
-        one, two = scaling(kitchen)
+        one, two = scaling(kitchen, arguments.seconds)
         print(f"8 controllers of kitchen: one thread {one:.0f} us, two {two:.0f} us, {one / two:.2f} times faster")
         print(f"import: {importing():.1f} ms")
         grown, each = leak(plain, arguments.controllers)

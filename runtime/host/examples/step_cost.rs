@@ -22,7 +22,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         controller.set_instruction(Instruction::Id(instruction))?;
     }
     let mut best = f64::INFINITY;
-    // The fastest of ten shares, as the Python side measures.
+    // The fastest of ten shares, as benches/python.py measures.
     for _ in 0..10 {
         let start = Instant::now();
         for _ in 0..steps {
