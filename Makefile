@@ -14,7 +14,7 @@ COLLECT_lorel   := --episodes 50000
 # What lints and tests cover; one selection, because each is a build of its own, of tract too: the oracle and the language encoder's engine.
 FEATURES := lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language
 ALL      := --workspace --features $(FEATURES)
-RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-host -p lads-pace -p lads-ffi -p lads-cli -p lads-proof
+RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-host -p lads-pace -p lads-record -p lads-ffi -p lads-cli -p lads-proof
 
 PREFIX  ?= /usr/local
 

@@ -14,6 +14,7 @@ pyo3::import_exception!(lads.errors, InputError);
 pyo3::import_exception!(lads.errors, InstructionError);
 pyo3::import_exception!(lads.errors, OpenError);
 pyo3::import_exception!(lads.errors, ProofError);
+pyo3::import_exception!(lads.errors, RecordError);
 pyo3::import_exception!(lads.errors, SelfTestError);
 pyo3::import_exception!(lads.errors, StepError);
 pyo3::import_exception!(lads.errors, WorkspaceError);

@@ -19,6 +19,7 @@ mod judge;
 mod policy;
 mod process;
 mod proof;
+mod record;
 mod report;
 
 use std::ffi::OsString;
@@ -45,6 +46,7 @@ fn _lads(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(process::forked, module)?)?;
     module.add_function(wrap_pyfunction!(proof::wilson, module)?)?;
     module.add_function(wrap_pyfunction!(proof::score, module)?)?;
+    module.add_function(wrap_pyfunction!(record::write_log, module)?)?;
     module.add_function(wrap_pyfunction!(judge::judge, module)?)?;
     module.add_function(wrap_pyfunction!(command, module)?)?;
     Ok(())

@@ -16,6 +16,7 @@ from .errors import LadsError
 if TYPE_CHECKING:
     from . import gym, vector
     from .contract import Channel, Context, Contract, Element, Golden, Instruction, Language, SelfTest
+    from .recording import Recorder
     from .verification import Certificate, Reply, verify
 
 # What a control loop does not need is imported when it is first asked for: that is three quarters of the time of an import.
@@ -23,6 +24,7 @@ _LATER = {
     **dict.fromkeys(("gym", "vector"), None),
     **dict.fromkeys(("Channel", "Context", "Contract", "Element", "Golden", "Instruction", "Language", "SelfTest"), "contract"),
     **dict.fromkeys(("Certificate", "Reply", "verify"), "verification"),
+    "Recorder": "recording",
 }
 
 
@@ -55,6 +57,7 @@ __all__ = [
     "LadsError",
     "Language",
     "Policy",
+    "Recorder",
     "Reply",
     "SelfTest",
     "Selected",

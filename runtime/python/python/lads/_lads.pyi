@@ -37,6 +37,14 @@ def judge(
     replayed: Sequence[tuple[int, int, NDArray[np.float64]]],
     about: str,
 ) -> tuple[str, str, str]: ...
+def write_log(
+    policy: Policy,
+    path: str | os.PathLike[str],
+    seed: int,
+    noise: str,
+    notes: Mapping[str, str],
+    episodes: Sequence[Mapping[str, Any]],
+) -> None: ...
 def command(arguments: Sequence[str]) -> int: ...
 
 class Policy:

@@ -29,6 +29,10 @@ class StepError(LadsError, RuntimeError):
     """A control step gave no action, such as one beyond the end of the context."""
 
 
+class RecordError(LadsError, OSError):
+    """A recording cannot be written, or the policy cannot be recorded."""
+
+
 class SelfTestError(LadsError, RuntimeError):
     """The policy answers otherwise on this machine than recorded, or holds no golden episode."""
 
