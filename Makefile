@@ -14,7 +14,7 @@ COLLECT_lorel   := --episodes 50000
 # What lints and tests cover; one selection, because each is a build of its own, of tract too: the oracle and the language encoder's engine.
 FEATURES := lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language
 ALL      := --workspace --features $(FEATURES)
-RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-host -p lads-pace -p lads-record -p lads-ffi -p lads-cli -p lads-proof
+RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-host -p lads-import -p lads-pace -p lads-record -p lads-ffi -p lads-cli -p lads-proof
 
 PREFIX  ?= /usr/local
 
@@ -76,7 +76,7 @@ test-runtime:
 	cargo test $(RUNTIME) -p lads-language
 
 test-rust: setup
-	cargo test $(ALL)
+	cargo test $(ALL) --no-fail-fast
 
 # Tests of what has unsafe code or untrusted input, in a build with AddressSanitizer, whose run-time library comes with the toolchain,
 # and under valgrind, which also sees the use of memory that was never written. Debug assertions and the checks of the preconditions of

@@ -21,7 +21,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 # The Makefile's: with another one cargo would build tract once more.
 SELECTION = ("--workspace", "--features", "lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language")
 # The newest operator set that the compiler reads.
-OPSET = 21
+OPSET = 28
 
 
 def write(case, folder):
@@ -31,7 +31,7 @@ def write(case, folder):
         # Mean and deviation are optional outputs for training.
         outputs = outputs[:1]
     values = inputs + outputs
-    if not all(isinstance(value, np.ndarray) and value.dtype in (np.float32, np.int64) for value in values):
+    if not all(isinstance(value, np.ndarray) and value.dtype in (np.float32, np.int64, np.int32, np.bool_) for value in values):
         return False
     model = onnx.ModelProto()
     model.CopyFrom(case.model)
@@ -42,7 +42,7 @@ def write(case, folder):
         return False
     names, free = {}, {"in": list("abcde"), "out": list("yz"), "index": ["j"]}
     for info, value in zip(list(graph.input), inputs, strict=True):
-        if value.dtype == np.int64:
+        if value.dtype in (np.int64, np.int32):
             # Axes, shapes and indices are constants in every exported policy.
             names[info.name] = f"test/graph/{info.name}"
             graph.initializer.append(numpy_helper.from_array(value, names[info.name]))
@@ -54,7 +54,7 @@ def write(case, folder):
             names[info.name] = f"test/graph/{short}"
             graph.initializer.append(numpy_helper.from_array(value, f"given/{short}"))
     for info, value in zip(graph.output, outputs, strict=True):
-        kind = free["index" if value.dtype == np.int64 else "out"]
+        kind = free["index" if value.dtype in (np.int64, np.int32) else "out"]
         if not kind or info.name in names:
             return False
         short = kind.pop(0)

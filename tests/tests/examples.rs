@@ -167,3 +167,57 @@ fn the_rust_loop_runs() {
         "{text}"
     );
 }
+
+/// The number behind `digest` in what a program prints.
+fn digest(text: &str) -> &str {
+    text.lines()
+        .find_map(|line| line.strip_prefix("digest "))
+        .unwrap_or_else(|| panic!("no digest in {text}"))
+}
+
+#[test]
+fn the_biped_stands_and_walks_alike_in_rust_and_in_c() {
+    let folder = project_path("runtime/host/examples/biped");
+    for name in ["stand", "walk"] {
+        let (policy, robot) = (
+            folder.join(format!("{name}.onnx")),
+            folder.join("robot.toml"),
+        );
+        let request = lads_import::Request {
+            models: vec![&policy],
+            robot: Some(&robot),
+            ..lads_import::Request::default()
+        };
+        let imported = lads_import::import(&request).unwrap_or_else(|error| panic!("{error}"));
+        let bundle = scratch(&format!("{name}.lads.onnx"));
+        fs::write(&bundle, &imported.bundle).expect("it can be written");
+        let image = compiled(&bundle);
+        fs::write(scratch(&format!("{name}.lads")), image.as_bytes()).expect("it can be written");
+    }
+    let target = Path::new(env!("CARGO_TARGET_TMPDIR"))
+        .parent()
+        .expect("it lies in the target folder");
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    run(Command::new(cargo)
+        .args([
+            "build",
+            "--quiet",
+            "-p",
+            "lads-host",
+            "--example",
+            "biped",
+            "--target-dir",
+        ])
+        .arg(target)
+        .current_dir(project_path(".")));
+    let rust = run(Command::new(target.join("debug/examples/biped"))
+        .args([scratch("stand.lads.onnx"), scratch("walk.lads.onnx")])
+        .args(["150", "--fast"]));
+    let c = run(build("cc", "-std=c11", "c/biped.c", &[])
+        .args([scratch("stand.lads"), scratch("walk.lads")])
+        .arg("150"));
+    assert_eq!(digest(&rust), digest(&c), "{rust}\n{c}");
+    // Every 40th read is lost, and the last action bridges it.
+    assert!(c.contains("3 coasted"), "{c}");
+    assert!(c.matches("the last action again").count() == 3, "{c}");
+}

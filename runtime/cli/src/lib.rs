@@ -11,6 +11,7 @@ mod act;
 mod bench;
 mod compile;
 mod emit;
+mod import;
 mod inspect;
 mod line;
 mod model;
@@ -56,6 +57,8 @@ enum Command {
         #[arg(long, conflicts_with = "json")]
         observations: bool,
     },
+    /// Makes a bundle of any policy.onnx and a description of the robot: raw sensor values in, what the motors get out
+    Import(import::Request),
     /// Compiles a bundle to a program image, and writes it as a file, as source, or both
     Compile(compile::Request),
     /// Replays the policy's golden episode on this machine and compares the indices in force and the actions
@@ -134,6 +137,7 @@ fn run(command: Command) -> Result<(), Refusal> {
             json,
             observations,
         } => inspect(&model, json, observations),
+        Command::Import(request) => import::import(&request),
         Command::Compile(request) => compile::compile(request),
         Command::SelfTest { model } => {
             let line = self_test::self_test(&Model::open(&model)?)?;

@@ -1,6 +1,7 @@
-//! The one line with which the command refuses: what it is about, what is wrong with it, what to do.
+//! The one line with which the command refuses: what it is about, what is wrong with it, what to do. Where a person has to settle many
+//! things at once, there is a line for each of them below.
 //!
-//! Invariant: a printed refusal is one line, whatever the errors underneath contain.
+//! Invariant: every line of a printed refusal was made here, whatever the errors underneath contain.
 
 use std::error::Error;
 use std::fmt::{self, Display};
@@ -18,6 +19,21 @@ impl Refusal {
     /// An error that names the thing and the remedy itself.
     pub fn of(error: impl Display) -> Self {
         Self(one_line(&error.to_string()))
+    }
+
+    /// All that is wrong with `thing`, a line for each, and the remedy.
+    pub fn list(
+        thing: impl Display,
+        wrong: impl Iterator<Item = String>,
+        remedy: impl Display,
+    ) -> Self {
+        let wrong: Vec<String> = wrong.map(|line| format!("  {}", one_line(&line))).collect();
+        let things = if wrong.len() == 1 { "thing" } else { "things" };
+        let head = one_line(&format!(
+            "{thing}: {} {things} to settle; {remedy}",
+            wrong.len()
+        ));
+        Self(format!("{head}\n{}", wrong.join("\n")))
     }
 
     /// The same with an error that says itself what to do.

@@ -73,7 +73,7 @@ fn bad_files_are_refused_by_every_command() {
         ),
         (
             altered(folder.path(), "lads.contract", "some.contract"),
-            ["altered.onnx", "lads.contract", "export"],
+            ["altered.onnx", "lads.contract", "lads import"],
         ),
     ];
     for (model, parts) in cases {

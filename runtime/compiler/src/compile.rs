@@ -105,6 +105,12 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
             *cache.unwrap_or(&Cache::NONE),
             &mut weights,
         )?;
+        if lowered.ops.is_empty() {
+            return Err(CompileError::Entry {
+                entry: entry.name.as_str().into(),
+                problem: "it computes nothing: its outputs are its inputs as they lie".into(),
+            });
+        }
         reach.check(contract, &blueprint, entry, &lowered)?;
         let placed = plan(&lowered);
         verify(&lowered, &placed).map_err(|fault| CompileError::Plan {

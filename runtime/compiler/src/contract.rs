@@ -11,7 +11,7 @@ use std::collections::HashSet;
 use serde::Deserialize;
 
 use crate::error::BundleError;
-use crate::family::Family;
+use crate::family::{Family, RESERVED};
 
 pub use channel::{Channel, DType, Element, QuaternionOrder, Role};
 pub use language::{Acceptance, Language, Pooling, Similarity};
@@ -315,6 +315,16 @@ impl Contract {
         }
         if count(Role::Instruction) > 1 {
             return Err("field `channels` has more than one instruction".into());
+        }
+        let seen = self.observations().map(|channel| &channel.name);
+        let named = seen.chain(self.states.iter().map(|state| &state.name));
+        if let Some(name) = named
+            .into_iter()
+            .find(|name| RESERVED.contains(&name.as_str()))
+        {
+            return Err(format!(
+                "an observation or a state is called \"{name}\", which means something else to a graph; give it another name"
+            ));
         }
         for channel in &self.channels {
             let floats = channel.role == Role::Observation || channel.dtype == DType::F32;

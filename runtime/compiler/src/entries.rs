@@ -345,8 +345,13 @@ fn declaration(value: &ValueInfoProto) -> Result<(Type, Vec<Dim>), String> {
     let tensor = value.r#type.as_ref().and_then(|ty| ty.tensor_type.as_ref());
     let tensor = tensor.ok_or_else(|| format!("{name} declares no tensor type"))?;
     let ty = match tensor.elem_type {
-        // Bytes and small integers come as numbers: the graph casts them.
-        data_type::FLOAT | data_type::UINT8 => Type::F32,
+        // Bytes and small integers come as numbers: the graph casts them. So do floats of other widths and truth values.
+        data_type::FLOAT
+        | data_type::FLOAT16
+        | data_type::BFLOAT16
+        | data_type::DOUBLE
+        | data_type::BOOL
+        | data_type::UINT8 => Type::F32,
         data_type::INT64 | data_type::INT32 => Type::I64,
         other => {
             return Err(format!(

@@ -56,7 +56,7 @@ pub enum BundleError {
     },
     /// An ONNX model without a policy's contract.
     #[error(
-        "no `lads.contract` in the model's metadata, so it is not a policy bundle; export it with the exporter of this project"
+        "no `lads.contract` in the model's metadata, so it is not a policy bundle; `lads import` makes one of any ONNX policy"
     )]
     NoContract,
     /// A contract that another version of this crate reads.

@@ -19,6 +19,7 @@ use serde::Deserialize;
 
 use crate::contract::{Contract, MAX_LEN, Network};
 
+pub use blueprint::RESERVED;
 pub(crate) use blueprint::{Blueprint, Bound, Call, Entry, Keep, Origin, Times};
 
 /// What the table asks of a family.

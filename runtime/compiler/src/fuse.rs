@@ -3,6 +3,7 @@
 //! A pass changes how a value is computed, never which value it is, up to the rounding of folded scales.
 
 mod attention;
+mod columns;
 mod linear;
 mod rows;
 

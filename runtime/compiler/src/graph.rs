@@ -24,7 +24,7 @@ use crate::tensor::{Data, Tensor};
 
 #[cfg(test)]
 pub(crate) use eval::apply;
-pub(crate) use eval::{MAX_FOLDING, cost, evaluate};
+pub(crate) use eval::{MAX_FOLDING, Value, cost, evaluate, fold};
 pub(crate) use rewrite::{Rewriter, topological};
 
 /// Length of an axis: `fixed`, or `P + fixed`.
@@ -110,11 +110,19 @@ impl Hash for Kind<UnaryKind> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) struct Unary {
     pub kind: Kind<UnaryKind>,
-    /// Slope of `LeakyRelu`, as bits.
+    /// Slope of `LeakyRelu`, factor of `Elu`, as bits.
     pub alpha: u32,
 }
 
 impl Unary {
+    /// One with a parameter.
+    pub fn with(kind: UnaryKind, alpha: f32) -> Self {
+        Self {
+            kind: Kind(kind),
+            alpha: alpha.to_bits(),
+        }
+    }
+
     pub fn of(kind: UnaryKind) -> Self {
         Self {
             kind: Kind(kind),
@@ -156,6 +164,10 @@ pub(crate) enum Op {
     Shift(i64),
     /// Rows of a constant `[rows, ..]` by an integer of one element; the result has shape `[..]`.
     GatherRow,
+    /// A number of one element as an integer, without its fraction.
+    ToIndex,
+    /// An integer of one element as a number.
+    FromIndex,
     /// Index of the first smallest or largest element of all, shape `[]`.
     ArgMin,
     /// See `ArgMin`.

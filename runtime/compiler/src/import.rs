@@ -4,9 +4,20 @@
 //! operator, the node and the entry: nothing is ever dropped in silence. Shapes follow from the inputs; the only symbolic axis is
 //! the context length.
 
+mod activations;
+mod arithmetic;
 mod attributes;
+mod constants;
+mod einsum;
+mod indices;
+mod layers;
+mod logic;
+mod norms;
 mod operators;
+mod parts;
 mod recurrent;
+mod reductions;
+mod sequences;
 mod shapes;
 mod trial;
 
@@ -21,10 +32,11 @@ use crate::onnx::{GraphProto, ModelProto, NodeProto, TensorProto};
 use crate::tensor::Tensor;
 
 use attributes::Attributes;
+use sequences::Given;
 pub(crate) use trial::{Declared, trial};
 
 /// Operator sets that the translations were written for.
-const OPSETS: std::ops::RangeInclusive<i64> = 13..=21;
+const OPSETS: std::ops::RangeInclusive<i64> = 7..=28;
 
 /// The most nodes that an entry may have; an LSTM counts its steps.
 const MAX_NODES: usize = 1 << 16;
@@ -32,6 +44,7 @@ const MAX_NODES: usize = 1 << 16;
 /// The initializers of a model, read once each, so that entries share them.
 pub(crate) struct Model<'m> {
     graph: &'m GraphProto,
+    opset: i64,
     protos: HashMap<&'m str, &'m TensorProto>,
     tensors: RefCell<HashMap<&'m str, Arc<Tensor>>>,
 }
@@ -64,11 +77,11 @@ impl<'m> Model<'m> {
                 OPSETS.end()
             )));
         }
-        Ok(Self::of(graph))
+        Ok(Self::of(graph, opset))
     }
 
     /// A graph of whatever operator set.
-    fn of(graph: &'m GraphProto) -> Self {
+    fn of(graph: &'m GraphProto, opset: i64) -> Self {
         let protos = graph
             .initializer
             .iter()
@@ -76,6 +89,7 @@ impl<'m> Model<'m> {
             .collect();
         Self {
             graph,
+            opset,
             protos,
             tensors: RefCell::default(),
         }
@@ -110,6 +124,7 @@ impl<'m> Model<'m> {
             model: self,
             graph: Graph::default(),
             values: HashMap::new(),
+            sequences: HashMap::new(),
         };
         let mut inputs = vec![];
         for input in &signature.inputs {
@@ -182,6 +197,7 @@ struct Builder<'b, 'm> {
     model: &'b Model<'m>,
     graph: Graph,
     values: HashMap<String, Id>,
+    sequences: HashMap<String, Vec<Id>>,
 }
 
 impl Builder<'_, '_> {
@@ -205,16 +221,20 @@ impl Builder<'_, '_> {
         }
         let mut inputs = vec![];
         for name in &node.input {
-            inputs.push(if name.is_empty() {
+            inputs.push(if name.is_empty() || self.sequences.contains_key(name) {
                 None
             } else {
                 Some(self.value(name)?)
             });
         }
         let attributes = Attributes::new(&node.attribute)?;
+        if sequences::is_known(&node.op_type) {
+            return self.sequence(node, &inputs, &attributes);
+        }
         let operands = Operands {
             inputs,
             outputs: node.output.len(),
+            opset: self.model.opset,
         };
         let outputs = operators::translate(&mut self.graph, &node.op_type, &operands, &attributes)?;
         attributes.all_read()?;
@@ -232,6 +252,27 @@ impl Builder<'_, '_> {
             None => Ok(()),
         }
     }
+
+    /// A node that reads or gives a sequence.
+    fn sequence(
+        &mut self,
+        node: &NodeProto,
+        inputs: &[Option<Id>],
+        attributes: &Attributes,
+    ) -> Result<(), String> {
+        let known = &self.sequences;
+        let given = sequences::translate(&mut self.graph, node, inputs, known, attributes)?;
+        attributes.all_read()?;
+        let name = node.output.first().ok_or("gives nothing")?;
+        let again = match given {
+            Given::Value(id) => self.values.insert(name.clone(), id).is_some(),
+            Given::Sequence(list) => self.sequences.insert(name.clone(), list).is_some(),
+        };
+        if again {
+            return Err(format!("gives {name}, which exists already"));
+        }
+        Ok(())
+    }
 }
 
 /// What a node reads.
@@ -239,6 +280,8 @@ struct Operands {
     inputs: Vec<Option<Id>>,
     /// How many outputs the node has.
     outputs: usize,
+    /// The operator set that says what the node means.
+    opset: i64,
 }
 
 impl Operands {

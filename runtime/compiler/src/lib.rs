@@ -8,15 +8,22 @@
 //! an [`Image`] that `lads-core` runs without allocating. Runs on the host and may allocate; what it reads may be hostile, so
 //! every error is a value that names the thing and the remedy.
 //!
-//! Operators of the default ONNX domain that are compiled (operator sets 13 to 21); anything else is an error that names the
-//! operator, the node and the entry:
+//! Operators of the default ONNX domain that are compiled (operator sets 7 to 28, each by what its set says); anything else is an
+//! error that names the operator, the node and the entry:
 //!
 //! ```text
-//! Abs Add ArgMax ArgMin BatchNormalization Cast Clip Concat Constant ConstantOfShape Div Dropout Erf Exp Expand Flatten Gather
-//! GRU Gelu Gemm Identity LSTM LayerNormalization LeakyRelu Log LogSoftmax MatMul Max Min Mul Neg Pow Reciprocal ReduceL1 ReduceL2
-//! ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare Relu Reshape Shape Sigmoid Slice Softmax Split Sqrt
-//! Squeeze Sub Sum Tanh Transpose Unsqueeze
+//! Abs Add And ArgMax ArgMin BatchNormalization Cast Celu Clip Concat ConcatFromSequence Constant ConstantOfShape Div Dropout
+//! Einsum Elu Equal Erf Exp Expand EyeLike Flatten GRU Gather GatherND Gelu Gemm Greater GreaterOrEqual GroupNormalization
+//! HardSigmoid HardSwish Identity InstanceNormalization LSTM LayerNormalization LeakyRelu Less LessOrEqual Log LogSoftmax MatMul
+//! Max Min Mish Mul Neg Not Or PRelu Pad Pow RMSNormalization Range Reciprocal ReduceL1 ReduceL2 ReduceMax ReduceMean ReduceMin
+//! ReduceProd ReduceSum ReduceSumSquare Relu Reshape ScatterND Selu SequenceAt SequenceConstruct SequenceEmpty SequenceInsert
+//! SequenceLength Shape Sigmoid Size Slice Softmax Softplus Softsign Split SplitToSequence Sqrt Squeeze Sub Sum Swish Tanh
+//! ThresholdedRelu Tile Transpose Unsqueeze Where Xor
 //! ```
+//!
+//! A program computes with 32-bit floats, whatever width the file's have: constants are rounded as the file says, what is computed
+//! keeps its bits. Integers are indices, or whole numbers exact up to 2^24; truth values are numbers that are 0 or 1. Shapes are
+//! static. GRU and LSTM over several steps are unrolled, 512 at most.
 #![forbid(unsafe_code)]
 
 mod aligned;
@@ -33,9 +40,10 @@ mod graph;
 mod image;
 mod import;
 mod lower;
-mod onnx;
+pub mod onnx;
 mod plan;
 mod reach;
+mod reference;
 mod report;
 mod survey;
 mod tensor;
@@ -52,6 +60,7 @@ pub use error::{BundleError, CompileError, Line};
 pub use golden::Golden;
 pub use image::Image;
 pub use lads_image::op::{CacheFormat, WeightFormat};
+pub use reference::Reference;
 pub use report::{CompileReport, ProgramReport};
 pub use survey::{Field, Missing, Operand, Operator, Survey, Value, survey};
 pub use verify::PlanFault;

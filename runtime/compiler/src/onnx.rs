@@ -5,6 +5,8 @@
 //!
 //! What can fail: [`decode`] tells a file that is no ONNX model from one that was cut off.
 
+#![allow(missing_docs, reason = "`onnx.proto3` names and explains the fields")]
+
 mod envelope;
 
 use bytes::Bytes;
@@ -14,7 +16,7 @@ use crate::error::BundleError;
 
 /// A model file.
 #[derive(Clone, PartialEq, Message)]
-pub(crate) struct ModelProto {
+pub struct ModelProto {
     #[prost(int64, tag = "1")]
     pub ir_version: i64,
     #[prost(message, repeated, tag = "8")]
@@ -29,7 +31,7 @@ pub(crate) struct ModelProto {
 
 /// An operator set that the model uses.
 #[derive(Clone, PartialEq, Message)]
-pub(crate) struct OperatorSetIdProto {
+pub struct OperatorSetIdProto {
     #[prost(string, tag = "1")]
     pub domain: String,
     #[prost(int64, tag = "2")]
@@ -38,7 +40,7 @@ pub(crate) struct OperatorSetIdProto {
 
 /// A key and a value of the metadata.
 #[derive(Clone, PartialEq, Message)]
-pub(crate) struct StringStringEntryProto {
+pub struct StringStringEntryProto {
     #[prost(string, tag = "1")]
     pub key: String,
     #[prost(string, tag = "2")]
@@ -47,7 +49,7 @@ pub(crate) struct StringStringEntryProto {
 
 /// Nodes in topological order, what they read and what they give.
 #[derive(Clone, PartialEq, Message)]
-pub(crate) struct GraphProto {
+pub struct GraphProto {
     #[prost(message, repeated, tag = "1")]
     pub node: Vec<NodeProto>,
     #[prost(string, tag = "2")]
@@ -64,7 +66,7 @@ pub(crate) struct GraphProto {
 
 /// One operator.
 #[derive(Clone, PartialEq, Message)]
-pub(crate) struct NodeProto {
+pub struct NodeProto {
     #[prost(string, repeated, tag = "1")]
     pub input: Vec<String>,
     #[prost(string, repeated, tag = "2")]
@@ -81,7 +83,7 @@ pub(crate) struct NodeProto {
 
 /// An attribute of an operator. `kind` says which of the fields holds the value.
 #[derive(Clone, PartialEq, Message)]
-pub(crate) struct AttributeProto {
+pub struct AttributeProto {
     #[prost(string, tag = "1")]
     pub name: String,
     #[prost(float, tag = "2")]
@@ -108,7 +110,7 @@ pub(crate) struct AttributeProto {
 
 /// A constant tensor. The elements are in `raw_data` (little-endian) or in the field of their type.
 #[derive(Clone, PartialEq, Message)]
-pub(crate) struct TensorProto {
+pub struct TensorProto {
     #[prost(int64, repeated, tag = "1")]
     pub dims: Vec<i64>,
     #[prost(int32, tag = "2")]
@@ -121,6 +123,8 @@ pub(crate) struct TensorProto {
     pub int32_data: Vec<i32>,
     #[prost(int64, repeated, tag = "7")]
     pub int64_data: Vec<i64>,
+    #[prost(double, repeated, tag = "10")]
+    pub double_data: Vec<f64>,
     #[prost(string, tag = "8")]
     pub name: String,
     #[prost(bytes = "bytes", tag = "9")]
@@ -133,7 +137,7 @@ pub(crate) struct TensorProto {
 
 /// Name and type of an input or output.
 #[derive(Clone, PartialEq, Message)]
-pub(crate) struct ValueInfoProto {
+pub struct ValueInfoProto {
     #[prost(string, tag = "1")]
     pub name: String,
     #[prost(message, optional, tag = "2")]
@@ -142,14 +146,14 @@ pub(crate) struct ValueInfoProto {
 
 /// A type: only tensors are read.
 #[derive(Clone, PartialEq, Message)]
-pub(crate) struct TypeProto {
+pub struct TypeProto {
     #[prost(message, optional, tag = "1")]
     pub tensor_type: Option<TensorTypeProto>,
 }
 
 /// Element type and shape.
 #[derive(Clone, PartialEq, Message)]
-pub(crate) struct TensorTypeProto {
+pub struct TensorTypeProto {
     #[prost(int32, tag = "1")]
     pub elem_type: i32,
     #[prost(message, optional, tag = "2")]
@@ -158,14 +162,14 @@ pub(crate) struct TensorTypeProto {
 
 /// The axes.
 #[derive(Clone, PartialEq, Message)]
-pub(crate) struct TensorShapeProto {
+pub struct TensorShapeProto {
     #[prost(message, repeated, tag = "1")]
     pub dim: Vec<DimensionProto>,
 }
 
 /// One axis: a length, or the name of a symbolic one.
 #[derive(Clone, PartialEq, Message)]
-pub(crate) struct DimensionProto {
+pub struct DimensionProto {
     #[prost(int64, optional, tag = "1")]
     pub dim_value: Option<i64>,
     #[prost(string, optional, tag = "2")]
@@ -174,14 +178,22 @@ pub(crate) struct DimensionProto {
 
 /// A message of which only the presence matters.
 #[derive(Clone, PartialEq, Message)]
-pub(crate) struct Opaque {}
+pub struct Opaque {}
 
 /// Element types, as `TensorProto.DataType` numbers them.
-pub(crate) mod data_type {
+pub mod data_type {
     pub const FLOAT: i32 = 1;
     pub const UINT8: i32 = 2;
+    pub const INT8: i32 = 3;
+    pub const UINT16: i32 = 4;
+    pub const INT16: i32 = 5;
     pub const INT32: i32 = 6;
     pub const INT64: i32 = 7;
+    pub const BOOL: i32 = 9;
+    pub const FLOAT16: i32 = 10;
+    pub const DOUBLE: i32 = 11;
+    pub const UINT32: i32 = 12;
+    pub const BFLOAT16: i32 = 16;
 
     /// The name of an element type, for messages.
     pub fn name(code: i32) -> String {
@@ -212,7 +224,7 @@ pub(crate) mod data_type {
 }
 
 /// Reads a model file.
-pub(crate) fn decode(bytes: &Bytes) -> Result<ModelProto, BundleError> {
+pub fn decode(bytes: &Bytes) -> Result<ModelProto, BundleError> {
     envelope::check(bytes)?;
     let model = ModelProto::decode(bytes.clone()).map_err(|error| BundleError::NotOnnx {
         problem: format!("its protocol buffer does not decode: {error}").into(),

@@ -167,7 +167,10 @@ pub fn survey(bytes: &[u8]) -> Result<Survey, BundleError> {
         .chain(&inner)
         .filter_map(|value| Some((value.name.as_str(), taken(value)?)))
         .collect();
-    let refused = trial(graph, &declared);
+    let default = |domain: &str| domain.is_empty() || domain == "ai.onnx";
+    let sets = &model.opset_import;
+    let opset = (sets.iter().find(|set| default(&set.domain))).map(|set| set.version);
+    let refused = trial(graph, opset.unwrap_or(i64::MAX), &declared);
     missing.operators.extend(refused.into_iter().map(|node| {
         Operator {
             operator: line(&node.operator),
@@ -185,13 +188,8 @@ pub fn survey(bytes: &[u8]) -> Result<Survey, BundleError> {
         Some(json) => of_bundle(&model, graph, json, &mut missing)?,
         None => of_stranger(&inputs, graph, &mut missing),
     }
-    let default = |domain: &str| domain.is_empty() || domain == "ai.onnx";
-    let sets = &model.opset_import;
     Ok(Survey {
-        opset: sets
-            .iter()
-            .find(|set| default(&set.domain))
-            .map(|set| set.version),
+        opset,
         producer: line(&model.producer_name),
         nodes: graph.node.len(),
         inputs: inputs.into_iter().map(value).collect(),
@@ -216,7 +214,12 @@ fn tensor(value: &ValueInfoProto) -> Option<&TensorTypeProto> {
 fn taken(value: &ValueInfoProto) -> Option<(Type, Vec<Dim>)> {
     let tensor = tensor(value)?;
     let ty = match tensor.elem_type {
-        data_type::FLOAT | data_type::UINT8 => Type::F32,
+        data_type::FLOAT
+        | data_type::FLOAT16
+        | data_type::BFLOAT16
+        | data_type::DOUBLE
+        | data_type::BOOL
+        | data_type::UINT8 => Type::F32,
         data_type::INT64 | data_type::INT32 => Type::I64,
         _ => return None,
     };

@@ -4,6 +4,8 @@
 
 use std::sync::Arc;
 
+use lads_kernels::stored;
+
 use crate::onnx::{TensorProto, data_type};
 
 /// The most elements that an initializer or a folded constant may have: 256 MiB of `f32`.
@@ -78,6 +80,14 @@ impl Tensor {
         }
     }
 
+    /// The number of elements.
+    pub fn len(&self) -> usize {
+        match &self.data {
+            Data::F32(data) => data.len(),
+            Data::I64(data) => data.len(),
+        }
+    }
+
     /// The value, if all elements are the same one.
     pub fn uniform(&self) -> Option<f32> {
         let data = self.as_f32()?;
@@ -106,34 +116,67 @@ impl Tensor {
             .filter(|shape| shape.len() <= MAX_RANK)
             .and_then(|shape| elements(&shape).map(|len| (shape, len)))
             .ok_or_else(|| format!("its shape is negative, larger than {MAX_ELEMENTS} elements or has more than {MAX_RANK} axes"))?;
-        let raw = &proto.raw_data;
-        let data = match proto.data_type {
-            data_type::FLOAT if !raw.is_empty() => Data::F32(words(raw, f32::from_le_bytes)?),
-            data_type::FLOAT => Data::F32(proto.float_data.clone()),
-            data_type::INT64 if !raw.is_empty() => Data::I64(words(raw, i64::from_le_bytes)?),
-            data_type::INT64 => Data::I64(proto.int64_data.clone()),
-            data_type::INT32 if !raw.is_empty() => {
-                Data::I64(words(raw, |word| i64::from(i32::from_le_bytes(word)))?)
-            }
-            data_type::INT32 => Data::I64(proto.int32_data.iter().map(|&x| i64::from(x)).collect()),
-            other => {
-                return Err(format!(
-                    "its elements are {}; supported are float32, int64 and int32",
-                    data_type::name(other)
-                ));
-            }
-        };
-        let got = match &data {
-            Data::F32(data) => data.len(),
-            Data::I64(data) => data.len(),
-        };
-        if got != len {
+        let data = elements_of(proto)?;
+        let tensor = Self { shape, data };
+        if tensor.len() != len {
             return Err(format!(
-                "its shape {shape:?} needs {len} elements, it has {got}"
+                "its shape {:?} needs {len} elements, it has {}",
+                tensor.shape,
+                tensor.len()
             ));
         }
-        Ok(Arc::new(Self { shape, data }))
+        Ok(Arc::new(tensor))
     }
+}
+
+/// The elements of a tensor: floats of all widths as `f32`, integers as `i64`, truth values as 0 and 1.
+fn elements_of(proto: &TensorProto) -> Result<Data, String> {
+    use data_type::{
+        BFLOAT16, BOOL, DOUBLE, FLOAT, FLOAT16, INT8, INT16, INT32, INT64, UINT8, name,
+    };
+    let raw = &proto.raw_data;
+    let small = &proto.int32_data;
+    // Of 16 bits, and so kept in the lower half of 32.
+    let halves = || small.iter().map(|&x| x as u16);
+    let (has_raw, kind) = (!raw.is_empty(), proto.data_type);
+    Ok(match kind {
+        FLOAT if has_raw => Data::F32(words(raw, f32::from_le_bytes)?),
+        FLOAT => Data::F32(proto.float_data.clone()),
+        FLOAT16 if has_raw => Data::F32(words(raw, |word| {
+            stored::from_f16(u16::from_le_bytes(word))
+        })?),
+        FLOAT16 => Data::F32(halves().map(stored::from_f16).collect()),
+        BFLOAT16 if has_raw => Data::F32(words(raw, |word| {
+            stored::from_bf16(u16::from_le_bytes(word))
+        })?),
+        BFLOAT16 => Data::F32(halves().map(stored::from_bf16).collect()),
+        DOUBLE if has_raw => singles(words(raw, f64::from_le_bytes)?)?,
+        DOUBLE => singles(proto.double_data.clone())?,
+        INT64 if has_raw => Data::I64(words(raw, i64::from_le_bytes)?),
+        INT64 => Data::I64(proto.int64_data.clone()),
+        INT32 if has_raw => Data::I64(words(raw, |word| i64::from(i32::from_le_bytes(word)))?),
+        INT16 if has_raw => Data::I64(words(raw, |word| i64::from(i16::from_le_bytes(word)))?),
+        UINT8 if has_raw => Data::I64(raw.iter().map(|&x| i64::from(x)).collect()),
+        INT8 if has_raw => Data::I64(words(raw, |word| i64::from(i8::from_le_bytes(word)))?),
+        INT32 | INT16 | UINT8 | INT8 => Data::I64(small.iter().map(|&x| i64::from(x)).collect()),
+        BOOL if has_raw => Data::F32(raw.iter().map(|&x| f32::from(u8::from(x != 0))).collect()),
+        BOOL => Data::F32(small.iter().map(|&x| f32::from(u8::from(x != 0))).collect()),
+        other => {
+            return Err(format!(
+                "its elements are {}; supported are floats, bool and integers up to int64",
+                name(other)
+            ));
+        }
+    })
+}
+
+/// Doubles as `f32`.
+fn singles(doubles: Vec<f64>) -> Result<Data, String> {
+    let lost = |x: f64| x.is_finite() && !(x as f32).is_finite();
+    if let Some(x) = doubles.iter().find(|&&x| lost(x)) {
+        return Err(format!("its element {x:e} is beyond 32-bit floats"));
+    }
+    Ok(Data::F32(doubles.into_iter().map(|x| x as f32).collect()))
 }
 
 /// Little-endian words.

@@ -2,6 +2,7 @@
 
 mod attention;
 mod bombs;
+mod field;
 mod layers;
 mod machine;
 mod models;

@@ -18,6 +18,7 @@ mod attention;
 mod binary;
 mod copy;
 mod gather_row;
+mod index;
 mod layer_norm;
 mod linear;
 mod matmul;
@@ -36,6 +37,7 @@ pub use attention::{Attention, CacheFormat};
 pub use binary::{Binary, BinaryKind};
 pub use copy::Copy;
 pub use gather_row::GatherRow;
+pub use index::{FromIndex, ToIndex};
 pub use layer_norm::LayerNorm;
 pub use linear::{Activation, Linear, WeightFormat};
 pub use matmul::MatMul;
@@ -249,6 +251,8 @@ ops! {
     Copy = 10,
     ArgMin = 11 if "arg",
     ArgMax = 12 if "arg",
+    ToIndex = 14,
+    FromIndex = 15,
 }
 
 #[cfg(test)]

@@ -4,9 +4,10 @@ use std::collections::BTreeSet;
 
 use lads_image::codec::Field;
 use lads_image::op::{
-    Activation, ArgMax, ArgMin, Attention, Binary, BinaryKind, CacheFormat, Copy, GatherRow,
-    INT_SLOTS, IntSlot, LayerNorm, Linear, MatMul, OP_WORDS, Op, Operand, Reduce, ReduceKind,
-    Softmax, Space, Span, StateSpan, Unary, UnaryKind, WeightFormat, WeightSpan,
+    Activation, ArgMax, ArgMin, Attention, Binary, BinaryKind, CacheFormat, Copy, FromIndex,
+    GatherRow, INT_SLOTS, IntSlot, LayerNorm, Linear, MatMul, OP_WORDS, Op, Operand, Reduce,
+    ReduceKind, Softmax, Space, Span, StateSpan, ToIndex, Unary, UnaryKind, WeightFormat,
+    WeightSpan,
 };
 use lads_image::{Access, AccessKind, Checker, Fault, Isa, Machine, Program, Spaces, Work};
 use lads_kernels::{attention_scratch_len, packed_len};
@@ -195,6 +196,16 @@ fn samples() -> Vec<Op> {
     let (x, out) = (span(10, 12), IntSlot(7));
     ops.push(ArgMin { x, out }.into());
     ops.push(ArgMax { x, out }.into());
+    let (one, index) = (span(10, 1), IntSlot(7));
+    ops.push(ToIndex { x: one, out }.into());
+    ops.push(
+        FromIndex {
+            index,
+            shift: -3,
+            y: one,
+        }
+        .into(),
+    );
     ops
 }
 
@@ -245,7 +256,9 @@ fn outside_the_arena(op: &mut Op) -> Vec<(&mut u32, u32, usize)> {
         Op::Reduce(op) => operand(&mut op.x).into_iter().collect(),
         Op::Copy(op) => operand(&mut op.x).into_iter().collect(),
         Op::GatherRow(op) => operand(&mut op.table).into_iter().collect(),
-        Op::Softmax(_) | Op::ArgMin(_) | Op::ArgMax(_) => vec![],
+        Op::Softmax(_) | Op::ArgMin(_) | Op::ArgMax(_) | Op::ToIndex(_) | Op::FromIndex(_) => {
+            vec![]
+        }
     }
 }
 
@@ -436,9 +449,10 @@ fn accesses_are_what_a_run_does() {
             let may = slots.written == Some(IntSlot(slot as u8));
             assert!(int == 1 || may, "{op:?} writes slot {slot}");
         }
-        let index = matches!(op, Op::ArgMin(_) | Op::ArgMax(_));
+        let index = matches!(op, Op::ArgMin(_) | Op::ArgMax(_) | Op::ToIndex(_));
         assert_eq!(slots.written.is_some(), index);
-        assert_eq!(slots.read.is_some(), matches!(op, Op::GatherRow(_)));
+        let reads = matches!(op, Op::GatherRow(_) | Op::FromIndex(_));
+        assert_eq!(slots.read.is_some(), reads);
     }
 }
 

@@ -2,9 +2,10 @@
 
 use lads_image::codec::{Field, Reader, Writer};
 use lads_image::op::{
-    Activation, ArgMax, ArgMin, Attention, Binary, BinaryKind, CacheFormat, Copy, GatherRow,
-    IntSlot, LayerNorm, Linear, MatMul, OP_WORDS, Op, Operand, Place, Reduce, ReduceKind, Softmax,
-    Space, Span, StateSpan, Unary, UnaryKind, WeightFormat, WeightSpan,
+    Activation, ArgMax, ArgMin, Attention, Binary, BinaryKind, CacheFormat, Copy, FromIndex,
+    GatherRow, IntSlot, LayerNorm, Linear, MatMul, OP_WORDS, Op, Operand, Place, Reduce,
+    ReduceKind, Softmax, Space, Span, StateSpan, ToIndex, Unary, UnaryKind, WeightFormat,
+    WeightSpan,
 };
 use proptest::prelude::*;
 
@@ -27,18 +28,22 @@ fn activation() -> impl Strategy<Value = Activation> {
         Activation::Relu,
         Activation::Tanh,
         Activation::Sigmoid,
+        Activation::Softplus,
+        Activation::Mish,
     ];
     prop_oneof![
         prop::sample::select(plain.to_vec()),
-        (-1.0_f32..1.0).prop_map(Activation::LeakyRelu)
+        (-1.0_f32..1.0).prop_map(Activation::LeakyRelu),
+        (-1.0_f32..1.0).prop_map(Activation::Elu)
     ]
 }
 
 #[expect(clippy::too_many_lines, reason = "one strategy per op")]
 fn op() -> impl Strategy<Value = Op> {
-    use BinaryKind::{Add, Div, Max, Min, Mul, Pow, Sub};
+    use BinaryKind::{Add, Div, Greater, Keep, Max, Min, Mul, Pow, Sub};
     use UnaryKind::{
-        Abs, Erf, Exp, LeakyRelu, Log, Neg, Recip, Relu, Rsqrt, Sigmoid, Sqrt, Square, Tanh,
+        Abs, Elu, Erf, Exp, LeakyRelu, Log, Mish, Neg, Recip, Relu, Rsqrt, Sigmoid, Softplus, Sqrt,
+        Square, Tanh, Trunc,
     };
     let dims = any::<[u32; 4]>;
     let linear = (
@@ -120,7 +125,7 @@ fn op() -> impl Strategy<Value = Op> {
             }
             .into()
         });
-    let kinds = vec![Add, Sub, Mul, Div, Max, Min, Pow];
+    let kinds = vec![Add, Sub, Mul, Div, Max, Min, Pow, Greater, Keep];
     let binary = (
         prop::sample::select(kinds),
         operand(),
@@ -143,7 +148,8 @@ fn op() -> impl Strategy<Value = Op> {
             .into()
         });
     let kinds = vec![
-        Relu, LeakyRelu, Tanh, Sigmoid, Exp, Log, Sqrt, Rsqrt, Neg, Abs, Recip, Erf, Square,
+        Relu, LeakyRelu, Tanh, Sigmoid, Exp, Log, Sqrt, Rsqrt, Neg, Abs, Recip, Erf, Square, Elu,
+        Softplus, Mish, Trunc,
     ];
     let unary = (
         prop::sample::select(kinds),
@@ -239,9 +245,24 @@ fn op() -> impl Strategy<Value = Op> {
         }
         .into()
     });
+    let to_index = (span(), 0_u8..8).prop_map(|(x, slot)| {
+        ToIndex {
+            x,
+            out: IntSlot(slot),
+        }
+        .into()
+    });
+    let from_index = (0_u8..8, any::<i32>(), span()).prop_map(|(slot, shift, y)| {
+        FromIndex {
+            index: IntSlot(slot),
+            shift,
+            y,
+        }
+        .into()
+    });
     prop_oneof![
         linear, layer_norm, attention, binary, unary, softmax, reduce, matmul, gather, copy,
-        arg_min, arg_max
+        arg_min, arg_max, to_index, from_index
     ]
 }
 

@@ -42,6 +42,14 @@ pub enum UnaryKind {
     Erf,
     /// `x * x`
     Square,
+    /// `x` where `x >= 0`, else `alpha * (exp(x) - 1)`.
+    Elu,
+    /// `log(1 + exp(x))`
+    Softplus,
+    /// `x * tanh(log(1 + exp(x)))`
+    Mish,
+    /// The next whole number towards zero.
+    Trunc,
 }
 
 /// An operation on each element.
@@ -49,7 +57,7 @@ pub enum UnaryKind {
 pub struct Unary {
     /// Which.
     pub kind: UnaryKind,
-    /// The slope of [`UnaryKind::LeakyRelu`].
+    /// The slope of [`UnaryKind::LeakyRelu`], the factor of [`UnaryKind::Elu`].
     pub alpha: f32,
 }
 
@@ -102,6 +110,10 @@ impl Kernel for Elements<'_> {
                 UnaryKind::Recip => each(x, |x| 1.0 / x),
                 UnaryKind::Erf => each(x, math::erf),
                 UnaryKind::Square => each(x, |x| x * x),
+                UnaryKind::Elu => each(x, |x| math::elu(x, self.alpha)),
+                UnaryKind::Softplus => each(x, math::softplus),
+                UnaryKind::Mish => each(x, math::mish),
+                UnaryKind::Trunc => each(x, math::trunc),
             }
             assign(y, &block);
         }

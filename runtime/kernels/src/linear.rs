@@ -86,39 +86,52 @@ pub enum Activation {
     Tanh,
     /// `1 / (1 + exp(-x))`
     Sigmoid,
+    /// `x` where `x >= 0`, else `alpha * (exp(x) - 1)`.
+    Elu(f32),
+    /// `log(1 + exp(x))`
+    Softplus,
+    /// `x * tanh(log(1 + exp(x)))`
+    Mish,
 }
 
 impl Activation {
     /// The operation on each element that a layer may leave for the end: long code, which is compiled once.
-    fn for_the_end(self) -> Option<UnaryKind> {
-        match self {
-            Self::None | Self::Relu | Self::LeakyRelu(_) => None,
-            Self::Tanh => Some(UnaryKind::Tanh),
-            Self::Sigmoid => Some(UnaryKind::Sigmoid),
-        }
+    fn for_the_end(self) -> Option<Unary> {
+        let (kind, alpha) = match self {
+            Self::None | Self::Relu | Self::LeakyRelu(_) => return None,
+            Self::Tanh => (UnaryKind::Tanh, 0.0),
+            Self::Sigmoid => (UnaryKind::Sigmoid, 0.0),
+            Self::Elu(alpha) => (UnaryKind::Elu, alpha),
+            Self::Softplus => (UnaryKind::Softplus, 0.0),
+            Self::Mish => (UnaryKind::Mish, 0.0),
+        };
+        Some(Unary { kind, alpha })
     }
 
     #[inline(always)]
     fn apply<S: Simd>(self, simd: S, x: S::V) -> S::V {
         /// Where a result is added to what is there; the same code for all instruction sets.
         #[inline(never)]
-        fn each(block: &mut Block, f: fn(f32) -> f32) {
+        fn each(block: &mut Block, alpha: f32, f: fn(f32, f32) -> f32) {
             for x in block {
-                *x = f(*x);
+                *x = f(*x, alpha);
             }
         }
-        let slow = |f| {
+        let slow = |alpha, f| {
             let mut block = [0.0; LANES];
             simd.store(x, &mut block);
-            each(&mut block, f);
+            each(&mut block, alpha, f);
             simd.load(&block)
         };
         match self {
             Self::None => x,
             Self::Relu => simd.where_negative(x, simd.splat(0.0)),
             Self::LeakyRelu(alpha) => simd.where_negative(x, simd.mul(simd.splat(alpha), x)),
-            Self::Tanh => slow(math::tanh),
-            Self::Sigmoid => slow(math::sigmoid),
+            Self::Tanh => slow(0.0, |x, _| math::tanh(x)),
+            Self::Sigmoid => slow(0.0, |x, _| math::sigmoid(x)),
+            Self::Elu(alpha) => slow(alpha, math::elu),
+            Self::Softplus => slow(0.0, |x, _| math::softplus(x)),
+            Self::Mish => slow(0.0, |x, _| math::mish(x)),
         }
     }
 }
@@ -170,10 +183,10 @@ impl Linear<'_> {
                 }
             }
         }
-        if let Some(kind) = at_the_end {
+        if let Some(unary) = at_the_end {
             let rows = |len: usize, of: usize| len.checked_div(of).unwrap_or(0);
             let computed = rows(x.len(), self.k).min(rows(y.len(), self.n)) * self.n;
-            Unary { kind, alpha: 0.0 }.run_in_place(isa, y.get_mut(..computed).unwrap_or(&mut []));
+            unary.run_in_place(isa, y.get_mut(..computed).unwrap_or(&mut []));
         }
     }
 

@@ -34,12 +34,20 @@ pub fn min(a: f32, b: f32) -> f32 {
 /// product with `n` is exact). The polynomial and the two parts are those of Cephes' `expf` (S. Moshier).
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
+    // Beyond these the result is infinite or rounds to zero.
+    let (n, p) = split(x.clamp(-104.0, 89.0));
+    // 2^n in two factors, each a normal number, so that results below the normal numbers are rounded once.
+    let half = n >> 1;
+    (p + 1.0) * power_of_two(half) * power_of_two(n.wrapping_sub(half))
+}
+
+/// `n` and `p` with `exp(x) = 2^n * (1 + p)`, of an `x` between -104 and 89.
+#[inline(always)]
+fn split(x: f32) -> (i32, f32) {
     // 1.5 * 2^23: adding it leaves the rounded number in the low bits of the mantissa.
     const ROUND: f32 = 12582912.0;
     const LN2_HIGH: f32 = 0.693359375;
     const LN2_LOW: f32 = -2.12194440e-4;
-    // Beyond these the result is infinite or rounds to zero.
-    let x = x.clamp(-104.0, 89.0);
     let rounded = x * core::f32::consts::LOG2_E + ROUND;
     let n = rounded - ROUND;
     let r = (x - n * LN2_HIGH) - n * LN2_LOW;
@@ -49,14 +57,67 @@ pub fn exp(x: f32) -> f32 {
     p = p * r + 4.1665795894e-2;
     p = p * r + 1.6666665459e-1;
     p = p * r + 5.0000001201e-1;
-    let p = p * (r * r) + r + 1.0;
-    // 2^n in two factors, each a normal number, so that results below the normal numbers are rounded once.
     let n = rounded
         .to_bits()
         .wrapping_sub(ROUND.to_bits())
         .cast_signed();
-    let half = n >> 1;
-    p * power_of_two(half) * power_of_two(n.wrapping_sub(half))
+    (n, p * (r * r) + r)
+}
+
+/// `x` where `x >= 0`, else `alpha * (exp(x) - 1)`, near zero without cancellation; relative error below 1.2e-7 with an `alpha` of 1.
+#[inline(always)]
+pub fn elu(x: f32, alpha: f32) -> f32 {
+    // Below -30 the exponential is lost beside one.
+    let (n, p) = split(x.clamp(-30.0, 0.0));
+    let scale = power_of_two(n);
+    let below = alpha * (p * scale + (scale - 1.0));
+    if x < 0.0 { below } else { x }
+}
+
+/// `log(1 + exp(x))`; relative error below 4.0e-7 where the result is a normal number.
+///
+/// `max(x, 0) + log(1 + t)` with `t = exp(-|x|)`, and `log(1 + t) = 2 atanh(s)` with `s = t / (2 + t)`, at most a third, as a series.
+#[inline(always)]
+pub fn softplus(x: f32) -> f32 {
+    let t = exp(-x.abs());
+    let s = t / (2.0 + t);
+    let z = s * s;
+    let mut p = 1.0 / 13.0;
+    p = p * z + 1.0 / 11.0;
+    p = p * z + 1.0 / 9.0;
+    p = p * z + 1.0 / 7.0;
+    p = p * z + 1.0 / 5.0;
+    p = p * z + 1.0 / 3.0;
+    relu(x) + (2.0 * s + 2.0 * s * z * p)
+}
+
+/// `x * tanh(log(1 + exp(x)))`; relative error below 4.0e-7 where the result is a normal number.
+///
+/// With `w = exp(x)` the hyperbolic tangent is `n / (n + 2)`, `n = w (w + 2)`.
+#[inline(always)]
+pub fn mish(x: f32) -> f32 {
+    // From 20 on the quotient rounds to one, long before `n` is infinite.
+    let w = exp(min(x, 20.0));
+    let n = w * (w + 2.0);
+    x * (n / (n + 2.0))
+}
+
+/// The next whole number towards zero.
+#[inline(always)]
+pub fn trunc(x: f32) -> f32 {
+    libm::truncf(x)
+}
+
+/// 1 where `a > b`, else 0.
+#[inline(always)]
+pub fn greater(a: f32, b: f32) -> f32 {
+    if a > b { 1.0 } else { 0.0 }
+}
+
+/// `a` where `b` is not zero, else 0.
+#[inline(always)]
+pub fn keep(a: f32, b: f32) -> f32 {
+    if b == 0.0 { 0.0 } else { a }
 }
 
 /// `2^n` for `n` in `-126..=127`.

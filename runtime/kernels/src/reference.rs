@@ -17,7 +17,15 @@ pub fn activation(activation: Activation, x: f64) -> f64 {
         Activation::LeakyRelu(alpha) => x.max(0.0) + f64::from(alpha) * x.min(0.0),
         Activation::Tanh => libm::tanh(x),
         Activation::Sigmoid => 1.0 / (1.0 + libm::exp(-x)),
+        Activation::Elu(alpha) => x.max(0.0) + f64::from(alpha) * libm::expm1(x.min(0.0)),
+        Activation::Softplus => softplus(x),
+        Activation::Mish => x * libm::tanh(softplus(x)),
     }
+}
+
+/// `log(1 + exp(x))`
+fn softplus(x: f64) -> f64 {
+    x.max(0.0) + libm::log1p(libm::exp(-x.abs()))
 }
 
 /// `activation(x·w + bias)` with `w` as `[k, n]`; `y` is `[m, n]` and `bias` may be empty.
@@ -138,6 +146,10 @@ pub fn unary(kind: UnaryKind, alpha: f32, x: f32) -> f32 {
         UnaryKind::Recip => 1.0 / x,
         UnaryKind::Erf => libm::erf(x),
         UnaryKind::Square => x * x,
+        UnaryKind::Elu => activation(Activation::Elu(alpha), x),
+        UnaryKind::Softplus => activation(Activation::Softplus, x),
+        UnaryKind::Mish => activation(Activation::Mish, x),
+        UnaryKind::Trunc => libm::trunc(x),
     }) as f32
 }
 
@@ -152,6 +164,9 @@ pub fn binary(kind: BinaryKind, a: f32, b: f32) -> f32 {
         BinaryKind::Max => a.max(b),
         BinaryKind::Min => a.min(b),
         BinaryKind::Pow => libm::pow(a, b),
+        BinaryKind::Greater => f64::from(u8::from(a > b)),
+        BinaryKind::Keep if b == 0.0 => 0.0,
+        BinaryKind::Keep => a,
     }) as f32
 }
 

@@ -19,6 +19,10 @@ pub enum BinaryKind {
     Min,
     /// `a` to the power of `b`.
     Pow,
+    /// 1 where `a > b`, else 0.
+    Greater,
+    /// `a` where `b` is not zero, else 0: what a condition selects.
+    Keep,
 }
 
 /// An operand of [`binary`].
@@ -76,6 +80,8 @@ fn binary_row(kind: BinaryKind, a: Row, b: Row, y: &mut [f32]) {
         BinaryKind::Max => apply(a, b, y, math::max),
         BinaryKind::Min => apply(a, b, y, math::min),
         BinaryKind::Pow => apply(a, b, y, math::pow),
+        BinaryKind::Greater => apply(a, b, y, math::greater),
+        BinaryKind::Keep => apply(a, b, y, math::keep),
     }
 }
 

@@ -110,6 +110,9 @@ fn activation() -> impl Strategy<Value = Activation> {
         Activation::LeakyRelu(0.2),
         Activation::Tanh,
         Activation::Sigmoid,
+        Activation::Elu(0.8),
+        Activation::Softplus,
+        Activation::Mish,
     ];
     select(all.to_vec())
 }

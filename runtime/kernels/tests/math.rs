@@ -78,6 +78,42 @@ fn tanh_is_as_exact_as_it_says() {
 }
 
 #[test]
+fn elu_is_as_exact_as_it_says() {
+    let elu = |x| math::elu(x, 1.0);
+    below(
+        largest_error([f32::NEG_INFINITY, f32::INFINITY], elu, |x| {
+            if x < 0.0 { x.exp_m1() } else { x }
+        }),
+        1.2e-7,
+    );
+    assert_eq!((elu(0.0), elu(-0.0)), (0.0, 0.0));
+    assert_eq!(math::elu(f32::NEG_INFINITY, 0.5), -0.5);
+    assert_eq!(elu(f32::INFINITY), f32::INFINITY);
+    assert!(elu(f32::NAN).is_nan());
+}
+
+#[test]
+fn softplus_and_mish_are_as_exact_as_they_say() {
+    let exact = |x: f64| x.max(0.0) + (-x.abs()).exp().ln_1p();
+    let range = [-87.0, f32::INFINITY];
+    below(largest_error(range, math::softplus, exact), 4.0e-7);
+    below(
+        largest_error(range, math::mish, |x| {
+            let n = x.min(300.0).exp();
+            let n = n * (n + 2.0);
+            x * (n / (n + 2.0))
+        }),
+        4.0e-7,
+    );
+    for f in [math::softplus, math::mish] {
+        assert_eq!(f(f32::INFINITY), f32::INFINITY);
+        assert!(f(f32::NAN).is_nan());
+    }
+    assert_eq!(math::softplus(f32::NEG_INFINITY), 0.0);
+    assert_eq!(math::mish(-200.0), 0.0);
+}
+
+#[test]
 fn the_functions_of_libm_are_as_exact_as_stated() {
     below(
         largest_error([f32::NEG_INFINITY, f32::INFINITY], math::erf, libm::erf),

@@ -13,7 +13,7 @@ use proptest::prelude::*;
 use proptest::sample::select;
 use support::{close_up_to, digest, on_all, values};
 
-const UNARY: [UnaryKind; 13] = [
+const UNARY: [UnaryKind; 17] = [
     UnaryKind::Relu,
     UnaryKind::LeakyRelu,
     UnaryKind::Tanh,
@@ -27,9 +27,13 @@ const UNARY: [UnaryKind; 13] = [
     UnaryKind::Recip,
     UnaryKind::Erf,
     UnaryKind::Square,
+    UnaryKind::Elu,
+    UnaryKind::Softplus,
+    UnaryKind::Mish,
+    UnaryKind::Trunc,
 ];
 
-const BINARY: [BinaryKind; 7] = [
+const BINARY: [BinaryKind; 9] = [
     BinaryKind::Add,
     BinaryKind::Sub,
     BinaryKind::Mul,
@@ -37,6 +41,8 @@ const BINARY: [BinaryKind; 7] = [
     BinaryKind::Max,
     BinaryKind::Min,
     BinaryKind::Pow,
+    BinaryKind::Greater,
+    BinaryKind::Keep,
 ];
 
 const REDUCE: [ReduceKind; 5] = [

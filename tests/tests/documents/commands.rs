@@ -116,7 +116,10 @@ fn would_run(command: &str) -> Result<String, String> {
     run(&project_path("."), &script)
 }
 
-/// A folder that looks like the project and takes what commands write; with the `lads` of a build of today.
+/// What short commands run, as their folders in `target/release` have it.
+const BUILT: [&str; 2] = ["lads", "examples/biped"];
+
+/// A folder that looks like the project and takes what commands write; with the programs of a build of today.
 fn folder() -> tempfile::TempDir {
     let target = Path::new(env!("CARGO_TARGET_TMPDIR"))
         .parent()
@@ -124,7 +127,8 @@ fn folder() -> tempfile::TempDir {
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let mut build = Command::new(cargo);
     build
-        .args(["build", "--quiet", "-p", "lads-cli", "--target-dir"])
+        .args(["build", "--quiet", "-p", "lads-cli", "-p", "lads-host"])
+        .args(["--bins", "--example", "biped", "--target-dir"])
         .arg(target);
     let built = build
         .current_dir(project_path("."))
@@ -139,12 +143,12 @@ fn folder() -> tempfile::TempDir {
             symlink(root.join(&name), folder.path().join(&name)).expect("links can be made");
         }
     }
-    fs::create_dir_all(folder.path().join("target/release")).expect("there is room");
-    symlink(
-        target.join("debug/lads"),
-        folder.path().join("target/release/lads"),
-    )
-    .expect("links can be made");
+    let release = folder.path().join("target/release");
+    fs::create_dir_all(release.join("examples")).expect("there is room");
+    for program in BUILT {
+        symlink(target.join("debug").join(program), release.join(program))
+            .expect("links can be made");
+    }
     folder
 }
 

@@ -106,6 +106,10 @@ impl Display for Foreign<'_> {
         for field in contract {
             writeln!(f, "  {}: {}", field.field, field.needed)?;
         }
-        Ok(())
+        writeln!(
+            f,
+            "\n`lads import {} --template` prints the form in which a person says it",
+            self.path.display()
+        )
     }
 }

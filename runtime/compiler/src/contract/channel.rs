@@ -145,6 +145,12 @@ pub struct Element {
     /// Unit of the physical value.
     #[serde(default)]
     pub physical_unit: Option<String>,
+    /// Proportional gain of the joint's own controller with which the policy was trained, per unit of the action.
+    #[serde(default)]
+    pub stiffness: Option<f32>,
+    /// Derivative gain of the same.
+    #[serde(default)]
+    pub damping: Option<f32>,
 }
 
 fn one() -> f32 {

@@ -195,6 +195,16 @@ pub(crate) enum Bound {
     Cache,
 }
 
+/// Names that mean the same in every graph: no observation and no state is called so.
+pub const RESERVED: [&str; 6] = [
+    "action",
+    "previous_action",
+    "timestep",
+    "phase",
+    "pass",
+    "index",
+];
+
 impl Blueprint {
     pub fn state(mut self, name: &str, keep: Keep, scope: Scope) -> Self {
         self.states.push(State {

@@ -1,12 +1,13 @@
 //! Products with constant matrices become linear layers, and take in what follows them: scale, bias, activation, residual.
 //!
 //! `(x·W) * s + t` is `x·(W s) + t`: so batch normalisation disappears. A value that somebody else reads too is not taken in.
+//! A reshape between a layer and what follows it, as vectors without a batch axis have it, moves behind both.
 
 use std::collections::HashMap;
 
 use lads_image::op::{BinaryKind, UnaryKind};
 
-use super::Fused;
+use super::{Fused, columns};
 use crate::graph::{Dim, Graph, Id, Op, Rewriter, Type, Unary, topological};
 
 /// Fuses the linear layers of an entry.
@@ -31,7 +32,10 @@ pub(super) fn fuse(fused: Fused) -> Result<Fused, String> {
             .node(id)
             .inputs
             .iter()
-            .map(|input| uses[input] == 1)
+            .map(|input| {
+                let reshaped = matches!(old.op(*input), Op::Reshape);
+                uses[input] == 1 && !(reshaped && uses[&old.node(*input).inputs[0]] != 1)
+            })
             .collect();
         rewriter.at(id);
         let taken = match old.op(id) {
@@ -58,13 +62,14 @@ fn product(g: &mut Graph, x: &[Id]) -> Result<Option<Id>, String> {
     if !(matrix && rows) {
         return Ok(None);
     }
+    let (rows, matrix) = columns::sorted(g, x[0], x[1])?.unwrap_or((x[0], x[1]));
     g.linear(
         Op::Linear {
             bias: false,
             residual: false,
             activation: None,
         },
-        x.to_vec(),
+        vec![rows, matrix],
     )
     .map(Some)
 }
@@ -81,6 +86,14 @@ fn layer(g: &Graph, id: Id) -> Option<(bool, Option<Unary>)> {
     }
 }
 
+/// The value that a reshape gives another shape, or the value itself.
+fn unshaped(g: &Graph, id: Id) -> Id {
+    match g.op(id) {
+        Op::Reshape => g.node(id).inputs[0],
+        _ => id,
+    }
+}
+
 /// A linear layer and something: a scale, a bias or a residual.
 fn combined(
     g: &mut Graph,
@@ -92,17 +105,23 @@ fn combined(
     // The later layer is taken first: the other side is then more likely to be the residual that it belongs to.
     let sides = if x[0] > x[1] { [0, 1] } else { [1, 0] };
     for side in sides {
-        let (own, other) = (x[side], x[1 - side]);
+        let (shaped, other) = (x[side], x[1 - side]);
+        let own = unshaped(g, shaped);
         let Some((bias, activation)) =
             layer(g, own).filter(|_| alone[side] && (commutes || side == 0))
         else {
             continue;
         };
-        if let Some(column) = per_output(g, own, other)? {
+        // The last axis must be the layer's outputs.
+        let outputs = g.shape(shaped).last() == g.shape(own).last();
+        if let Some(column) = per_output(g, shaped, other)?.filter(|_| outputs) {
             if activation.is_none() {
-                return folded(g, kind, own, bias, column);
+                let shape = g.shape(shaped).to_vec();
+                let taken = folded(g, kind, own, bias, column)?;
+                return taken.map(|layer| g.reshape(layer, &shape)).transpose();
             }
-        } else if kind == BinaryKind::Add
+        } else if own == shaped
+            && kind == BinaryKind::Add
             && g.shape(other) == g.shape(own)
             && g.ty(other) == Type::F32
             && g.constant(other).is_none()
@@ -180,19 +199,26 @@ fn folded(
 fn activated(g: &mut Graph, unary: Unary, x: Id) -> Result<Option<Id>, String> {
     let fits = matches!(
         unary.kind.0,
-        UnaryKind::Relu | UnaryKind::LeakyRelu | UnaryKind::Tanh | UnaryKind::Sigmoid
+        UnaryKind::Relu
+            | UnaryKind::LeakyRelu
+            | UnaryKind::Tanh
+            | UnaryKind::Sigmoid
+            | UnaryKind::Elu
+            | UnaryKind::Softplus
+            | UnaryKind::Mish
     );
-    let Some((bias, None)) = layer(g, x).filter(|_| fits) else {
+    let own = unshaped(g, x);
+    let Some((bias, None)) = layer(g, own).filter(|_| fits) else {
         return Ok(None);
     };
-    let inputs = g.node(x).inputs.clone();
-    g.linear(
+    let (inputs, shape) = (g.node(own).inputs.clone(), g.shape(x).to_vec());
+    let layer = g.linear(
         Op::Linear {
             bias,
             residual: false,
             activation: Some(unary),
         },
         inputs,
-    )
-    .map(Some)
+    )?;
+    g.reshape(layer, &shape).map(Some)
 }

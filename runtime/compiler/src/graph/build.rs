@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use lads_image::op::{BinaryKind, ReduceKind};
 
-use super::{Dim, Graph, Id, Kind, MAX_FOLDING, Op, Type, Unary, cost, evaluate, show};
+use super::{Dim, Graph, Id, Kind, MAX_FOLDING, Op, Type, Unary, cost, fold, show};
 use crate::tensor::{MAX_RANK, Tensor, elements};
 
 /// A node, or why its operands do not fit.
@@ -48,6 +48,11 @@ fn volume(shape: &[Dim]) -> Option<(usize, Vec<usize>)> {
 }
 
 impl Graph {
+    /// The shape that a shape and a value broadcast to.
+    pub fn broadcast(&self, shape: &[Dim], x: Id) -> Result<Vec<Dim>, String> {
+        broadcast(shape, self.shape(x))
+    }
+
     /// Folds the node if all its operands are constants, else adds it.
     fn fold(&mut self, op: Op, inputs: Vec<Id>, shape: Vec<Dim>, ty: Type) -> Built {
         if shape.len() > MAX_RANK || shape.contains(&Dim::of(0)) {
@@ -71,7 +76,7 @@ impl Graph {
                     "computes with constants alone, and with the entry's others that takes more than {MAX_FOLDING} operations"
                 ));
             }
-            if let Some(tensor) = evaluate(&op, &operands, &known) {
+            if let Some(tensor) = fold(&op, &operands, &known) {
                 return Ok(self.add_const(Arc::new(tensor)));
             }
         }
@@ -383,6 +388,28 @@ impl Graph {
         }
         let ty = self.ty(table);
         self.fold(Op::GatherRow, vec![table, index], shape[1..].to_vec(), ty)
+    }
+
+    /// One number as an integer, without its fraction.
+    pub fn index_of(&mut self, x: Id) -> Built {
+        self.floats(&[x])?;
+        let shape = self.shape(x).to_vec();
+        if shape.iter().any(|dim| !dim.is_one()) {
+            return Err(format!(
+                "makes {} integers at once, one is supported",
+                show(&shape)
+            ));
+        }
+        self.fold(Op::ToIndex, vec![x], shape, Type::I64)
+    }
+
+    /// One integer as a number.
+    pub fn number_of(&mut self, x: Id) -> Built {
+        let shape = self.shape(x).to_vec();
+        if self.ty(x) != Type::I64 || shape.iter().any(|dim| !dim.is_one()) {
+            return Err(format!("reads {} as one integer", show(self.shape(x))));
+        }
+        self.fold(Op::FromIndex, vec![x], shape, Type::F32)
     }
 
     /// Index of the first smallest or largest element of all.

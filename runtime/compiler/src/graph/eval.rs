@@ -1,15 +1,140 @@
-//! What a node computes, in the plainest way: folds constants. `None` means that the node cannot be folded, never that it is wrong.
+//! What a node computes, in the plainest way, on `ndarray`: with numbers of 32 bits to fold constants, with 64 to check what was compiled.
+//!
+//! `None` means that a node is not evaluated, never that it is wrong. Every sum goes from the first element to the last, so that a folded
+//! constant has the same bits wherever it is folded.
 
+use std::iter::{Product, Sum};
 use std::sync::Arc;
 
 use lads_image::op::{BinaryKind, ReduceKind, UnaryKind};
+use ndarray::{ArrayD, ArrayViewD, Axis, IxDyn, NdFloat, Slice, Zip, concatenate};
 
 use super::{Op, Unary};
-use crate::tensor::{Data, Tensor, strides};
+use crate::tensor::{Data, Tensor};
 
 /// The most operations that folding the constants of one entry may take. A policy's take some hundred thousands; a small model could
 /// ask for hours and for all memory.
 pub(crate) const MAX_FOLDING: usize = 1 << 26;
+
+/// Numbers that nodes are evaluated with.
+pub(crate) trait Real: NdFloat + Sum + Product {
+    /// A number of 32 bits.
+    fn exact(x: f32) -> Self;
+
+    /// Error function.
+    fn erf(self) -> Self;
+
+    /// A count, or an index.
+    fn of(whole: i64) -> Self;
+
+    /// Without its fraction.
+    fn whole(self) -> i64;
+}
+
+impl Real for f32 {
+    fn exact(x: f32) -> Self {
+        x
+    }
+
+    fn erf(self) -> Self {
+        lads_kernels::math::erf(self)
+    }
+
+    fn of(whole: i64) -> Self {
+        whole as f32
+    }
+
+    fn whole(self) -> i64 {
+        self as i64
+    }
+}
+
+impl Real for f64 {
+    fn exact(x: f32) -> Self {
+        f64::from(x)
+    }
+
+    fn erf(self) -> Self {
+        libm::erf(self)
+    }
+
+    fn of(whole: i64) -> Self {
+        whole as f64
+    }
+
+    fn whole(self) -> i64 {
+        self as i64
+    }
+}
+
+/// The value of a node.
+#[derive(Debug, Clone)]
+pub(crate) enum Value<T> {
+    Float(ArrayD<T>),
+    Int(ArrayD<i64>),
+}
+
+/// An operand of a node.
+#[derive(Debug, Clone)]
+pub(crate) enum View<'v, T> {
+    Float(ArrayViewD<'v, T>),
+    Int(ArrayViewD<'v, i64>),
+}
+
+impl<T: Real> Value<T> {
+    /// A constant, in these numbers.
+    pub fn of(tensor: &Tensor) -> Option<Self> {
+        Some(match View::of(tensor)? {
+            View::Float(array) => Value::Float(array.mapv(T::exact)),
+            View::Int(array) => Value::Int(array.to_owned()),
+        })
+    }
+
+    pub fn view(&self) -> View<'_, T> {
+        match self {
+            Value::Float(array) => View::Float(array.view()),
+            Value::Int(array) => View::Int(array.view()),
+        }
+    }
+}
+
+impl Value<f32> {
+    fn into_tensor(self) -> Tensor {
+        fn elements<E: Clone>(array: &ArrayD<E>) -> Vec<E> {
+            array.as_standard_layout().iter().cloned().collect()
+        }
+        match self {
+            Value::Float(array) => Tensor::f32(array.shape(), elements(&array)),
+            Value::Int(array) => Tensor::i64(array.shape(), elements(&array)),
+        }
+    }
+}
+
+impl<'v> View<'v, f32> {
+    fn of(tensor: &'v Tensor) -> Option<Self> {
+        let shape = IxDyn(&tensor.shape);
+        Some(match &tensor.data {
+            Data::F32(data) => View::Float(ArrayViewD::from_shape(shape, data).ok()?),
+            Data::I64(data) => View::Int(ArrayViewD::from_shape(shape, data).ok()?),
+        })
+    }
+}
+
+impl<'v, T> View<'v, T> {
+    fn float(&self) -> Option<&ArrayViewD<'v, T>> {
+        match self {
+            View::Float(array) => Some(array),
+            View::Int(_) => None,
+        }
+    }
+
+    fn int(&self) -> Option<&ArrayViewD<'v, i64>> {
+        match self {
+            View::Float(_) => None,
+            View::Int(array) => Some(array),
+        }
+    }
+}
 
 /// How many elements are read or made to evaluate a node.
 pub(crate) fn cost(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> usize {
@@ -22,125 +147,129 @@ pub(crate) fn cost(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> usize {
     made.saturating_mul(each)
 }
 
-/// The value of a node whose operands are constants; `shape` is its shape.
-pub(crate) fn evaluate(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> Option<Tensor> {
-    match op {
-        Op::Reshape => Some(Tensor {
-            shape: shape.to_vec(),
-            data: x[0].data.clone(),
-        }),
-        Op::Transpose(perm) => {
-            let from = strides(&x[0].shape);
-            let turned: Vec<usize> = perm.iter().map(|&axis| from[axis]).collect();
-            Some(gathered(&x[0], shape, &turned, 0))
-        }
-        Op::Slice { axis, start } => {
-            let from = strides(&x[0].shape);
-            Some(gathered(&x[0], shape, &from, start * from[*axis]))
-        }
-        Op::Expand => Some(gathered(
-            &x[0],
-            shape,
-            &broadcast_strides(&x[0].shape, shape),
-            0,
-        )),
-        Op::Concat { axis } => concat(x, *axis, shape),
-        Op::Binary(kind) => binary(kind.0, &x[0], &x[1], shape),
-        Op::Unary(unary) => {
-            let y = x[0].as_f32()?.iter().map(|&x| apply(*unary, x)).collect();
-            Some(Tensor::f32(shape, y))
-        }
-        Op::Reduce(kind, axis) => reduce(kind.0, &x[0], *axis, shape),
-        Op::MatMul => matmul(&x[0], &x[1], shape),
-        Op::GatherRow => {
-            let &[index] = x[1].as_i64()? else {
-                return None;
+/// The value of a node whose operands are constants. What has bits of its own at run time, and indices, are left to it.
+pub(crate) fn fold(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> Option<Tensor> {
+    let left = matches!(
+        op,
+        Op::Softmax | Op::LayerNorm { .. } | Op::ArgMin | Op::ArgMax | Op::Shift(_)
+    );
+    if left {
+        return None;
+    }
+    let x: Option<Vec<View<f32>>> = x.iter().map(|tensor| View::of(tensor)).collect();
+    evaluate(op, &x?, shape).map(Value::into_tensor)
+}
+
+/// The value of a node; `shape` is its shape.
+pub(crate) fn evaluate<T: Real>(op: &Op, x: &[View<T>], shape: &[usize]) -> Option<Value<T>> {
+    let float = |i: usize| x.get(i)?.float();
+    let value = match op {
+        Op::Reshape
+        | Op::Transpose(_)
+        | Op::Slice { .. }
+        | Op::Expand
+        | Op::Concat { .. }
+        | Op::GatherRow => {
+            let row = x.get(1).and_then(|index| index.int()?.first().copied());
+            return match x.first()? {
+                View::Float(_) => {
+                    let parts: Option<Vec<_>> = x.iter().map(|x| x.float().cloned()).collect();
+                    let table = float(0).cloned().map(|table| vec![table]);
+                    let parts = if *op == Op::GatherRow { table } else { parts };
+                    moved(op, parts?, row, shape).map(Value::Float)
+                }
+                View::Int(_) => {
+                    let parts: Option<Vec<_>> = x.iter().map(|x| x.int().cloned()).collect();
+                    moved(op, parts?, row, shape).map(Value::Int)
+                }
             };
-            let rows = *x[0].shape.first()?;
-            let index = usize::try_from(index).ok().filter(|&index| index < rows)?;
-            Some(gathered(
-                &x[0],
-                shape,
-                &strides(&x[0].shape)[1..],
-                index * strides(&x[0].shape)[0],
-            ))
+        }
+        Op::Binary(kind) => return binary(kind.0, x, shape),
+        Op::Shift(by) => return Some(Value::Int(x.first()?.int()?.mapv(|x| x + by))),
+        Op::ToIndex => return Some(Value::Int(float(0)?.mapv(T::whole))),
+        Op::ArgMin | Op::ArgMax => {
+            let index = best(float(0)?, *op == Op::ArgMax);
+            return Some(Value::Int(ArrayD::from_elem(IxDyn(shape), index)));
+        }
+        Op::FromIndex => x.first()?.int()?.mapv(T::of),
+        Op::Unary(unary) => float(0)?.mapv(|x| apply(*unary, x)),
+        Op::Reduce(kind, axis) => float(0)?.map_axis(Axis(*axis), |row| {
+            let (len, row) = (T::of(row.len() as i64), row.iter().copied());
+            match kind.0 {
+                ReduceKind::Sum => row.sum(),
+                ReduceKind::Mean => row.sum::<T>() / len,
+                ReduceKind::Max => row.fold(T::neg_infinity(), T::max),
+                ReduceKind::Min => row.fold(T::infinity(), T::min),
+                ReduceKind::Prod => row.product(),
+            }
+        }),
+        Op::MatMul => matmul(float(0)?, float(1)?, shape)?,
+        Op::Softmax => by_rows(float(0)?, |row| {
+            let most = row.iter().copied().fold(T::neg_infinity(), T::max);
+            for x in row.iter_mut() {
+                *x = (*x - most).exp();
+            }
+            let sum: T = row.iter().copied().sum();
+            for x in row.iter_mut() {
+                *x /= sum;
+            }
+        }),
+        Op::LayerNorm { eps } => {
+            let eps = T::exact(f32::from_bits(*eps));
+            let normed = by_rows(float(0)?, |row| {
+                let len = T::of(row.len() as i64);
+                let mean = row.iter().copied().sum::<T>() / len;
+                let square = |x: &T| (*x - mean) * (*x - mean);
+                let deviation = (row.iter().map(square).sum::<T>() / len + eps).sqrt();
+                for x in row.iter_mut() {
+                    *x = (*x - mean) / deviation;
+                }
+            });
+            normed * float(1)?.broadcast(IxDyn(shape))? + float(2)?.broadcast(IxDyn(shape))?
+        }
+        // What later passes of the compiler make, and inputs.
+        _ => return None,
+    };
+    Some(Value::Float(value))
+}
+
+/// The same elements, or some of them, in another place.
+fn moved<E: Clone>(
+    op: &Op,
+    mut x: Vec<ArrayViewD<E>>,
+    row: Option<i64>,
+    shape: &[usize],
+) -> Option<ArrayD<E>> {
+    if let Op::Concat { axis } = op {
+        return concatenate(Axis(*axis), &x).ok();
+    }
+    let x = x.swap_remove(0);
+    let reshaped = |x: ArrayViewD<E>| {
+        let x = x.as_standard_layout().into_owned();
+        x.into_shape_with_order(IxDyn(shape)).ok()
+    };
+    match op {
+        Op::Reshape => reshaped(x),
+        Op::Transpose(perm) => Some(x.permuted_axes(IxDyn(perm)).to_owned()),
+        Op::Slice { axis, start } => {
+            let part = Slice::from(*start..start + shape[*axis]);
+            Some(x.slice_axis(Axis(*axis), part).to_owned())
+        }
+        Op::Expand => Some(x.broadcast(IxDyn(shape))?.to_owned()),
+        Op::GatherRow => {
+            let row = usize::try_from(row?).ok()?;
+            let found = (row < x.shape()[0]).then(|| x.index_axis_move(Axis(0), row))?;
+            reshaped(found)
         }
         _ => None,
     }
 }
 
-/// Calls `f` with the offset of each element, in row-major order of `shape`.
-fn each(shape: &[usize], strides: &[usize], offset: usize, f: &mut impl FnMut(usize)) {
-    match (shape, strides) {
-        (&[dim, ref shape @ ..], &[stride, ref strides @ ..]) => {
-            for i in 0..dim {
-                each(shape, strides, offset + i * stride, f);
-            }
-        }
-        _ => f(offset),
-    }
-}
-
-fn gathered(x: &Tensor, shape: &[usize], strides: &[usize], offset: usize) -> Tensor {
-    fn pick<T: Copy>(x: &[T], shape: &[usize], strides: &[usize], offset: usize) -> Vec<T> {
-        let mut y = Vec::with_capacity(shape.iter().product());
-        each(shape, strides, offset, &mut |at| y.push(x[at]));
-        y
-    }
-    let data = match &x.data {
-        Data::F32(x) => Data::F32(pick(x, shape, strides, offset)),
-        Data::I64(x) => Data::I64(pick(x, shape, strides, offset)),
-    };
-    Tensor {
-        shape: shape.to_vec(),
-        data,
-    }
-}
-
-/// Strides of `from` when read with shape `to`: 0 where it broadcasts.
-fn broadcast_strides(from: &[usize], to: &[usize]) -> Vec<usize> {
-    let own = strides(from);
-    let missing = to.len() - from.len();
-    (0..to.len())
-        .map(|i| {
-            i.checked_sub(missing)
-                .map_or(0, |i| if from[i] == 1 { 0 } else { own[i] })
-        })
-        .collect()
-}
-
-fn concat(parts: &[Arc<Tensor>], axis: usize, shape: &[usize]) -> Option<Tensor> {
-    let outer: usize = shape[..axis].iter().product();
-    let chunk = |x: &Tensor| x.shape[axis..].iter().product::<usize>();
-    let data = if matches!(parts[0].data, Data::F32(_)) {
-        let mut y = vec![];
-        for o in 0..outer {
-            for part in parts {
-                y.extend_from_slice(part.as_f32()?.get(o * chunk(part)..(o + 1) * chunk(part))?);
-            }
-        }
-        Data::F32(y)
-    } else {
-        let mut y = vec![];
-        for o in 0..outer {
-            for part in parts {
-                y.extend_from_slice(part.as_i64()?.get(o * chunk(part)..(o + 1) * chunk(part))?);
-            }
-        }
-        Data::I64(y)
-    };
-    Some(Tensor {
-        shape: shape.to_vec(),
-        data,
-    })
-}
-
-fn binary(kind: BinaryKind, a: &Tensor, b: &Tensor, shape: &[usize]) -> Option<Tensor> {
-    let a = gathered(a, shape, &broadcast_strides(&a.shape, shape), 0);
-    let b = gathered(b, shape, &broadcast_strides(&b.shape, shape), 0);
-    match (&a.data, &b.data) {
-        (Data::F32(a), Data::F32(b)) => {
-            let f = |(&a, &b): (&f32, &f32)| match kind {
+fn binary<T: Real>(kind: BinaryKind, x: &[View<T>], shape: &[usize]) -> Option<Value<T>> {
+    match x {
+        [View::Float(a), View::Float(b)] => {
+            let zipped = Zip::from(a.broadcast(IxDyn(shape))?).and(b.broadcast(IxDyn(shape))?);
+            Some(Value::Float(zipped.map_collect(|&a, &b| match kind {
                 BinaryKind::Add => a + b,
                 BinaryKind::Sub => a - b,
                 BinaryKind::Mul => a * b,
@@ -148,10 +277,12 @@ fn binary(kind: BinaryKind, a: &Tensor, b: &Tensor, shape: &[usize]) -> Option<T
                 BinaryKind::Max => a.max(b),
                 BinaryKind::Min => a.min(b),
                 BinaryKind::Pow => a.powf(b),
-            };
-            Some(Tensor::f32(shape, a.iter().zip(b).map(f).collect()))
+                BinaryKind::Greater => T::of(i64::from(a > b)),
+                BinaryKind::Keep if b == T::zero() => T::zero(),
+                BinaryKind::Keep => a,
+            })))
         }
-        (Data::I64(a), Data::I64(b)) => {
+        [View::Int(a), View::Int(b)] => {
             let f = |(&a, &b): (&i64, &i64)| match kind {
                 BinaryKind::Add => a.checked_add(b),
                 BinaryKind::Sub => a.checked_sub(b),
@@ -159,82 +290,100 @@ fn binary(kind: BinaryKind, a: &Tensor, b: &Tensor, shape: &[usize]) -> Option<T
                 BinaryKind::Div => a.checked_div(b),
                 BinaryKind::Max => Some(a.max(b)),
                 BinaryKind::Min => Some(a.min(b)),
-                BinaryKind::Pow => None,
+                BinaryKind::Greater => Some(i64::from(a > b)),
+                BinaryKind::Pow | BinaryKind::Keep => None,
             };
-            let y: Option<Vec<i64>> = a.iter().zip(b).map(f).collect();
-            Some(Tensor::i64(shape, y?))
+            let (a, b) = (a.broadcast(IxDyn(shape))?, b.broadcast(IxDyn(shape))?);
+            let y: Option<Vec<i64>> = a.iter().zip(b.iter()).map(f).collect();
+            Some(Value::Int(ArrayD::from_shape_vec(IxDyn(shape), y?).ok()?))
         }
         _ => None,
     }
 }
 
 /// One element of a [`Unary`].
-pub(crate) fn apply(unary: Unary, x: f32) -> f32 {
+pub(crate) fn apply<T: Real>(unary: Unary, x: T) -> T {
+    let (zero, one) = (T::zero(), T::one());
+    let alpha = T::exact(f32::from_bits(unary.alpha));
+    let softplus = |x: T| x.max(zero) + (-x.abs()).exp().ln_1p();
     match unary.kind.0 {
-        UnaryKind::Relu => x.max(0.0),
-        UnaryKind::LeakyRelu => {
-            if x < 0.0 {
-                f32::from_bits(unary.alpha) * x
-            } else {
-                x
-            }
-        }
+        UnaryKind::Relu => x.max(zero),
+        UnaryKind::LeakyRelu if x < zero => alpha * x,
+        UnaryKind::Elu if x < zero => alpha * x.exp_m1(),
+        UnaryKind::LeakyRelu | UnaryKind::Elu => x,
         UnaryKind::Tanh => x.tanh(),
-        UnaryKind::Sigmoid => 1.0 / (1.0 + (-x).exp()),
+        UnaryKind::Sigmoid => one / (one + (-x).exp()),
         UnaryKind::Exp => x.exp(),
         UnaryKind::Log => x.ln(),
         UnaryKind::Sqrt => x.sqrt(),
-        UnaryKind::Rsqrt => 1.0 / x.sqrt(),
+        UnaryKind::Rsqrt => one / x.sqrt(),
         UnaryKind::Neg => -x,
         UnaryKind::Abs => x.abs(),
-        UnaryKind::Recip => 1.0 / x,
-        UnaryKind::Erf => lads_kernels::math::erf(x),
+        UnaryKind::Recip => one / x,
+        UnaryKind::Erf => x.erf(),
         UnaryKind::Square => x * x,
+        UnaryKind::Softplus => softplus(x),
+        UnaryKind::Mish => x * softplus(x).tanh(),
+        UnaryKind::Trunc => x.trunc(),
     }
 }
 
-fn reduce(kind: ReduceKind, x: &Tensor, axis: usize, shape: &[usize]) -> Option<Tensor> {
-    let data = x.as_f32()?;
-    let len = x.shape[axis];
-    let inner: usize = x.shape[axis + 1..].iter().product();
-    let outer: usize = x.shape[..axis].iter().product();
-    let mut y = Vec::with_capacity(outer * inner);
-    for o in 0..outer {
-        for i in 0..inner {
-            let row = (0..len).map(|a| data[(o * len + a) * inner + i]);
-            y.push(match kind {
-                ReduceKind::Sum => row.sum(),
-                ReduceKind::Mean => row.sum::<f32>() / len as f32,
-                ReduceKind::Max => row.fold(f32::NEG_INFINITY, f32::max),
-                ReduceKind::Min => row.fold(f32::INFINITY, f32::min),
-                ReduceKind::Prod => row.product(),
-            });
+/// A copy whose rows over the last axis were changed.
+fn by_rows<T: Real>(x: &ArrayViewD<T>, change: impl Fn(&mut [T])) -> ArrayD<T> {
+    let mut y = x.as_standard_layout().into_owned();
+    let len = y.shape().last().copied().unwrap_or(1).max(1);
+    if let Some(all) = y.as_slice_mut() {
+        all.chunks_exact_mut(len).for_each(change);
+    }
+    y
+}
+
+/// Index of the first smallest or largest element.
+fn best<T: Real>(x: &ArrayViewD<T>, largest: bool) -> i64 {
+    let mut found = (0, T::nan());
+    for (i, &value) in x.iter().enumerate() {
+        let better = if largest {
+            value > found.1
+        } else {
+            value < found.1
+        };
+        if i == 0 || better {
+            found = (i as i64, value);
         }
     }
-    Some(Tensor::f32(shape, y))
+    found.0
 }
 
-fn matmul(a: &Tensor, b: &Tensor, shape: &[usize]) -> Option<Tensor> {
+/// Products over the last two axes, the others broadcast.
+fn matmul<T: Real>(a: &ArrayViewD<T>, b: &ArrayViewD<T>, shape: &[usize]) -> Option<ArrayD<T>> {
     let (batch, &[m, n]) = shape.split_last_chunk::<2>()?;
-    let k = *a.shape.last()?;
-    let (da, db) = (a.as_f32()?, b.as_f32()?);
-    let matrices = |x: &Tensor, rows: usize, cols: usize| {
-        let mut offsets = vec![];
-        let lead = &x.shape[..x.shape.len() - 2];
-        let steps: Vec<usize> = broadcast_strides(lead, batch)
-            .iter()
-            .map(|stride| stride * rows * cols)
-            .collect();
-        each(batch, &steps, 0, &mut |at| offsets.push(at));
-        offsets
+    let k = *a.shape().last()?;
+    let count = batch.iter().product::<usize>();
+    let matrices = |x: &ArrayViewD<T>, rows: usize, cols: usize| {
+        let wanted = [batch, &[rows, cols]].concat();
+        let wide = x.broadcast(IxDyn(&wanted))?;
+        let wide = wide.as_standard_layout().into_owned();
+        wide.into_shape_with_order((count, rows, cols)).ok()
     };
-    let mut y = Vec::with_capacity(shape.iter().product());
-    for (a, b) in matrices(a, m, k).into_iter().zip(matrices(b, k, n)) {
-        for i in 0..m {
-            for j in 0..n {
-                y.push((0..k).map(|l| da[a + i * k + l] * db[b + l * n + j]).sum());
+    let (a, b) = (matrices(a, m, k)?, matrices(b, k, n)?);
+    let mut y = Vec::with_capacity(count * m * n);
+    for (a, b) in a.outer_iter().zip(b.outer_iter()) {
+        for row in a.outer_iter() {
+            // Row by row of `b`: each sum still goes from the first product to the last.
+            let products = row.iter().zip(b.outer_iter());
+            let mut sums: Option<Vec<T>> = None;
+            for (&factor, of) in products {
+                match &mut sums {
+                    None => sums = Some(of.iter().map(|&x| factor * x).collect()),
+                    Some(sums) => {
+                        for (sum, &x) in sums.iter_mut().zip(of) {
+                            *sum += factor * x;
+                        }
+                    }
+                }
             }
+            y.extend(sums?);
         }
     }
-    Some(Tensor::f32(shape, y))
+    ArrayD::from_shape_vec(IxDyn(shape), y).ok()
 }

@@ -113,6 +113,8 @@ impl<'g> Rewriter<'g> {
             Op::Expand => new.expand(x[0], &node.shape)?,
             Op::Shift(by) => new.shift(x[0], *by)?,
             Op::GatherRow => new.gather_row(x[0], x[1])?,
+            Op::ToIndex => new.index_of(x[0])?,
+            Op::FromIndex => new.number_of(x[0])?,
             Op::ArgMin | Op::ArgMax => new.arg(node.op.clone(), x[0])?,
             Op::Linear { .. } => new.linear(node.op.clone(), x.to_vec())?,
             Op::Attention { .. } | Op::Record { .. } => new.cached(node.op.clone(), x.to_vec()),

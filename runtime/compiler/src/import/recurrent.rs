@@ -50,11 +50,12 @@ impl Kind {
 struct Cell {
     kind: Kind,
     input: Id,
-    recurrent: Id,
+    /// All gates of an LSTM; of a GRU z and r, then h.
+    recurrent: Vec<Id>,
     /// Added to the input's share.
     bias: Option<Id>,
-    /// Added to the hidden state's share, where it is not part of `bias`.
-    recurrent_bias: Option<Id>,
+    /// Added to the hidden state's shares, where it is not part of `bias`; empty for none.
+    recurrent_bias: Vec<Id>,
     hidden: usize,
 }
 
@@ -187,7 +188,16 @@ fn cell(g: &mut Graph, x: &Operands, direction: usize, kind: Kind) -> Result<Cel
             "has recurrent weights of shape {shape:?}, not hidden by {gates} hidden"
         ));
     }
-    let (mut bias, mut recurrent_bias) = (None, None);
+    let parts = |g: &mut Graph, id: Id, axis: usize| -> Result<Vec<Id>, String> {
+        Ok(match kind {
+            Kind::Lstm => vec![id],
+            Kind::Gru { .. } => vec![
+                g.slice(id, axis, 0, 2 * hidden)?,
+                g.slice(id, axis, 2 * hidden, hidden)?,
+            ],
+        })
+    };
+    let (mut bias, mut recurrent_bias) = (None, vec![]);
     if let Some(id) = x.optional(3) {
         let len = gates * hidden;
         let own = g.slice(id, 0, direction, 1)?;
@@ -196,13 +206,14 @@ fn cell(g: &mut Graph, x: &Operands, direction: usize, kind: Kind) -> Result<Cel
         if kind == Kind::Lstm {
             bias = Some(g.binary(BinaryKind::Add, input, recurrent)?);
         } else {
-            (bias, recurrent_bias) = (Some(input), Some(recurrent));
+            bias = Some(input);
+            recurrent_bias = parts(g, recurrent, 0)?;
         }
     }
     Ok(Cell {
         kind,
         input,
-        recurrent,
+        recurrent: parts(g, recurrent, 1)?,
         bias,
         recurrent_bias,
         hidden,
@@ -260,7 +271,7 @@ fn lstm_step(
     let n = cell.hidden;
     let mut gates = share;
     if let Some(h) = h {
-        let recurrent = g.matmul(h, cell.recurrent)?;
+        let recurrent = g.matmul(h, cell.recurrent[0])?;
         gates = g.binary(BinaryKind::Add, recurrent, gates)?;
     }
     let open = g.slice(gates, 1, 0, 3 * n)?;
@@ -291,15 +302,13 @@ fn gru_step(
 ) -> Result<Id, String> {
     let n = cell.hidden;
     let sigmoid = Unary::of(UnaryKind::Sigmoid);
-    // The hidden state's share of gates `from..to`, with its bias; nothing without either.
-    let recurrent = |g: &mut Graph, h: Option<Id>, from: usize, to: usize| {
+    // The hidden state's share of z and r or of h, with its bias; nothing without either.
+    let recurrent = |g: &mut Graph, h: Option<Id>, part: usize| {
         let mut sum = None;
         if let Some(h) = h {
-            let weights = g.slice(cell.recurrent, 1, from * n, (to - from) * n)?;
-            sum = Some(g.matmul(h, weights)?);
+            sum = Some(g.matmul(h, cell.recurrent[part])?);
         }
-        if let Some(bias) = cell.recurrent_bias {
-            let bias = g.slice(bias, 0, from * n, (to - from) * n)?;
+        if let Some(&bias) = cell.recurrent_bias.get(part) {
             sum = Some(match sum {
                 Some(sum) => g.binary(BinaryKind::Add, sum, bias)?,
                 None => bias,
@@ -308,14 +317,14 @@ fn gru_step(
         Ok::<_, String>(sum)
     };
     let mut gates = g.slice(share, 1, 0, 2 * n)?;
-    if let Some(sum) = recurrent(g, h, 0, 2)? {
+    if let Some(sum) = recurrent(g, h, 0)? {
         gates = g.binary(BinaryKind::Add, sum, gates)?;
     }
     let gates = g.unary(sigmoid, gates)?;
     let (z, r) = (g.slice(gates, 1, 0, n)?, g.slice(gates, 1, n, n)?);
     let mut candidate = g.slice(share, 1, 2 * n, n)?;
     let added = if linear_before_reset {
-        match recurrent(g, h, 2, 3)? {
+        match recurrent(g, h, 1)? {
             Some(sum) => Some(g.binary(BinaryKind::Mul, r, sum)?),
             None => None,
         }
@@ -324,7 +333,7 @@ fn gru_step(
             Some(h) => Some(g.binary(BinaryKind::Mul, r, h)?),
             None => None,
         };
-        recurrent(g, reset, 2, 3)?
+        recurrent(g, reset, 1)?
     };
     if let Some(added) = added {
         candidate = g.binary(BinaryKind::Add, candidate, added)?;

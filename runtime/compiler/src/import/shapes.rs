@@ -4,9 +4,12 @@ use std::sync::Arc;
 
 use super::Operands;
 use super::attributes::Attributes;
+use super::constants::{cast, constant, eye_like, filled, range};
+use super::indices::{gather, gather_nd, slice, split};
 use super::operators::Outputs;
-use crate::graph::{Dim, Graph, Id, Type, show};
-use crate::tensor::{Data, MAX_ELEMENTS, Tensor};
+use super::parts::{pad, scatter, tile};
+use crate::graph::{Dim, Graph, Id, show};
+use crate::tensor::Tensor;
 
 /// What is said of an operator that is not known.
 pub(super) const UNKNOWN: &str =
@@ -18,12 +21,11 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
     match operator {
         "Identity" => Ok(vec![x.get(0)?]),
         "Dropout" => {
-            // Identity unless training.
+            // Identity unless training; the ratio is an attribute in operator sets before 12.
             a.int("seed", 0)?;
+            a.float("ratio", 0.5)?;
             let training = x.optional(2).and_then(|id| g.constant(id).cloned());
-            if x.optional(2).is_some()
-                && training.is_none_or(|flag| flag.data != Data::I64(vec![0]))
-            {
+            if x.optional(2).is_some() && training.is_none_or(|flag| flag.uniform() != Some(0.0)) {
                 return Err("supports inference only".into());
             }
             Ok(vec![x.get(0)?])
@@ -35,14 +37,27 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
             let shape = g
                 .known_shape(x.get(0)?)
                 .ok_or("supports static shapes only")?;
-            if a.int("start", 0)? != 0 || a.int("end", i64::MAX)? != i64::MAX {
-                return Err("supports whole shapes only".into());
-            }
+            let rank = shape.len() as i64;
+            let at = |i: i64| (if i < 0 { i.saturating_add(rank) } else { i }).clamp(0, rank);
+            let (start, end) = (at(a.int("start", 0)?), at(a.int("end", i64::MAX)?));
             let dims: Vec<i64> = shape.iter().map(|&dim| dim as i64).collect();
+            let dims = dims[start as usize..end.max(start) as usize].to_vec();
+            if dims.is_empty() {
+                return Err("gives no axis".into());
+            }
             Ok(vec![
                 g.add_const(Arc::new(Tensor::i64(&[dims.len()], dims))),
             ])
         }
+        "Size" => {
+            let shape = g
+                .known_shape(x.get(0)?)
+                .ok_or("supports static shapes only")?;
+            let size = shape.iter().product::<usize>() as i64;
+            Ok(vec![g.add_const(Arc::new(Tensor::i64(&[], vec![size])))])
+        }
+        "Range" => range(g, x),
+        "EyeLike" => eye_like(g, x, a),
         "Reshape" => one(reshape(g, x, a)),
         "Flatten" => one(flatten(g, x, a)),
         "Squeeze" => one(squeeze(g, x, a)),
@@ -73,8 +88,12 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
             one(g.concat(&parts, along))
         }
         "Split" => split(g, x, a),
-        "Slice" => one(slice(g, x)),
+        "Slice" => one(slice(g, x, a)),
+        "Pad" => one(pad(g, x, a)),
+        "Tile" => one(tile(g, x)),
+        "ScatterND" => one(scatter(g, x, a)),
         "Gather" => one(gather(g, x, a)),
+        "GatherND" => one(gather_nd(g, x, a)),
         _ => Err(UNKNOWN.into()),
     }
 }
@@ -85,7 +104,7 @@ pub(super) fn axis(g: &Graph, x: Id, axis: i64) -> Result<usize, String> {
         .ok_or_else(|| format!("names axis {axis} of {}", show(g.shape(x))))
 }
 
-fn within(axis: i64, rank: usize) -> Option<usize> {
+pub(super) fn within(axis: i64, rank: usize) -> Option<usize> {
     let axis = if axis < 0 {
         axis.checked_add(rank as i64)?
     } else {
@@ -94,75 +113,24 @@ fn within(axis: i64, rank: usize) -> Option<usize> {
     usize::try_from(axis).ok().filter(|&axis| axis < rank)
 }
 
+/// The number of elements.
+pub(super) fn volume(dims: &[Dim]) -> Result<Dim, String> {
+    let mut lens = dims.iter().map(|dim| dim.known());
+    lens.try_fold(1_usize, |all, len| all.checked_mul(len?))
+        .map(Dim::of)
+        .ok_or_else(|| "supports static shapes only".into())
+}
+
 /// Constant integers, if the input is there.
 pub(super) fn integers(g: &Graph, id: Option<Id>) -> Result<Option<Vec<i64>>, String> {
     id.map(|id| wanted(g, id)).transpose()
 }
 
-fn wanted(g: &Graph, id: Id) -> Result<Vec<i64>, String> {
+pub(super) fn wanted(g: &Graph, id: Id) -> Result<Vec<i64>, String> {
     let tensor = g.constant(id).and_then(|tensor| tensor.as_i64());
     tensor
         .map(<[i64]>::to_vec)
         .ok_or_else(|| "needs constant shapes, axes and indices".into())
-}
-
-fn cast(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
-    use crate::onnx::data_type::{FLOAT, INT32, INT64, name};
-    let value = x.get(0)?;
-    let to = a.int("to", 0)?;
-    a.only("saturate", 1)?;
-    let to = i32::try_from(to).unwrap_or(0);
-    match (g.ty(value), to) {
-        (Type::F32, FLOAT) | (Type::I64, INT64 | INT32) => return Ok(vec![value]),
-        _ => {}
-    }
-    let shape = g.known_shape(value);
-    let (Some(tensor), Some(shape)) = (g.constant(value).cloned(), shape) else {
-        return Err(format!("to {} is supported for constants only", name(to)));
-    };
-    let cast = match (&tensor.data, to) {
-        (Data::I64(data), FLOAT) => Tensor::f32(&shape, data.iter().map(|&x| x as f32).collect()),
-        (Data::F32(data), INT64 | INT32) => {
-            Tensor::i64(&shape, data.iter().map(|&x| x as i64).collect())
-        }
-        _ => return Err(format!("to {} is not supported", name(to))),
-    };
-    Ok(vec![g.add_const(Arc::new(cast))])
-}
-
-fn constant(g: &mut Graph, a: &Attributes) -> Outputs {
-    let tensor = if let Some(tensor) = a.tensor("value")? {
-        tensor
-    } else if let Some(values) = a.floats("value_floats")? {
-        Arc::new(Tensor::f32(&[values.len()], values.to_vec()))
-    } else if let Some(values) = a.ints("value_ints")? {
-        Arc::new(Tensor::i64(&[values.len()], values.to_vec()))
-    } else {
-        let (float, int) = (
-            a.float("value_float", f32::NAN)?,
-            a.int("value_int", i64::MIN)?,
-        );
-        match (float.is_nan(), int) {
-            (false, _) => Arc::new(Tensor::scalar(float)),
-            (true, i64::MIN) => return Err("has no value that is supported".into()),
-            (true, int) => Arc::new(Tensor::i64(&[], vec![int])),
-        }
-    };
-    Ok(vec![g.add_const(tensor)])
-}
-
-fn filled(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
-    let shape = wanted(g, x.get(0)?)?;
-    let shape: Option<Vec<usize>> = shape.iter().map(|&dim| usize::try_from(dim).ok()).collect();
-    let shape = shape.filter(|shape| crate::tensor::elements(shape).is_some());
-    let shape = shape.ok_or_else(|| format!("needs a shape of at most {MAX_ELEMENTS} elements"))?;
-    let value = a
-        .tensor("value")?
-        .unwrap_or_else(|| Arc::new(Tensor::f32(&[1], vec![0.0])));
-    let id = g.add_const(value);
-    let dims: Vec<Dim> = shape.iter().map(|&dim| Dim::of(dim)).collect();
-    let single = g.reshape(id, &[])?;
-    g.expand(single, &dims).map(|y| vec![y])
 }
 
 fn reshape(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> {
@@ -265,107 +233,4 @@ fn unsqueeze(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> 
         })
         .collect();
     g.reshape(value, &shape.ok_or("names an axis twice")?)
-}
-
-fn split(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
-    let value = x.get(0)?;
-    let along = axis(g, value, a.int("axis", 0)?)?;
-    let whole = g.shape(value)[along]
-        .known()
-        .ok_or("supports axes of known length only")?;
-    let outputs = x.outputs;
-    a.only("num_outputs", outputs as i64)?;
-    let lens = match a.ints("split")? {
-        Some(lens) => lens.to_vec(),
-        None => integers(g, x.optional(1))?.unwrap_or_else(|| {
-            // Equal parts, the last one smaller.
-            let part = whole.div_ceil(outputs.max(1));
-            (0..outputs)
-                .map(|i| (whole.saturating_sub(i * part)).min(part) as i64)
-                .collect()
-        }),
-    };
-    let mut start = 0;
-    let mut parts = vec![];
-    for len in lens {
-        let len = usize::try_from(len).map_err(|_| format!("has a part of length {len}"))?;
-        parts.push(g.slice(value, along, start, len)?);
-        start += len;
-    }
-    if start != whole || parts.len() != outputs {
-        return Err(format!(
-            "splits {whole} elements into {outputs} parts of {start} in all"
-        ));
-    }
-    Ok(parts)
-}
-
-fn slice(g: &mut Graph, x: &Operands) -> Result<Id, String> {
-    let mut value = x.get(0)?;
-    let (starts, ends) = (wanted(g, x.get(1)?)?, wanted(g, x.get(2)?)?);
-    let axes = integers(g, x.optional(3))?.unwrap_or_else(|| (0..starts.len() as i64).collect());
-    let steps = integers(g, x.optional(4))?.unwrap_or_else(|| vec![1; starts.len()]);
-    if ends.len() != starts.len() || axes.len() != starts.len() || steps.len() != starts.len() {
-        return Err("has starts, ends, axes and steps of different lengths".into());
-    }
-    for (((start, end), along), step) in starts.into_iter().zip(ends).zip(axes).zip(steps) {
-        let along = axis(g, value, along)?;
-        let len = g.shape(value)[along]
-            .known()
-            .ok_or("supports axes of known length only")? as i64;
-        if step != 1 {
-            return Err(format!("supports step 1 only, not {step}"));
-        }
-        let clamp = |at: i64| {
-            if at < 0 {
-                at.saturating_add(len).max(0)
-            } else {
-                at.min(len)
-            }
-        };
-        let (start, end) = (clamp(start), clamp(end));
-        value = g.slice(value, along, start as usize, (end - start).max(0) as usize)?;
-    }
-    Ok(value)
-}
-
-fn gather(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> {
-    let (value, index) = (x.get(0)?, x.get(1)?);
-    let along = axis(g, value, a.int("axis", 0)?)?;
-    let index_shape = g.shape(index).to_vec();
-    if g.ty(index) != Type::I64 {
-        return Err("needs integer indices".into());
-    }
-    let before = g.shape(value)[..along].to_vec();
-    let after = g.shape(value)[along + 1..].to_vec();
-    let shape = [&before[..], &index_shape, &after].concat();
-    let Some(rows) = g
-        .constant(index)
-        .and_then(|tensor| tensor.as_i64())
-        .map(<[i64]>::to_vec)
-    else {
-        if along != 0 {
-            return Err("with an index that is not constant is supported along axis 0 only".into());
-        }
-        let row = g.gather_row(value, index)?;
-        return g.reshape(row, &shape);
-    };
-    let len = g.shape(value)[along]
-        .known()
-        .ok_or("supports axes of known length only")?;
-    let rows: Option<Vec<usize>> = rows.iter().map(|&row| within(row, len)).collect();
-    let rows = rows
-        .filter(|rows| !rows.is_empty())
-        .ok_or_else(|| format!("has indices outside 0..{len}"))?;
-    let consecutive = rows.windows(2).all(|pair| pair[0] + 1 == pair[1]);
-    let picked = if consecutive {
-        g.slice(value, along, rows[0], rows.len())?
-    } else {
-        let parts = rows
-            .iter()
-            .map(|&row| g.slice(value, along, row, 1))
-            .collect::<Result<Vec<_>, _>>()?;
-        g.concat(&parts, along)?
-    };
-    g.reshape(picked, &shape)
 }

@@ -6,7 +6,7 @@
 use std::collections::{BTreeSet, HashMap, HashSet};
 
 use super::attributes::Attributes;
-use super::{Builder, MAX_NODES, Model, Operands, node_name, operators, shapes};
+use super::{Builder, MAX_NODES, Model, Operands, node_name, operators, sequences, shapes};
 use crate::entries;
 use crate::graph::{Dim, Graph, Type, show};
 use crate::onnx::{GraphProto, NodeProto};
@@ -25,8 +25,8 @@ pub(crate) struct Refused {
 pub(crate) type Declared<'d> = HashMap<&'d str, (Type, Vec<Dim>)>;
 
 /// Tries all nodes that the graph's outputs need. Values of entries are tried entry by entry, as they are compiled.
-pub(crate) fn trial(graph: &GraphProto, declared: &Declared) -> Vec<Refused> {
-    let model = Model::of(graph);
+pub(crate) fn trial(graph: &GraphProto, opset: i64, declared: &Declared) -> Vec<Refused> {
+    let model = Model::of(graph, opset);
     let order: HashMap<*const NodeProto, usize> = (graph.node.iter().enumerate())
         .map(|(i, node)| (std::ptr::from_ref(node), i))
         .collect();
@@ -72,6 +72,7 @@ impl<'b, 'm> Attempt<'b, 'm> {
                 model,
                 graph: Graph::default(),
                 values: HashMap::new(),
+                sequences: HashMap::new(),
             },
             declared,
             unknown: HashSet::new(),
@@ -105,7 +106,9 @@ impl<'b, 'm> Attempt<'b, 'm> {
             self.builder.node(node).err()
         };
         for name in node.output.iter().filter(|name| !name.is_empty()) {
-            if !self.builder.values.contains_key(name) {
+            let built =
+                self.builder.values.contains_key(name) || self.builder.sequences.contains_key(name);
+            if !built {
                 self.assume(name);
             }
         }
@@ -137,9 +140,13 @@ fn unknown(node: &NodeProto) -> Option<String> {
     if let Some(problem) = super::foreign(node) {
         return Some(problem);
     }
+    if sequences::is_known(&node.op_type) {
+        return None;
+    }
     let nothing = Operands {
         inputs: vec![],
         outputs: node.output.len(),
+        opset: *super::OPSETS.end(),
     };
     let attributes = Attributes::new(&[]).ok()?;
     let tried = operators::translate(&mut Graph::default(), &node.op_type, &nothing, &attributes);

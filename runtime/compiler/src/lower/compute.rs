@@ -1,8 +1,8 @@
 //! The op or view of each kind of node.
 
 use lads_image::op::{
-    self, Activation, ArgMax, ArgMin, Binary, BinaryKind, Copy, GatherRow, LayerNorm, Linear,
-    MatMul, Reduce, ReduceKind, Softmax, Span, UnaryKind, WeightSpan,
+    self, Activation, ArgMax, ArgMin, Binary, BinaryKind, Copy, FromIndex, GatherRow, LayerNorm,
+    Linear, MatMul, Reduce, ReduceKind, Softmax, Span, ToIndex, UnaryKind, WeightSpan,
 };
 
 use super::Lowering;
@@ -18,7 +18,8 @@ pub(super) fn product(shape: &[usize]) -> usize {
 impl Lowering<'_> {
     /// Lowers one node; its operands are lowered.
     pub(super) fn node(&mut self, id: Id) -> Done {
-        if self.g.ty(id) == Type::I64 && !matches!(self.g.op(id), Op::ArgMin | Op::ArgMax) {
+        let computed = matches!(self.g.op(id), Op::ArgMin | Op::ArgMax | Op::ToIndex);
+        if self.g.ty(id) == Type::I64 && !computed {
             return self.integer(id);
         }
         let x = self.g.node(id).inputs.clone();
@@ -65,6 +66,8 @@ impl Lowering<'_> {
                 self.attention(id, &x, layer, f32::from_bits(scale))
             }
             Op::Record { layer, .. } => self.record(x[0], x[1], layer),
+            Op::ToIndex => self.arg(id, x[0], |x, out| ToIndex { x, out }.into()),
+            Op::FromIndex => self.number_of(id, x[0]),
             Op::ArgMin => self.arg(id, x[0], |x, out| ArgMin { x, out }.into()),
             Op::ArgMax => self.arg(id, x[0], |x, out| ArgMax { x, out }.into()),
             Op::Shift(_) => Err("adds to an integer that is none".into()),
@@ -361,6 +364,24 @@ impl Lowering<'_> {
         Ok(())
     }
 
+    fn number_of(&mut self, id: Id, x: Id) -> Done {
+        let shape = self.shape(id)?;
+        let &(index, shift) = self
+            .ints
+            .get(&x)
+            .ok_or("reads an integer that is not computed")?;
+        let shift = i32::try_from(shift).map_err(|_| "adds too much to an index")?;
+        let y = self.allocate(id, &shape);
+        let op = FromIndex {
+            index,
+            shift,
+            y: self.span(&y, 1),
+        };
+        self.ops.push(op.into());
+        self.set(id, y);
+        Ok(())
+    }
+
     fn linear(
         &mut self,
         id: Id,
@@ -438,6 +459,9 @@ fn activation_of(unary: Unary) -> Activation {
         UnaryKind::LeakyRelu => Activation::LeakyRelu(f32::from_bits(unary.alpha)),
         UnaryKind::Tanh => Activation::Tanh,
         UnaryKind::Sigmoid => Activation::Sigmoid,
+        UnaryKind::Elu => Activation::Elu(f32::from_bits(unary.alpha)),
+        UnaryKind::Softplus => Activation::Softplus,
+        UnaryKind::Mish => Activation::Mish,
         // The fusion takes in no other.
         _ => Activation::None,
     }

@@ -123,6 +123,9 @@ impl<'w> Machine<'w> {
                         }
                         Activation::Tanh => element(UnaryKind::Tanh, 0.0, sum as f32),
                         Activation::Sigmoid => element(UnaryKind::Sigmoid, 0.0, sum as f32),
+                        Activation::Elu(alpha) => element(UnaryKind::Elu, alpha, sum as f32),
+                        Activation::Softplus => element(UnaryKind::Softplus, 0.0, sum as f32),
+                        Activation::Mish => element(UnaryKind::Mish, 0.0, sum as f32),
                     };
                     y.push(if op.accumulate {
                         self.get(op.y)[i] + sum
@@ -219,6 +222,11 @@ impl<'w> Machine<'w> {
                     self.arena[op.y.offset as usize + to] = x[from];
                 }
             }
+            Op::ToIndex(op) => self.ints[usize::from(op.out.0)] = self.get(op.x)[0] as i64,
+            Op::FromIndex(op) => {
+                let number = self.ints[usize::from(op.index.0)] + i64::from(op.shift);
+                self.put(op.y, &[number as f32]);
+            }
             Op::ArgMin(op) => {
                 self.ints[usize::from(op.out.0)] = first_best(self.get(op.x), |a, b| a < b);
             }
@@ -272,6 +280,8 @@ fn lads_kernels_kind(kind: lads_image::op::BinaryKind) -> lads_kernels::BinaryKi
         Core::Max => Kernel::Max,
         Core::Min => Kernel::Min,
         Core::Pow => Kernel::Pow,
+        Core::Greater => Kernel::Greater,
+        Core::Keep => Kernel::Keep,
     }
 }
 

@@ -221,6 +221,21 @@ fn onnx_node_cases() {
     let without: Vec<&str> = (documented.split_whitespace())
         .filter(|operator| !passed.contains_key(*operator))
         .collect();
-    // The package's cases of these search several rows, or convert other types.
-    assert_eq!(without, ["ArgMax", "ArgMin", "Cast"]);
+    // The package's cases of these search several rows, have inputs or sequences that no entry has, or numbers of 64 bits; those of
+    // policy files of the field are compared with ONNX Runtime by `tests/parity/test_import.py`.
+    let left = [
+        "ArgMax",
+        "ArgMin",
+        "ConcatFromSequence",
+        "Einsum",
+        "Not",
+        "SequenceAt",
+        "SequenceConstruct",
+        "SequenceEmpty",
+        "SequenceInsert",
+        "SequenceLength",
+        "SplitToSequence",
+        "Tile",
+    ];
+    assert_eq!(without, left);
 }

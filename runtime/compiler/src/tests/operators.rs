@@ -22,9 +22,20 @@ pub(super) fn compile(small: &Small) -> Result<Compiled, CompileError> {
 
 /// Compiles, runs and compares.
 #[track_caller]
-pub(super) fn agrees(mut small: Small) -> Compiled {
-    let program = compile(&small).unwrap_or_else(|error| panic!("{error}"));
-    let oracle = Oracle::new(&small.bytes(18));
+pub(super) fn agrees(small: Small) -> Compiled {
+    agrees_at(18, small)
+}
+
+/// The same by another operator set.
+#[track_caller]
+pub(super) fn agrees_at(opset: i64, mut small: Small) -> Compiled {
+    let outputs: Vec<String> = (small.signature.outputs.iter())
+        .map(|output| output.name.clone())
+        .collect();
+    let outputs: Vec<&str> = outputs.iter().map(String::as_str).collect();
+    let program = compiled(&small.model(opset), &small.signature, &outputs, Cache::NONE)
+        .unwrap_or_else(|error| panic!("{error}"));
+    let oracle = Oracle::new(&small.bytes(opset));
     let mut machine = Machine::new(&program.placed, &program.weights, vec![]);
     let mut inputs = HashMap::new();
     for input in small.signature.inputs.clone() {

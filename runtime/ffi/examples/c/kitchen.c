@@ -9,6 +9,8 @@
  */
 #define _POSIX_C_SOURCE 200809L
 
+#include "files.h"
+
 #include <lads.h>
 #include <mujoco/mujoco.h>
 
@@ -59,31 +61,6 @@ static bool is_done(int task, const mjtNum *state) {
 static int refuse(const char *thing, const char *why) {
     fprintf(stderr, "kitchen: %s: %s\n", thing, why);
     return 2;
-}
-
-/* Memory that starts on a cache line. */
-static void *lines(size_t bytes) {
-    void *memory = NULL;
-    return posix_memalign(&memory, LADS_WORKSPACE_ALIGN, bytes) == 0 ? memory : NULL;
-}
-
-static unsigned char *read_file(const char *path, size_t *bytes) {
-    FILE *file = fopen(path, "rb");
-    unsigned char *content = NULL;
-    long end = -1;
-    if (file != NULL && fseek(file, 0, SEEK_END) == 0 && (end = ftell(file)) > 0) {
-        *bytes = (size_t)end;
-        content = lines(*bytes);
-        rewind(file);
-        if (content != NULL && fread(content, 1, *bytes, file) != *bytes) {
-            free(content);
-            content = NULL;
-        }
-    }
-    if (file != NULL) {
-        fclose(file);
-    }
-    return content;
 }
 
 /* The next moment of a clock that ticks once a period; returns how many periods have been missed. */

@@ -11,7 +11,7 @@ use crate::place::{Operand, Span};
 
 pub use lads_kernels::BinaryKind;
 
-word_enum_for!(BinaryKind { Add = 0, Sub = 1, Mul = 2, Div = 3, Max = 4, Min = 5, Pow = 6, });
+word_enum_for!(BinaryKind { Add = 0, Sub = 1, Mul = 2, Div = 3, Max = 4, Min = 5, Pow = 6, Greater = 7, Keep = 8, });
 
 record! {
     /// `y[i] = kind(a[i], b[i])` over four dimensions. In place when `y` is exactly the span of a contiguous `a` or `b`.

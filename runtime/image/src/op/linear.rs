@@ -20,6 +20,9 @@ impl Field for Activation {
             Self::LeakyRelu(alpha) => (2, alpha),
             Self::Tanh => (3, 0.0),
             Self::Sigmoid => (4, 0.0),
+            Self::Elu(alpha) => (5, alpha),
+            Self::Softplus => (6, 0.0),
+            Self::Mish => (7, 0.0),
         };
         out.word(kind);
         alpha.put(out);
@@ -34,6 +37,9 @@ impl Field for Activation {
             2 => return Some(Self::LeakyRelu(alpha)),
             3 => Self::Tanh,
             4 => Self::Sigmoid,
+            5 => return Some(Self::Elu(alpha)),
+            6 => Self::Softplus,
+            7 => Self::Mish,
             _ => return None,
         };
         (alpha.to_bits() == 0).then_some(plain)

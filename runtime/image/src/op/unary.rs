@@ -25,6 +25,10 @@ word_enum_for!(UnaryKind {
     Recip = 10,
     Erf = 11,
     Square = 12,
+    Elu = 13,
+    Softplus = 14,
+    Mish = 15,
+    Trunc = 16,
 });
 
 record! {
@@ -32,7 +36,7 @@ record! {
     pub struct Unary {
         /// What is computed.
         pub kind: UnaryKind,
-        /// Slope of `LeakyRelu`; anything for the others.
+        /// Slope of `LeakyRelu`, factor of `Elu`; anything for the others.
         pub alpha: f32,
         /// The operand.
         pub x: Operand,

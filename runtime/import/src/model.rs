@@ -1,0 +1,388 @@
+//! The policy files themselves: read, their external data brought in, their values listed.
+//!
+//! What can fail: a file is no ONNX model, or one that is cut off; external data is missing, short, larger than it says, or lies outside the
+//! model's folder; names are given twice, nodes form a cycle, a weight is no number. Each is a problem with its name.
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Component, Path, PathBuf};
+
+use bytes::Bytes;
+use lads_compiler::onnx::{
+    self, DimensionProto, GraphProto, ModelProto, TensorProto, ValueInfoProto, data_type,
+};
+use lads_compiler::{BundleError, survey};
+use prost::Message as _;
+
+use crate::problem::Problems;
+
+/// A policy file.
+pub(crate) struct Model {
+    /// The file's name without its ending, which tells values of several files apart.
+    pub stem: String,
+    pub path: PathBuf,
+    pub proto: ModelProto,
+    pub sha256: String,
+}
+
+/// A value that a graph reads or gives.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Edge {
+    /// Index of the file.
+    pub file: usize,
+    pub name: String,
+    pub elem_type: i32,
+    pub dims: Vec<usize>,
+}
+
+impl Edge {
+    pub fn len(&self) -> usize {
+        self.dims.iter().product()
+    }
+}
+
+/// Largest number of elements of a value at a graph's edge.
+const MAX_LEN: usize = 1 << 20;
+
+impl Model {
+    /// Reads a file. What is wrong inside of it is added to the problems; an error is what makes reading on senseless.
+    pub fn read(path: &Path, problems: &mut Problems) -> Result<Self, BundleError> {
+        let named = |source: BundleError| BundleError::File {
+            path: path.into(),
+            source: Box::new(source),
+        };
+        let bytes =
+            lads_host::input::read(path).map_err(|error| named(BundleError::Read(error)))?;
+        let sha256 = lads_compiler::sha256(&bytes);
+        let mut proto = onnx::decode(&Bytes::from(bytes)).map_err(named)?;
+        if let Some(graph) = &mut proto.graph {
+            let folder = path
+                .parent()
+                .filter(|folder| !folder.as_os_str().is_empty());
+            bring_in(graph, folder.unwrap_or(Path::new(".")), problems);
+            check(graph, problems);
+        }
+        let stem = path.file_stem().unwrap_or_default();
+        Ok(Self {
+            stem: stem.to_string_lossy().into_owned(),
+            path: path.into(),
+            proto,
+            sha256,
+        })
+    }
+
+    /// Nodes that the compiler does not take, with the lengths of the axes that are known by now.
+    pub fn operators(
+        &self,
+        axes: &BTreeMap<String, usize>,
+        problems: &mut Problems,
+    ) -> Result<(), BundleError> {
+        let mut proto = self.proto.clone();
+        let inputs = proto.graph.iter_mut().flat_map(|graph| &mut graph.input);
+        let shapes =
+            inputs.filter_map(|value| value.r#type.as_mut()?.tensor_type.as_mut()?.shape.as_mut());
+        for dim in shapes.flat_map(|shape| &mut shape.dim) {
+            let name = dim.dim_param.as_deref().unwrap_or("");
+            if let Some(&len) = axes.get(name) {
+                (dim.dim_value, dim.dim_param) = (Some(len as i64), None);
+            }
+        }
+        for operator in survey(&proto.encode_to_vec())?.missing.operators {
+            problems.add(
+                format!("node `{}`", operator.node),
+                format!("operator {} {}", operator.operator, operator.problem),
+            );
+        }
+        Ok(())
+    }
+
+    pub fn graph(&self) -> &GraphProto {
+        static NONE: std::sync::OnceLock<GraphProto> = std::sync::OnceLock::new();
+        // Always there: reading asked for it.
+        self.proto
+            .graph
+            .as_ref()
+            .unwrap_or_else(|| NONE.get_or_init(GraphProto::default))
+    }
+
+    /// Metadata of the file.
+    pub fn metadata(&self) -> impl Iterator<Item = (&str, &str)> {
+        let pairs = self.proto.metadata_props.iter();
+        pairs.map(|pair| (pair.key.as_str(), pair.value.as_str()))
+    }
+
+    /// The inputs, without those that are weights, and the outputs.
+    pub fn edges(
+        &self,
+        file: usize,
+        axes: &BTreeMap<String, usize>,
+        problems: &mut Problems,
+    ) -> (Vec<Edge>, Vec<Edge>) {
+        let graph = self.graph();
+        let weights: HashSet<&str> = graph
+            .initializer
+            .iter()
+            .map(|tensor| tensor.name.as_str())
+            .collect();
+        let mut edge = |value: &ValueInfoProto, input: bool| {
+            edge(file, value, axes)
+                .map_err(|problem| {
+                    let kind = if input { "input" } else { "output" };
+                    // An output that is not used may be anything.
+                    if input {
+                        problems.add(format!("{kind} `{}`", value.name), problem);
+                    }
+                })
+                .ok()
+        };
+        let inputs = graph
+            .input
+            .iter()
+            .filter(|value| !weights.contains(value.name.as_str()))
+            .filter_map(|value| edge(value, true))
+            .collect();
+        let outputs = graph.output.iter().filter_map(|value| edge(value, false));
+        (inputs, outputs.collect())
+    }
+}
+
+fn edge(
+    file: usize,
+    value: &ValueInfoProto,
+    axes: &BTreeMap<String, usize>,
+) -> Result<Edge, String> {
+    let tensor = value.r#type.as_ref().and_then(|ty| ty.tensor_type.as_ref());
+    let tensor = tensor.ok_or("is no tensor; export the policy with tensors at its edge")?;
+    let shape = tensor
+        .shape
+        .as_ref()
+        .ok_or("has no shape; export the policy with static shapes")?;
+    let mut dims = vec![];
+    for (axis, dim) in shape.dim.iter().enumerate() {
+        dims.push(length(axis, dim, axes)?);
+    }
+    let len = dims
+        .iter()
+        .try_fold(1_usize, |len, &dim| len.checked_mul(dim));
+    if !len.is_some_and(|len| (1..=MAX_LEN).contains(&len)) {
+        return Err(format!(
+            "has shape {dims:?}, which has no elements or more than {MAX_LEN}"
+        ));
+    }
+    Ok(Edge {
+        file,
+        name: value.name.clone(),
+        elem_type: tensor.elem_type,
+        dims,
+    })
+}
+
+/// The length of an axis; the first one, if it has a name, is a batch of one.
+fn length(
+    axis: usize,
+    dim: &DimensionProto,
+    axes: &BTreeMap<String, usize>,
+) -> Result<usize, String> {
+    let name = dim.dim_param.as_deref().unwrap_or("");
+    if let Some(&len) = axes.get(name) {
+        return Ok(len);
+    }
+    match dim.dim_value {
+        Some(len) if len > 0 => Ok(usize::try_from(len).unwrap_or(usize::MAX)),
+        Some(len) if dim.dim_param.is_none() && !(len == 0 && axis == 0) => {
+            Err(format!("has length {len} along axis {axis}"))
+        }
+        _ if axis == 0 => Ok(1),
+        _ if name.is_empty() => Err(format!(
+            "has an axis {axis} of unknown length; export the policy with static shapes"
+        )),
+        _ => Err(format!(
+            "has an axis `{name}` of unknown length: say `axes.{name} = LENGTH`"
+        )),
+    }
+}
+
+/// Puts the elements of external tensors into the model.
+fn bring_in(graph: &mut GraphProto, folder: &Path, problems: &mut Problems) {
+    let mut files: HashMap<PathBuf, File> = HashMap::new();
+    for tensor in &mut graph.initializer {
+        if tensor.data_location == 0 && tensor.external_data.is_empty() {
+            continue;
+        }
+        match external(tensor, folder, &mut files) {
+            Ok(raw) => {
+                tensor.raw_data = raw.into();
+                tensor.data_location = 0;
+                tensor.external_data.clear();
+            }
+            Err(problem) => problems.add(format!("weight `{}`", tensor.name), problem),
+        }
+    }
+}
+
+fn external(
+    tensor: &TensorProto,
+    folder: &Path,
+    files: &mut HashMap<PathBuf, File>,
+) -> Result<Vec<u8>, String> {
+    let field = |key: &str| {
+        let pair = tensor.external_data.iter().find(|pair| pair.key == key);
+        pair.map(|pair| pair.value.as_str())
+    };
+    let number = |key: &str| {
+        field(key)
+            .map(str::parse::<u64>)
+            .transpose()
+            .map_err(|_| format!("says a {key} of external data that is no number"))
+    };
+    let location = field("location").ok_or("says no location of its external data")?;
+    let relative = Path::new(location);
+    let inside = relative
+        .components()
+        .all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
+    if !inside {
+        return Err(format!(
+            "has external data in `{location}`, outside the model's folder, which is not read; export the weights beside the model"
+        ));
+    }
+    let path = folder.join(relative);
+    let (Ok(resolved), Ok(home)) = (path.canonicalize(), folder.canonicalize()) else {
+        return Err(format!(
+            "has external data in `{location}`, which is missing; put that file beside the model"
+        ));
+    };
+    if !resolved.starts_with(&home) || !resolved.is_file() {
+        return Err(format!(
+            "has external data in `{location}`, which leads out of the model's folder or is no file; put the file itself there"
+        ));
+    }
+    let (offset, wanted) = (number("offset")?.unwrap_or(0), expected(tensor)?);
+    let length = number("length")?.unwrap_or(wanted);
+    if length != wanted {
+        return Err(format!(
+            "has {length} bytes of external data, its type and shape need {wanted}; export it again"
+        ));
+    }
+    if !files.contains_key(&resolved) {
+        let file = File::open(&resolved).map_err(|error| format!("`{location}`: {error}"))?;
+        files.insert(resolved.clone(), file);
+    }
+    let file = files.get_mut(&resolved).ok_or("cannot be read")?;
+    let size = file.metadata().map_or(0, |metadata| metadata.len());
+    if offset.checked_add(length).is_none_or(|end| end > size) {
+        return Err(format!(
+            "needs bytes {offset} to {} of `{location}`, which has {size}; copy it again",
+            offset.saturating_add(length)
+        ));
+    }
+    let mut raw = vec![0; length as usize];
+    file.seek(SeekFrom::Start(offset))
+        .and_then(|_| file.read_exact(&mut raw))
+        .map_err(|error| format!("`{location}`: {error}"))?;
+    Ok(raw)
+}
+
+/// Bytes that a tensor's elements take.
+fn expected(tensor: &TensorProto) -> Result<u64, String> {
+    let size = match tensor.data_type {
+        data_type::FLOAT | data_type::INT32 | 12 => 4,
+        data_type::INT64 | 11 | 13 => 8,
+        data_type::FLOAT16 | 16 | 4 | 5 => 2,
+        data_type::UINT8 | data_type::BOOL | 3 => 1,
+        other => {
+            return Err(format!(
+                "has elements of {}, which no policy has",
+                data_type::name(other)
+            ));
+        }
+    };
+    let len = tensor.dims.iter().try_fold(size, |len: u64, &dim| {
+        len.checked_mul(u64::try_from(dim).ok()?)
+    });
+    len.filter(|&len| len <= 1 << 30)
+        .ok_or_else(|| format!("has shape {:?}, which no policy has", tensor.dims))
+}
+
+/// Names given twice, nodes that wait for each other, weights that are no numbers.
+fn check(graph: &GraphProto, problems: &mut Problems) {
+    let weights = graph.initializer.iter().map(|tensor| tensor.name.as_str());
+    let mut known: HashSet<&str> = HashSet::new();
+    for name in weights {
+        if !known.insert(name) {
+            problems.add(
+                format!("weight `{name}`"),
+                "is there twice; export the policy again",
+            );
+        }
+    }
+    for tensor in &graph.initializer {
+        if !finite(tensor) {
+            problems.add(
+                format!("weight `{}`", tensor.name),
+                "holds a value that is no finite number; the training has diverged, export an earlier checkpoint",
+            );
+        }
+    }
+    let mut inputs = HashSet::new();
+    for value in &graph.input {
+        if !inputs.insert(value.name.as_str()) {
+            problems.add(
+                format!("input `{}`", value.name),
+                "is there twice; export the policy again",
+            );
+        }
+        known.insert(&value.name);
+    }
+    let mut later: HashSet<&str> = HashSet::new();
+    for name in graph.node.iter().flat_map(|node| &node.output) {
+        if !name.is_empty() && (!later.insert(name) || known.contains(name.as_str())) {
+            problems.add(
+                format!("value `{name}`"),
+                "is given twice; export the policy again",
+            );
+        }
+    }
+    for node in &graph.node {
+        for name in node.input.iter().filter(|name| !name.is_empty()) {
+            if !known.contains(name.as_str()) {
+                let wrong = if later.contains(name.as_str()) {
+                    "is read before it is computed: the nodes are out of order or form a cycle; export the policy again"
+                } else {
+                    "is computed by no node; export the policy again"
+                };
+                problems.add(format!("value `{name}`"), wrong);
+            }
+        }
+        known.extend(node.output.iter().map(String::as_str));
+    }
+    for output in &graph.output {
+        if !known.contains(output.name.as_str()) {
+            problems.add(
+                format!("output `{}`", output.name),
+                "is computed by no node; export the policy again",
+            );
+        }
+    }
+}
+
+fn finite(tensor: &TensorProto) -> bool {
+    let raw = &tensor.raw_data;
+    match tensor.data_type {
+        data_type::FLOAT => {
+            let words = raw.as_chunks::<4>().0.iter();
+            words
+                .map(|&word| f32::from_le_bytes(word))
+                .chain(tensor.float_data.iter().copied())
+                .all(f32::is_finite)
+        }
+        // All ones in the exponent.
+        data_type::FLOAT16 => {
+            let words = raw.as_chunks::<2>().0.iter();
+            words
+                .map(|&word| u16::from_le_bytes(word))
+                .all(|half| half & 0x7c00 != 0x7c00)
+        }
+        _ => true,
+    }
+}

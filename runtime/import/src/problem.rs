@@ -1,0 +1,52 @@
+//! What stands between a file and a policy, collected so that a person sees all of it at once.
+
+use std::fmt::{self, Display, Formatter};
+
+use lads_compiler::Line;
+
+/// One thing that is missing or contradicts another.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Problem {
+    /// What it is about: a field of the robot's description, a value or a node of the graph, a file.
+    pub about: String,
+    /// What is wrong with it, and what to do.
+    pub wrong: String,
+}
+
+/// All problems of an import, in the order in which they were found.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Problems(Vec<Problem>);
+
+impl Problems {
+    /// Adds one, once.
+    pub(crate) fn add(&mut self, about: impl Display, wrong: impl Display) {
+        let line = |text: String| Line::from(text).to_string();
+        let problem = Problem {
+            about: line(about.to_string()),
+            wrong: line(wrong.to_string()),
+        };
+        if !self.0.contains(&problem) {
+            self.0.push(problem);
+        }
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// All of them.
+    pub fn all(&self) -> &[Problem] {
+        &self.0
+    }
+}
+
+/// One line for each.
+impl Display for Problems {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        for problem in &self.0 {
+            writeln!(f, "  {}: {}", problem.about, problem.wrong)?;
+        }
+        Ok(())
+    }
+}

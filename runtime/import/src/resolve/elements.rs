@@ -1,0 +1,149 @@
+//! Joints, and lists with a number for each element.
+
+use crate::problem::Problems;
+use crate::robot::{Clip, Each, Robot};
+
+/// The joints in the policy's order, and where each lies among the robot's.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) struct Joints {
+    /// In the policy's order.
+    pub policy: Vec<String>,
+    /// In the robot's order.
+    pub robot: Vec<String>,
+}
+
+impl Joints {
+    pub fn of(robot: &Robot, problems: &mut Problems) -> Self {
+        let mut policy = robot.joints.clone().unwrap_or_default();
+        let order = robot.wired_joints.clone();
+        if let (true, Some(order), Some(map)) = (policy.is_empty(), &order, &robot.joint_ids_map) {
+            let named: Option<Vec<String>> = map.iter().map(|&id| order.get(id).cloned()).collect();
+            match named {
+                Some(named) => policy = named,
+                None => problems.add(
+                    "robot_joints",
+                    format!(
+                        "has {} names, and `joint_ids_map` asks for number {}; name all of the robot's joints in its own order",
+                        order.len(),
+                        map.iter().max().unwrap_or(&0)
+                    ),
+                ),
+            }
+        } else if policy.is_empty() && robot.joint_ids_map.is_some() {
+            problems.add(
+                "robot_joints",
+                "is not said: the names of all of the robot's joints in its own order, in which `joint_ids_map` numbers them",
+            );
+        }
+        for (field, names) in [
+            ("joints", &policy),
+            ("robot_joints", order.as_ref().unwrap_or(&vec![])),
+        ] {
+            for (i, name) in names.iter().enumerate() {
+                if name.trim().is_empty() || names[..i].contains(name) {
+                    problems.add(field, format!("names \"{name}\" twice, or not at all"));
+                }
+            }
+        }
+        let robot = match order {
+            None => policy.clone(),
+            Some(order) => {
+                for name in policy.iter().filter(|name| !order.contains(name)) {
+                    problems.add(
+                        "robot_joints",
+                        format!("misses \"{name}\", which the policy moves"),
+                    );
+                }
+                order
+            }
+        };
+        Self { policy, robot }
+    }
+
+    /// For joints in the policy's order: their indices, in the order of the robot.
+    pub fn by_robot(&self, names: &[String]) -> Vec<usize> {
+        let mut order: Vec<usize> = (0..names.len()).collect();
+        let place = |i: &usize| self.robot.iter().position(|known| *known == names[*i]);
+        order.sort_by_key(|i| place(i).unwrap_or(usize::MAX));
+        order
+    }
+}
+
+/// A number for each element. A list of another length, or what is no number, is a problem.
+pub(crate) fn spread(
+    each: Option<&Each>,
+    width: usize,
+    about: &str,
+    problems: &mut Problems,
+) -> Option<Vec<f64>> {
+    let values = match each? {
+        Each::One(value) => vec![*value; width],
+        Each::Many(values) if values.len() == width => values.clone(),
+        Each::Many(values) => {
+            problems.add(
+                about,
+                format!("has {} numbers, there are {width} elements", values.len()),
+            );
+            return None;
+        }
+    };
+    if let Some(value) = values
+        .iter()
+        .find(|value| !value.is_finite() || value.abs() > 1e30)
+    {
+        problems.add(about, format!("holds {value}, which is no finite number"));
+        return None;
+    }
+    Some(values)
+}
+
+/// The bounds of a clip for each element.
+pub(crate) fn bounds(
+    clip: Option<&Clip>,
+    width: usize,
+    about: &str,
+    problems: &mut Problems,
+) -> Option<(Vec<f64>, Vec<f64>)> {
+    let (low, high) = match clip? {
+        Clip::Around(bound) => (Each::One(-bound), Each::One(*bound)),
+        Clip::Between([low, high]) => (low.clone(), high.clone()),
+    };
+    let low = spread(Some(&low), width, about, problems)?;
+    let high = spread(Some(&high), width, about, problems)?;
+    if let Some((low, high)) = low.iter().zip(&high).find(|(low, high)| low >= high) {
+        problems.add(about, format!("is {low} to {high}, which is no range"));
+        return None;
+    }
+    Some((low, high))
+}
+
+/// Smallest and largest value of each element.
+pub(crate) fn limits(
+    [min, max]: [Option<&Each>; 2],
+    width: usize,
+    about: &str,
+    unit: Option<&str>,
+    problems: &mut Problems,
+) -> Option<(Vec<f64>, Vec<f64>)> {
+    let unit = unit.map_or(String::new(), |unit| format!(", in {unit}"));
+    let mut limit = |each: Option<&Each>, field: &str, what: &str| {
+        let about = format!("{about}.{field}");
+        if each.is_none() {
+            problems.add(
+                &about,
+                format!("is not said: the {what} value of each of {width} elements, or one for all{unit}"),
+            );
+        }
+        spread(each, width, &about, problems)
+    };
+    let (low, high) = (limit(min, "min", "smallest"), limit(max, "max", "largest"));
+    let (low, high) = (low?, high?);
+    if let Some(i) = (0..width).find(|&i| low[i] >= high[i]) {
+        problems.add(
+            format!("{about}.min"),
+            format!("element {i} is {}, not below its max {}", low[i], high[i]),
+        );
+        return None;
+    }
+    Some((low, high))
+}

@@ -1,0 +1,383 @@
+//! What a person says about a robot and its policy: the TOML file, and what the policy's neighbours say in the same form.
+//!
+//! Every field may be missing here; whether enough is said is decided where all of it comes together. What can fail: the text is no
+//! TOML, or a field has a name or a type that is not known, which is told with its line.
+
+use std::collections::BTreeMap;
+
+use serde::Deserialize;
+
+/// A number for each element, or one for all of them.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(untagged)]
+pub(crate) enum Each {
+    One(f64),
+    Many(Vec<f64>),
+}
+
+impl Each {
+    pub fn len(&self) -> Option<usize> {
+        match self {
+            Each::One(_) => None,
+            Each::Many(values) => Some(values.len()),
+        }
+    }
+}
+
+/// Bounds of a clip: `[low, high]` of numbers or of lists, or one number for both sides.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(untagged)]
+pub(crate) enum Clip {
+    Around(f64),
+    Between([Each; 2]),
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Environment {
+    pub id: String,
+    pub version: String,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum QuaternionOrder {
+    Wxyz,
+    Xyzw,
+}
+
+/// In which order a graph reads the values of several steps.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Layout {
+    /// All steps of the first term, then of the next.
+    Term,
+    /// All terms of one step, then of the next.
+    Time,
+    /// All steps of the first element, then of the next.
+    Element,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Order {
+    OldestFirst,
+    NewestFirst,
+}
+
+/// What stands for steps before the first one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Start {
+    /// Zeros, where the graph reads them.
+    Zero,
+    /// The first step.
+    First,
+}
+
+/// How many of the last steps the graph reads, and how.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(crate) struct History {
+    pub length: Option<usize>,
+    pub layout: Option<Layout>,
+    pub order: Option<Order>,
+    pub start: Option<Start>,
+}
+
+/// What holds for a whole input of the graph.
+#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(crate) struct Input {
+    pub clip: Option<Clip>,
+    pub history: Option<History>,
+}
+
+/// Where the values of a term come from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum From {
+    /// The caller, as they are.
+    Sensor,
+    /// The caller's orientation; the term is the direction of gravity in the body's frame.
+    Gravity,
+    /// The last raw action of the policy.
+    Action,
+    /// A clock with the period of a gait.
+    Phase,
+    /// Control steps since the episode began.
+    Step,
+    /// 1 in the first step of an episode, 0 afterwards.
+    First,
+    /// Another output of the graphs.
+    Output(String),
+}
+
+impl TryFrom<String> for From {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        Ok(match text.as_str() {
+            "sensor" => From::Sensor,
+            "gravity" => From::Gravity,
+            "action" => From::Action,
+            "phase" => From::Phase,
+            "step" => From::Step,
+            "first" => From::First,
+            _ => match text.strip_prefix("output:") {
+                Some(output) => From::Output(output.into()),
+                None => {
+                    return Err(format!(
+                        "`from` is \"{text}\"; known are sensor, gravity, action, phase, step, first and output:NAME"
+                    ));
+                }
+            },
+        })
+    }
+}
+
+impl<'de> Deserialize<'de> for From {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        From::try_from(String::deserialize(deserializer)?).map_err(serde::de::Error::custom)
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Wave {
+    Sin,
+    Cos,
+}
+
+/// One element of a clock: sine or cosine of a turn, ahead by a part of a period.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Hand {
+    pub of: Wave,
+    #[serde(default)]
+    pub ahead: f64,
+}
+
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Phase {
+    pub period_s: f64,
+    pub elements: Vec<Hand>,
+}
+
+/// A part of an input of the graph.
+#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(crate) struct Term {
+    pub name: String,
+    pub input: Option<String>,
+    pub width: Option<usize>,
+    pub elements: Option<Vec<String>>,
+    pub per_joint: Option<bool>,
+    pub joints: Option<Vec<String>>,
+    pub channel: Option<String>,
+    pub from: Option<From>,
+    pub unit: Option<String>,
+    pub interface: Option<String>,
+    pub min: Option<Each>,
+    pub max: Option<Each>,
+    pub offset: Option<Each>,
+    pub clip: Option<Clip>,
+    pub scale: Option<Each>,
+    pub history: Option<usize>,
+    pub phase: Option<Phase>,
+}
+
+/// What the policy's output means.
+#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(crate) struct Action {
+    pub output: Option<String>,
+    pub elements: Option<Vec<String>>,
+    pub joints: Option<Vec<String>>,
+    pub unit: Option<String>,
+    pub interface: Option<String>,
+    pub reference: Option<String>,
+    pub clip: Option<Clip>,
+    pub scale: Option<Each>,
+    pub offset: Option<Each>,
+    pub min: Option<Each>,
+    pub max: Option<Each>,
+    pub stiffness: Option<Each>,
+    pub damping: Option<Each>,
+    pub tolerance: Option<f64>,
+}
+
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum ClearedBy {
+    #[default]
+    Episode,
+}
+
+/// An output that is the input of the next control step.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct State {
+    pub input: String,
+    pub output: String,
+    #[serde(default)]
+    pub cleared_by: ClearedBy,
+}
+
+/// An input that is always the same.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Constant {
+    pub input: String,
+    pub value: f64,
+}
+
+/// Everything that is said.
+#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(crate) struct Robot {
+    pub environment: Option<Environment>,
+    pub control_period_s: Option<f64>,
+    pub quaternion_order: Option<QuaternionOrder>,
+    pub joints: Option<Vec<String>>,
+    /// `robot_joints` in the file: the robot's joints, in its order.
+    #[serde(rename = "robot_joints")]
+    pub wired_joints: Option<Vec<String>>,
+    /// For each of the policy's joints, its index among the robot's.
+    pub joint_ids_map: Option<Vec<usize>>,
+    pub default_position: Option<Vec<f64>>,
+    pub history: Option<History>,
+    pub input: BTreeMap<String, Input>,
+    #[serde(rename = "term")]
+    pub terms: Vec<Term>,
+    pub action: Action,
+    #[serde(rename = "state")]
+    pub states: Vec<State>,
+    #[serde(rename = "constant")]
+    pub constants: Vec<Constant>,
+    pub axes: BTreeMap<String, usize>,
+}
+
+/// Takes over what `mine` does not say.
+macro_rules! fill {
+    ($mine:expr, $other:expr, $($field:ident)+) => {
+        $(if $mine.$field.is_none() { $mine.$field = $other.$field; })+
+    };
+}
+
+impl Robot {
+    /// Reads the TOML form.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        toml::from_str(text).map_err(|error| error.to_string().trim_end().replace('\n', " "))
+    }
+
+    /// Takes over what another source says where this one says nothing. Terms are the same if they have the same name; other names in
+    /// another number are a contradiction, which is returned.
+    pub fn fill(&mut self, other: Robot) -> Result<(), String> {
+        fill!(self, other, environment control_period_s quaternion_order joints wired_joints joint_ids_map default_position);
+        match (&mut self.history, other.history) {
+            (Some(mine), Some(other)) => {
+                fill!(mine, other, length layout order start);
+            }
+            (mine @ None, other) => *mine = other,
+            (Some(_), None) => {}
+        }
+        let action = other.action;
+        fill!(self.action, action, output elements joints unit interface reference clip scale offset min max stiffness damping tolerance);
+        for (axis, len) in other.axes {
+            self.axes.entry(axis).or_insert(len);
+        }
+        for (name, input) in other.input {
+            let mine = self.input.entry(name).or_default();
+            fill!(mine, input, clip history);
+        }
+        if self.states.is_empty() {
+            self.states = other.states;
+        }
+        if self.constants.is_empty() {
+            self.constants = other.constants;
+        }
+        if self.terms.is_empty() {
+            self.terms = other.terms;
+            return Ok(());
+        }
+        let names = |terms: &[Term]| {
+            let names: Vec<&str> = terms.iter().map(|term| term.name.as_str()).collect();
+            names.join(", ")
+        };
+        let (mine, theirs) = (names(&self.terms), names(&other.terms));
+        if !other.terms.is_empty() && mine != theirs {
+            return Err(format!(
+                "the terms are {mine} here and {theirs} there; say them in the order in which the graph reads them, by the same names"
+            ));
+        }
+        for (term, other) in self.terms.iter_mut().zip(other.terms) {
+            term.fill(other);
+        }
+        Ok(())
+    }
+}
+
+impl Term {
+    /// Takes over what another source says of the same term.
+    pub fn fill(&mut self, other: Term) {
+        fill!(self, other, input width elements per_joint joints channel from unit interface min max offset clip scale history phase);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_description_reads_and_unknown_fields_are_refused() {
+        let text = r#"
+            control_period_s = 0.02
+            joints = ["hip", "knee"]
+            history = { length = 3, layout = "time", order = "oldest_first", start = "first" }
+            [[term]]
+            name = "joint_pos"
+            offset = [0.1, 0.2]
+            scale = 2
+            clip = [-1, [1, 2]]
+            [[term]]
+            name = "clock"
+            from = "phase"
+            phase = { period_s = 0.8, elements = [{ of = "sin" }, { of = "cos", ahead = 0.5 }] }
+            [action]
+            scale = 0.25
+        "#;
+        let robot = Robot::parse(text).expect("it reads");
+        assert_eq!(robot.terms[0].offset, Some(Each::Many(vec![0.1, 0.2])));
+        assert_eq!(robot.terms[1].from, Some(From::Phase));
+        for (wrong, said) in [
+            ("period = 1", "period"),
+            ("[action]\nscael = 1", "scael"),
+            ("[[term]]\nname = 3", "line 2"),
+            ("[[term]]\nfrom = \"moon\"", "known are sensor"),
+            ("joints = [", "line 1"),
+        ] {
+            let error = Robot::parse(wrong).expect_err(wrong);
+            assert!(error.contains(said), "{error}");
+        }
+    }
+
+    #[test]
+    fn what_is_said_first_stays() {
+        let parse = |text: &str| Robot::parse(text).expect("it reads");
+        let mut mine = parse("[[term]]\nname = \"a\"\nscale = 2\n[action]\nunit = \"rad\"");
+        mine.fill(parse("control_period_s = 0.02\n[[term]]\nname = \"a\"\nscale = 3\nwidth = 4\n[action]\nunit = \"m\"\nscale = 1"))
+            .expect("the same terms");
+        assert_eq!(mine.control_period_s, Some(0.02));
+        assert_eq!(
+            (mine.terms[0].scale.clone(), mine.terms[0].width),
+            (Some(Each::One(2.0)), Some(4))
+        );
+        assert_eq!(mine.action.unit.as_deref(), Some("rad"));
+        assert_eq!(mine.action.scale, Some(Each::One(1.0)));
+        let error = mine
+            .fill(parse("[[term]]\nname = \"b\""))
+            .expect_err("other terms");
+        assert!(error.contains("a here and b there"), "{error}");
+    }
+}

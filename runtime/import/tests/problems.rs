@@ -1,0 +1,470 @@
+//! What is missing, what contradicts, and files that are broken or hostile: all of it told at once, by name, and nothing imported.
+
+mod common;
+
+use common::{Case, HEAD, mirror, model, node, says, step, value, weight, wide_action};
+use lads_compiler::onnx::StringStringEntryProto;
+use lads_import::{Request, template};
+use prost::Message as _;
+
+const SENSOR: &str = "unit = \"1\"\nmin = -100\nmax = 100\n";
+
+#[test]
+fn everything_that_is_missing_is_told_at_once() {
+    let told = Case::new(&mirror(51), "").refused();
+    for field in [
+        "environment",
+        "control_period_s",
+        "action.unit",
+        "action.min",
+        "action.max",
+        "action.scale",
+        "action.offset",
+        "joints",
+        "input `obs`",
+    ] {
+        assert!(told.contains(field), "{field} is not in\n{told}");
+    }
+    assert!(told.contains("51 elements"), "{told}");
+}
+
+#[test]
+fn contradictions_are_told_with_both_sides() {
+    let action = wide_action(3);
+    for (robot, said) in [
+        // Terms that do not add up.
+        (
+            format!("{HEAD}[[term]]\nname = \"a\"\nwidth = 2\n{SENSOR}{action}"),
+            "has 3 elements, its terms add up to 2: a 2",
+        ),
+        (
+            format!(
+                "{HEAD}[[term]]\nname = \"a\"\n{SENSOR}[[term]]\nname = \"b\"\n{SENSOR}{action}"
+            ),
+            "term.a: how many elements",
+        ),
+        // Names and numbers of another count.
+        (
+            format!(
+                "{HEAD}joints = [\"a\", \"b\", \"c\", \"d\"]\n[[term]]\nname = \"x\"\n{SENSOR}[action]\nunit = \"rad\"\nscale = 1\noffset = 0\nmin = 0\nmax = 1\n"
+            ),
+            "has 4 names, the output `actions` has 3",
+        ),
+        (
+            format!("{HEAD}[[term]]\nname = \"a\"\nscale = [1, 2]\nwidth = 3\n{SENSOR}{action}"),
+            "term.a.scale: has 2 numbers, there are 3",
+        ),
+        (
+            format!(
+                "{HEAD}[[term]]\nname = \"a\"\nunit = \"1\"\nmin = [0, 5, 0]\nmax = [1, 5, 1]\n{action}"
+            ),
+            "element 1 is 5, not below its max 5",
+        ),
+        (
+            format!("{HEAD}[[term]]\nname = \"a\"\nclip = [2, 1]\n{SENSOR}{action}"),
+            "is 2 to 1, which is no range",
+        ),
+        (
+            format!("{HEAD}[[term]]\nname = \"a\"\nscale = nan\n{SENSOR}{action}"),
+            "no finite number",
+        ),
+        // The default posture of positions is never guessed.
+        (
+            format!(
+                "{HEAD}joints = [\"a\", \"b\", \"c\"]\n[[term]]\nname = \"joint_pos\"\nmin = -1\nmax = 1\n{action}"
+            ),
+            "term.joint_pos.offset",
+        ),
+        (
+            format!("{HEAD}[[term]]\nname = \"up\"\nfrom = \"gravity\"\n{action}"),
+            "quaternion_order",
+        ),
+        // Histories say how they lie.
+        (
+            format!("{HEAD}[[term]]\nname = \"a\"\nhistory = 3\n{SENSOR}{action}"),
+            "history.layout",
+        ),
+        (
+            format!(
+                "{HEAD}robot_joints = [\"b\"]\njoints = [\"a\"]\n[[term]]\nname = \"a\"\n{SENSOR}{action}"
+            ),
+            "misses \"a\"",
+        ),
+        (
+            format!("{HEAD}[[term]]\nname = \"a\"\nchannel = \"phase\"\n{SENSOR}{action}"),
+            "cannot name a channel",
+        ),
+        (
+            format!("{HEAD}[[term]]\nname = \"a b\"\n{SENSOR}{action}"),
+            "letters, digits",
+        ),
+        (
+            format!(
+                "{HEAD}[[term]]\nname = \"a\"\n{SENSOR}{action}[[state]]\ninput = \"h\"\noutput = \"h\"\n"
+            ),
+            "\"h\" is none of them; there are obs",
+        ),
+        (
+            format!("{HEAD}[[term]]\nname = \"last_action\"\n{action}"),
+            "no term comes from the caller",
+        ),
+        (
+            "control_period = 1".into(),
+            "unknown field `control_period`",
+        ),
+    ] {
+        let told = Case::new(&mirror(3), &robot).refused();
+        assert!(told.contains(said), "{robot}\n{told}");
+    }
+}
+
+#[test]
+fn the_form_names_all_and_is_enough_once_it_is_filled_in() {
+    let mut policy = mirror(6);
+    says(
+        &mut policy,
+        &[
+            ("joint_names", "hip,knee,toe,heel,tail,neck"),
+            ("default_joint_pos", "0.1,0.2,0.3,0.4,0.5,0.6"),
+            ("observation_names", "joint_pos"),
+            ("action_scale", "0.25"),
+            ("run_path", "/home/somebody/runs/1"),
+        ],
+    );
+    let case = Case::new(&policy, "");
+    let path = case.path("policy.onnx");
+    let request = Request {
+        models: vec![&path],
+        ..Request::default()
+    };
+    let form = template(&request).expect("a form");
+    assert!(!form.contains("somebody"), "{form}");
+    // A person takes the `#` away from the fields that are missing.
+    let wanted = [
+        "environment",
+        "control_period_s",
+        "min",
+        "max",
+        "offset",
+        "unit",
+    ];
+    let filled: Vec<String> = form
+        .lines()
+        .map(|line| match line.strip_prefix("# ") {
+            Some(field)
+                if wanted
+                    .iter()
+                    .any(|name| field.starts_with(&format!("{name} = "))) =>
+            {
+                field.to_owned()
+            }
+            _ => line.to_owned(),
+        })
+        .collect();
+    case.put("robot.toml", filled.join("\n").as_bytes());
+    let imported = case
+        .import()
+        .unwrap_or_else(|error| panic!("{error}\n{form}"));
+    assert!(
+        imported
+            .notes
+            .iter()
+            .any(|note| note.contains("joint_names"))
+    );
+    let text = String::from_utf8_lossy(&imported.bundle).into_owned();
+    assert!(
+        !text.contains("somebody") && !text.contains("run_path"),
+        "private data in the bundle"
+    );
+    assert!(!text.contains(&*case.folder.path().to_string_lossy()));
+}
+
+#[test]
+fn neighbours_are_read_and_have_to_agree() {
+    let deploy = "step_dt: 0.02\njoint_ids_map: [1, 0]\ndefault_joint_pos: [0.5, 0.6]\nstiffness: [10, 20]\ndamping: [1, 2]\n\
+        actions: {JointPositionAction: {scale: [0.25, 0.5], offset: [0.5, 0.6], clip: null}}\n\
+        observations:\n  joint_pos_rel: {scale: [1.0, 1.0], clip: null, history_length: 1}\n";
+    let robot = "environment = { id = \"biped\", version = \"1\" }\nrobot_joints = [\"left\", \"right\"]\n\
+        [[term]]\nname = \"joint_pos_rel\"\nmin = -3\nmax = 3\n[action]\nmin = -3\nmax = 3\n";
+    let case = Case::new(&mirror(2), robot);
+    case.put("params/deploy.yaml", deploy.as_bytes());
+    let actions = case.actions(&[step(&[&[0.6, 0.5]]), step(&[&[1.6, 2.5]])]);
+    // Left and right are 0.6 and 0.5 at rest, and go back where they are.
+    common::close(&actions[0], &[0.6, 0.5]);
+    common::close(&actions[1], &[1.1, 1.0]);
+    let bundle =
+        lads_compiler::Bundle::from_bytes(&case.import().expect("again").bundle).expect("a bundle");
+    let gains: Vec<_> = (bundle.contract().action().elements.iter())
+        .map(|element| (element.name.clone(), element.stiffness))
+        .collect();
+    assert_eq!(
+        gains,
+        [("left".into(), Some(10.0)), ("right".into(), Some(20.0))]
+    );
+
+    let other = Case::new(&mirror(2), &robot.replace("joint_pos_rel", "dof_pos"));
+    other.put("deploy.yaml", deploy.as_bytes());
+    assert!(
+        other
+            .refused()
+            .contains("dof_pos here and joint_pos_rel there")
+    );
+    // The form says so too, instead of leaving a file out without a word.
+    let form = template(&Request {
+        models: vec![&other.path("policy.onnx")],
+        beside: vec![&other.path("policy.onnx")],
+        ..Request::default()
+    });
+    assert!(form.expect("a form").contains("wrong with the files"));
+    let bomb = Case::new(&mirror(2), robot);
+    bomb.put("deploy.yaml", "[".repeat(10_000).as_bytes());
+    let told = bomb.refused();
+    assert!(told.contains("deploy.yaml: is "), "{told}");
+}
+
+#[test]
+fn rounded_gains_are_told_until_somebody_says_them() {
+    let mut policy = mirror(2);
+    says(
+        &mut policy,
+        &[
+            ("joint_names", "hip,knee"),
+            ("joint_stiffness", "0.000,0.000"),
+            ("joint_damping", "1.000,1.000"),
+        ],
+    );
+    let robot = format!(
+        "{HEAD}[[term]]\nname = \"a\"\n{SENSOR}[action]\nunit = \"rad\"\nscale = 1\noffset = 0\nmin = -1\nmax = 1\n"
+    );
+    let told = Case::new(&policy, &robot).refused();
+    assert!(
+        told.contains("action.stiffness") && told.contains("action.damping"),
+        "{told}"
+    );
+    let case = Case::new(
+        &policy,
+        &format!("{robot}stiffness = 0.0004\ndamping = 0.02\n"),
+    );
+    case.import().unwrap_or_else(|error| panic!("{error}"));
+    // Four names and three actions, as one public file has it.
+    let mut policy = mirror(3);
+    says(&mut policy, &[("joint_names", "a,b,c,d")]);
+    let told = Case::new(&policy, &robot).refused();
+    assert!(
+        told.contains("has 4 names") && told.contains("3 elements"),
+        "{told}"
+    );
+}
+
+fn external(location: &str, extra: &[(&str, &str)]) -> lads_compiler::onnx::ModelProto {
+    let mut policy = model(
+        vec![value("obs", &[1, 2])],
+        vec![node("MatMul", &["obs", "w"], &["actions"])],
+        vec![weight("w", &[2, 2], &[])],
+        vec![value("actions", &[1, 2])],
+    );
+    let tensor = &mut policy.graph.as_mut().expect("a graph").initializer[0];
+    tensor.data_location = 1;
+    tensor.external_data = std::iter::once(&("location", location))
+        .chain(extra)
+        .map(|(key, value)| StringStringEntryProto {
+            key: (*key).into(),
+            value: (*value).into(),
+        })
+        .collect();
+    policy
+}
+
+#[test]
+fn weights_beside_the_model_are_brought_in_and_never_from_elsewhere() {
+    let robot = format!("{HEAD}[[term]]\nname = \"a\"\n{SENSOR}{}", wide_action(2));
+    let weights: Vec<u8> = [9.0_f32, 1.0, 2.0, 3.0, 4.0]
+        .iter()
+        .flat_map(|x| x.to_le_bytes())
+        .collect();
+    let case = Case::new(
+        &external("policy.onnx.data", &[("offset", "4"), ("length", "16")]),
+        &robot,
+    );
+    assert!(
+        case.refused()
+            .contains("`policy.onnx.data`, which is missing")
+    );
+    case.put("policy.onnx.data", &weights);
+    let actions = case.actions(&[step(&[&[1.0, 10.0]])]);
+    common::close(&actions[0], &[31.0, 42.0]);
+    case.put("policy.onnx.data", &weights[..19]);
+    assert!(case.refused().contains("needs bytes 4 to 20"));
+
+    for (location, extra, said) in [
+        ("../policy.onnx.data", &[][..], "outside the model's folder"),
+        ("/etc/passwd", &[], "outside the model's folder"),
+        (
+            "policy.onnx.data",
+            &[("length", "8")],
+            "has 8 bytes of external data, its type and shape need 16",
+        ),
+        (
+            "policy.onnx.data",
+            &[("offset", "18446744073709551615")],
+            "needs bytes 18446744073709551615",
+        ),
+        ("policy.onnx.data", &[("offset", "-1")], "no number"),
+        (".", &[], "is no file"),
+    ] {
+        let case = Case::new(&external(location, extra), &robot);
+        case.put("policy.onnx.data", &weights);
+        let told = case.refused();
+        assert!(told.contains(said), "{location}: {told}");
+    }
+    #[cfg(unix)]
+    {
+        let outside = tempfile::NamedTempFile::new().expect("a file");
+        let case = Case::new(&external("link", &[]), &robot);
+        std::os::unix::fs::symlink(outside.path(), case.path("link")).expect("a link");
+        assert!(case.refused().contains("leads out of the model's folder"));
+    }
+}
+
+#[test]
+fn broken_graphs_are_refused_by_name() {
+    let robot = format!("{HEAD}[[term]]\nname = \"a\"\n{SENSOR}{}", wide_action(1));
+    let policy = |nodes, weights| {
+        model(
+            vec![value("obs", &[1, 1])],
+            nodes,
+            weights,
+            vec![value("actions", &[1, 1])],
+        )
+    };
+    let cycle = vec![
+        node("Add", &["obs", "b"], &["a"]),
+        node("Add", &["a", "a"], &["b"]),
+        node("Identity", &["b"], &["actions"]),
+    ];
+    let twice = vec![
+        node("Identity", &["obs"], &["actions"]),
+        node("Neg", &["obs"], &["actions"]),
+    ];
+    let scaled = vec![node("Mul", &["obs", "w"], &["actions"])];
+    let mut huge = weight("w", &[1 << 31], &[1.0]);
+    huge.data_location = 1;
+    for (policy, said) in [
+        (
+            policy(cycle, vec![]),
+            "value `b`: is read before it is computed",
+        ),
+        (policy(twice, vec![]), "value `actions`: is given twice"),
+        (
+            policy(vec![], vec![]),
+            "output `actions`: is computed by no node",
+        ),
+        (
+            policy(scaled.clone(), vec![weight("w", &[1], &[f32::NAN])]),
+            "weight `w`: holds a value that is no finite number",
+        ),
+        (
+            policy(
+                scaled.clone(),
+                vec![weight("w", &[1], &[1.0]), weight("w", &[1], &[2.0])],
+            ),
+            "weight `w`: is there twice",
+        ),
+        (policy(scaled.clone(), vec![huge]), "weight `w`"),
+        (policy(scaled, vec![weight("w", &[1 << 31], &[1.0])]), "w"),
+        (
+            policy(
+                vec![
+                    node("NonMaxSuppression", &["obs"], &["x"]),
+                    node("Bogus", &["x"], &["actions"]),
+                ],
+                vec![],
+            ),
+            "operator Bogus",
+        ),
+    ] {
+        let told = Case::new(&policy, &robot).refused();
+        assert!(told.contains(said), "{said}: {told}");
+    }
+    let case = Case::new(&mirror(1), &robot);
+    let whole = std::fs::read(case.path("policy.onnx")).expect("a file");
+    for bytes in [
+        &whole[..whole.len() / 2],
+        b"",
+        b"PK\x03\x04 no model",
+        &whole[..3],
+    ] {
+        case.put("policy.onnx", bytes);
+        assert!(case.refused().contains("policy.onnx"));
+    }
+    // A bundle needs no import.
+    case.put("policy.onnx", &whole);
+    let bundle = case.import().expect("it is imported").bundle;
+    case.put("policy.onnx", &bundle);
+    assert!(case.refused().contains("is a policy bundle already"));
+}
+
+#[test]
+fn no_part_of_a_file_makes_it_panic() {
+    let robot = format!("{HEAD}[[term]]\nname = \"a\"\n{SENSOR}{}", wide_action(2));
+    let policy = model(
+        vec![value("obs", &[-1, 2])],
+        vec![
+            node("MatMul", &["obs", "w"], &["x"]),
+            node("Tanh", &["x"], &["actions"]),
+        ],
+        vec![weight("w", &[2, 2], &[0.1, 0.2, 0.3, 0.4])],
+        vec![value("actions", &[-1, 2])],
+    );
+    let case = Case::new(&policy, &robot);
+    case.import().unwrap_or_else(|error| panic!("{error}"));
+    let whole = policy.encode_to_vec();
+    for at in 0..whole.len() {
+        for flip in [0x01, 0x80, 0xff] {
+            let mut damaged = whole.clone();
+            damaged[at] ^= flip;
+            case.put("policy.onnx", &damaged);
+            let _ = case.import();
+        }
+        case.put("policy.onnx", &whole[..at]);
+        let _ = case.import();
+    }
+}
+
+#[test]
+fn a_recorded_run_has_to_be_what_the_graph_does() {
+    let robot = format!(
+        "{HEAD}[[term]]\nname = \"a\"\nwidth = 2\n{SENSOR}{}tolerance = 0.01\n",
+        wide_action(2)
+    );
+    let case = Case::new(&mirror(2), &robot);
+    let csv = case.path("run.csv");
+    let import = |text: &str| {
+        case.put("run.csv", text.as_bytes());
+        case.import_with(|request| request.golden = Some(&csv))
+            .map_err(|error| error.to_string())
+    };
+    let head = "observation.a.0, observation.a.1, action.a0, action.a1, reset\n";
+    let good = format!("{head}1,2,1,2,0\n3,4,3,4,0\n5,6,5.001,6,1\n");
+    let bundle = import(&good)
+        .unwrap_or_else(|error| panic!("{error}"))
+        .bundle;
+    let bundle = lads_compiler::Bundle::from_bytes(&bundle).expect("a bundle");
+    assert_eq!(bundle.golden().steps(), 2, "the first episode");
+    let error = import(&good.replace("3,4,3,4", "3,4,3,4.5")).expect_err("another action");
+    assert!(
+        error.contains("`a1`") && error.contains("4.5 in step 1"),
+        "{error}"
+    );
+    let error = import("observation.a.0,action.a0\n1,1\n").expect_err("columns are missing");
+    assert!(
+        error.contains("observation.a.1") && error.contains("action.a1"),
+        "{error}"
+    );
+    assert!(import(head).expect_err("no rows").contains("has no rows"));
+    assert!(
+        import(&format!("{head}1,x,1,2,0\n"))
+            .expect_err("no number")
+            .contains("`x`")
+    );
+}
