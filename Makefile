@@ -118,7 +118,7 @@ wheel: $(VENV)/wheel-stamp
 	rm -f target/wheels/lads-*.whl
 	$(PY) -m maturin build --quiet --release --manifest-path runtime/python/Cargo.toml --out target/wheels
 
-## test-python: the wheel in a fresh environment with nothing else, then the package's tests in the project's
+## test-python: the wheel in a fresh environment with nothing else, then the package's tests and examples in the project's
 test-python: setup wheel
 	rm -rf target/fresh
 	$(PYTHON) -m venv target/fresh
@@ -126,6 +126,8 @@ test-python: setup wheel
 	target/fresh/bin/python -X faulthandler runtime/python/tests/fresh.py models/kitchen-small.onnx
 	target/fresh/bin/python -m lads self-test models/kitchen-small.onnx
 	$(PY) -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall target/wheels/lads-*.whl
+	# What the tests and the examples need besides, by the installed wheel's own pins.
+	$(PY) -m pip install --quiet --disable-pip-version-check 'lads[test,examples]'
 	$(PY) -m pytest runtime/python/tests
 
 ## collect: demonstrations into data/ENV.safetensors; ENV=kitchen (scripted, of the 22 seen instructions) or ENV=lorel (random, labelled)

@@ -3,7 +3,9 @@
 //! All observations are checked before the first controller steps, so that one that is refused leaves all as they were. The threads are the
 //! batch's own, started once.
 
+use std::num::NonZero;
 use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
+use std::thread;
 
 use lads_core::{ChannelId, Data, StepError as CoreStepError};
 use numpy::{PyArray1, PyArrayMethods};
@@ -93,8 +95,8 @@ impl Controllers {
 
 #[pymethods]
 impl Controllers {
-    /// `count` controllers of a policy, with `threads` threads (all of the machine's by default). `instruction` is one for all, or a list of
-    /// as many. The seed of row i is `sample + i` and `noise + i`.
+    /// `count` controllers of a policy, with `threads` threads (all of the machine's by default, never more than controllers). `instruction` is
+    /// one for all, or a list of as many. The seed of row i is `sample + i` and `noise + i`.
     #[new]
     #[pyo3(signature = (policy, count, instruction=None, *, threads=None, sample=None, noise=None, portable=false))]
     fn new(
@@ -141,8 +143,9 @@ impl Controllers {
             actions: vec![0.0; count * contract.action_len()],
             rows,
         };
+        let all = || thread::available_parallelism().map_or(1, NonZero::get);
         let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(threads.unwrap_or(0))
+            .num_threads(threads.unwrap_or_else(all).min(count))
             .thread_name(|index| format!("lads-{index}"))
             .build()
             .map_err(|error| {
@@ -251,7 +254,8 @@ impl Controllers {
         })
     }
 
-    /// Follows an instruction: one for all rows, or a list of one for each of `rows` (all by default).
+    /// Follows an instruction: one for all rows, or a list of one for each of `rows` (all by default). Where one is refused, the rows
+    /// before it follow theirs.
     #[pyo3(signature = (instruction, rows=None))]
     fn instruct(
         &self,
@@ -302,7 +306,8 @@ impl Controllers {
         })
     }
 
-    /// Tells what was really executed in all rows: float32 [count, actions].
+    /// Tells what was really executed in all rows: float32 [count, actions]. Where one is refused, such as that of a row without a step,
+    /// the rows before it were told.
     fn executed(&self, actions: &Bound<'_, PyAny>) -> PyResult<()> {
         self.work(|inner| {
             let len = self.contract().action_len();

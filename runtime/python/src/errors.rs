@@ -10,6 +10,7 @@ pyo3::import_exception!(lads.errors, BusyError);
 pyo3::import_exception!(lads.errors, ClosedError);
 pyo3::import_exception!(lads.errors, CompileError);
 pyo3::import_exception!(lads.errors, ForkError);
+pyo3::import_exception!(lads.errors, ImportOnnxError);
 pyo3::import_exception!(lads.errors, InputError);
 pyo3::import_exception!(lads.errors, InstructionError);
 pyo3::import_exception!(lads.errors, OpenError);

@@ -15,6 +15,7 @@ mod batch;
 mod cell;
 mod controller;
 mod errors;
+mod import;
 mod judge;
 mod policy;
 mod process;
@@ -43,6 +44,8 @@ fn _lads(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<report::Selected>()?;
     module.add_function(wrap_pyfunction!(policy::open, module)?)?;
     module.add_function(wrap_pyfunction!(policy::from_image, module)?)?;
+    module.add_function(wrap_pyfunction!(import::import_onnx, module)?)?;
+    module.add_function(wrap_pyfunction!(import::template, module)?)?;
     module.add_function(wrap_pyfunction!(process::forked, module)?)?;
     module.add_function(wrap_pyfunction!(proof::wilson, module)?)?;
     module.add_function(wrap_pyfunction!(proof::score, module)?)?;

@@ -5,10 +5,11 @@ use std::sync::Arc;
 
 use lads_compiler::{CacheFormat, Options, WeightFormat};
 use lads_core::{Data, Isa};
+use lads_host::Opened;
 use numpy::{PyArray1, PyArrayDyn, PyArrayMethods};
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
-use pyo3::types::{PyBytes, PyDict};
+use pyo3::types::{PyBytes, PyDict, PyTuple};
 
 use crate::arrays;
 use crate::cell::{Checked, Working};
@@ -20,6 +21,7 @@ use crate::errors::{OpenError, SelfTestError, WorkspaceError, opening};
 pub struct Policy {
     path: PathBuf,
     checked: Arc<Checked>,
+    notes: Vec<String>,
     contract: PyOnceLock<Py<PyAny>>,
 }
 
@@ -61,7 +63,7 @@ pub fn open(
             path.display()
         )));
     }
-    Ok(Policy::of(path, Checked::of(opened)))
+    Ok(Policy::of(path, opened))
 }
 
 /// Opens a policy from the bytes of its image, such as Policy.image; `path` names it in messages. This is what unpickling calls.
@@ -74,7 +76,7 @@ pub fn from_image(py: Python<'_>, image: &[u8], path: PathBuf) -> PyResult<Polic
             ..error
         })
     })?;
-    Ok(Policy::of(path, Checked::of(opened)))
+    Ok(Policy::of(path, opened))
 }
 
 /// The format with this name.
@@ -94,12 +96,19 @@ fn format<T: Copy, const N: usize>(
 }
 
 impl Policy {
-    fn of(path: PathBuf, checked: Arc<Checked>) -> Self {
+    /// What was read from a file, or made of it.
+    pub fn of(path: PathBuf, opened: Opened) -> Self {
         Self {
             path,
-            checked,
+            checked: Checked::of(opened),
+            notes: vec![],
             contract: PyOnceLock::new(),
         }
+    }
+
+    /// The same with what is worth saying about how it came to be.
+    pub fn with_notes(self, notes: Vec<String>) -> Self {
+        Self { notes, ..self }
     }
 
     /// What was checked.
@@ -141,6 +150,12 @@ impl Policy {
             Ok::<_, PyErr>(read.unbind())
         })?;
         Ok(read.clone_ref(py))
+    }
+
+    /// What an import read and found out, a line each: tuple of str; empty for a policy that was opened.
+    #[getter]
+    fn notes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        PyTuple::new(py, &self.notes)
     }
 
     /// Everything that `lads inspect --json` prints: channels, schedule, programs, states, sizes in bytes.

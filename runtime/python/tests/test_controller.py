@@ -297,7 +297,7 @@ def test_nothing_leaks(plain, seen):
             except lads.errors.InputError:
                 pass
 
-    round_of(500)
+    round_of(1000)
     before = resident()
-    round_of(5000)
+    round_of(100_000)
     assert resident() - before < 4 << 20

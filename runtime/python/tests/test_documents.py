@@ -16,8 +16,9 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with the project's models in which snippets may write."""
-    os.symlink(PROJECT / "models", tmp_path / "models")
+    """A folder with the project's models and sources in which snippets may write."""
+    for name in ("models", "runtime"):
+        os.symlink(PROJECT / name, tmp_path / name)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -41,4 +42,5 @@ def test_snippets_run_as_typed(name, folder, monkeypatch, capsys):
     if name == "docs/python.md":
         said = capsys.readouterr().out
         assert "its dtype is float64" in said and "INCONCLUSIVE" in said and "success 1.000" in said, said
+        assert "double-precision evaluation" in said and "\njoints" in said, said
         assert (folder / "certificate.html").exists() and (folder / "certificate.json").exists()

@@ -1,5 +1,8 @@
 """Batches of controllers over threads: the same bits as one after the other."""
 
+import threading
+import time
+
 import numpy as np
 import pytest
 
@@ -85,3 +88,58 @@ def test_batches_that_make_no_sense(kitchen, arguments, text):
         Controllers(kitchen, 2).reset([5])
     with pytest.raises(lads.errors.InstructionError, match="rows 0, 1: no instruction has been set"):
         Controllers(kitchen, 2).step(np.stack([kitchen.golden.observations["observation"][0]] * 2))
+
+
+def test_never_more_threads_than_controllers(plain):
+    assert Controllers(plain, 2, threads=10**9).threads == 2 and Controllers(plain, 1).threads == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda seen: seen.astype(np.float64), "its dtype is float64"),
+        (lambda seen: seen[:1], r"its shape is \(1, 8\), the contract says \(2, 8\)"),
+        (lambda seen: seen[0], r"its shape is \(8,\)"),
+        (lambda seen: np.asfortranarray(seen), "not contiguous"),
+        (lambda seen: seen.tolist(), "the observation is a list"),
+    ],
+)
+def test_wrong_arrays_are_named(plain, seen, change, text):
+    batch = Controllers(plain, 2)
+    with pytest.raises(lads.errors.InputError, match=text):
+        batch.step(change(np.stack([seen, seen])))
+    read_only = np.zeros((2, 3), np.float32)
+    read_only.flags.writeable = False
+    with pytest.raises(lads.errors.InputError, match="out `actions`: the array is read-only"):
+        batch.step(np.stack([seen, seen]), read_only)
+    with pytest.raises(lads.errors.StepError, match="no step has been taken yet"):
+        batch.executed(np.zeros((2, 3), np.float32))
+    batch.step(np.stack([seen, seen]))
+    with pytest.raises(lads.errors.InputError, match="not finite"):
+        batch.executed(np.full((2, 3), np.nan, np.float32))
+
+
+def test_one_batch_and_two_threads(kitchen):
+    seen = np.repeat(kitchen.golden.observations["observation"][:1], 8, 0)
+    batch = Controllers(kitchen, 8, kitchen.golden.instruction, threads=1)
+    stop, refused = threading.Event(), []
+
+    def work():
+        while not stop.is_set():
+            try:
+                batch.step(seen)
+            except lads.errors.BusyError as error:
+                refused.append(str(error))
+
+    threads = [threading.Thread(target=work) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    deadline = time.monotonic() + 60
+    while not refused and time.monotonic() < deadline:
+        time.sleep(0.01)
+    stop.set()
+    for thread in threads:
+        thread.join()
+    assert refused and "at work in another thread" in refused[0]
+    batch.reset()
+    assert batch.step(seen)[1].timestep.tolist() == [0] * 8

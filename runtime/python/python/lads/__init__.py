@@ -1,8 +1,9 @@
 """Policies in Python, by the runtime that runs them in the machine.
 
-`open` reads a policy, a bundle (.onnx) or a compiled image (.lads); `Policy.controller` puts it to work; `Controller.step` turns an
-observation into an action. `lads.gym` evaluates a controller in any environment of Gymnasium's API, `lads.vector` steps many of them over
-threads, and `verify` compares one with the policy that was trained. Whatever is refused is an exception of `lads.errors`.
+`open` reads a policy, a bundle (.onnx) or a compiled image (.lads), and `import_onnx` any other ONNX policy; `Policy.controller` puts it to
+work; `Controller.step` turns an observation into an action. `lads.gym` evaluates a controller in any environment of Gymnasium's API,
+`lads.vector` steps many of them over threads, and `verify` compares one with the policy that was trained. Whatever is refused is an exception
+of `lads.errors`.
 """
 
 import os
@@ -10,7 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from . import errors
-from ._lads import Controller, Policy, Selected, StepReport, __version__, forked, from_image, open
+from ._lads import Controller, Policy, Selected, StepReport, __version__, forked, from_image, import_onnx, open, template
 from .errors import LadsError
 
 if TYPE_CHECKING:
@@ -66,7 +67,9 @@ __all__ = [
     "errors",
     "from_image",
     "gym",
+    "import_onnx",
     "open",
+    "template",
     "vector",
     "verify",
 ]

@@ -14,11 +14,12 @@ Array: TypeAlias = NDArray[Any]
 Floats: TypeAlias = NDArray[np.float32]
 Observation: TypeAlias = Array | Mapping[str, Array]
 Told: TypeAlias = str | Floats
+Path: TypeAlias = str | os.PathLike[str]
 
 __version__: str
 
 def open(
-    path: str | os.PathLike[str],
+    path: Path,
     *,
     weights: str = "f32",
     low_level: str | None = None,
@@ -26,7 +27,24 @@ def open(
     tolerance: float | None = None,
     force: bool = False,
 ) -> Policy: ...
-def from_image(image: bytes, path: str | os.PathLike[str]) -> Policy: ...
+def from_image(image: bytes, path: Path) -> Policy: ...
+def import_onnx(
+    policy: Path | Sequence[Path],
+    robot_toml: Path | None = None,
+    *,
+    output: Path | None = None,
+    beside: Sequence[Path] | None = None,
+    action: str | None = None,
+    states: Mapping[str, str] | None = None,
+    wires: Mapping[str, str] | None = None,
+    golden: Path | None = None,
+) -> Policy: ...
+def template(
+    policy: Path | Sequence[Path],
+    robot_toml: Path | None = None,
+    *,
+    beside: Sequence[Path] | None = None,
+) -> str: ...
 def forked() -> None: ...
 def wilson(successes: int, trials: int) -> tuple[float, float]: ...
 def score(outcomes: Sequence[tuple[int, int, bool]]) -> str: ...
@@ -39,7 +57,7 @@ def judge(
 ) -> tuple[str, str, str]: ...
 def write_log(
     policy: Policy,
-    path: str | os.PathLike[str],
+    path: Path,
     seed: int,
     noise: str,
     notes: Mapping[str, str],
@@ -56,6 +74,8 @@ class Policy:
     def contract(self) -> Contract: ...
     @property
     def golden(self) -> Golden | None: ...
+    @property
+    def notes(self) -> tuple[str, ...]: ...
     def inspect(self) -> dict[str, Any]: ...
     def self_test(self) -> SelfTest: ...
     def controller(

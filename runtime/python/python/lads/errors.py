@@ -13,6 +13,15 @@ class CompileError(OpenError):
     """A bundle does not compile, or the image with fewer bits does not pass the gate."""
 
 
+class ImportOnnxError(OpenError):
+    """A policy cannot be imported: something is missing or contradicts."""
+
+    def __init__(self, text: str, problems=()) -> None:
+        super().__init__(text)
+        self.problems: tuple[tuple[str, str], ...] = tuple(problems)
+        """All that is to be settled: what each is about, and what is wrong with it."""
+
+
 class WorkspaceError(LadsError, MemoryError):
     """There is no memory, or there are no threads, for a controller."""
 
