@@ -6,7 +6,7 @@ use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use lads_compiler::{Bundle, CacheFormat, Options, Storage, WeightFormat, named};
+use lads_compiler::{Bundle, CacheFormat, Formats, Options, WeightFormat, named};
 use lads_host::output;
 
 use crate::model::Model;
@@ -49,46 +49,17 @@ pub struct Request {
     force: bool,
 }
 
-/// A format, or what the bundle was tuned to.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Choice<T> {
-    Auto,
-    Of(T),
-}
-
-impl Request {
-    /// How the numbers are stored, if anything is said of it.
-    fn storage(&self, bundle: Option<&Bundle>) -> Option<Storage> {
-        if (self.weights, self.low_level, self.cache) == (Choice::Auto, None, Choice::Auto) {
-            return None;
-        }
-        let mut storage = match self.weights {
-            Choice::Of(weights) => Storage::of_weights(weights),
-            Choice::Auto => {
-                let tuned = bundle.and_then(Bundle::tuned);
-                tuned.map_or_else(Storage::default, |tuned| tuned.storage.clone())
-            }
-        };
-        if let Some(weights) = self.low_level {
-            for entry in bundle.map(Bundle::acting_entries).unwrap_or_default() {
-                let inside = format!("{entry}/");
-                storage.parts.retain(|part, _| !part.starts_with(&inside));
-                storage.parts.insert(entry, weights);
-            }
-        }
-        if let Choice::Of(cache) = self.cache {
-            storage.cache = cache;
-        }
-        Some(storage)
-    }
-}
-
 /// Compiles as requested.
 pub fn compile(request: Request) -> Result<(), Refusal> {
     // What is no bundle is refused below, with what it is instead.
     let bundle = Bundle::open(&request.model).ok();
+    let formats = Formats {
+        weights: request.weights.0,
+        low_level: request.low_level,
+        cache: request.cache.0,
+    };
     let options = Options {
-        storage: request.storage(bundle.as_ref()),
+        storage: bundle.as_ref().and_then(|bundle| formats.storage(bundle)),
         tolerance: request.tolerance,
         force: request.force,
     };
@@ -110,7 +81,8 @@ pub fn compile(request: Request) -> Result<(), Refusal> {
     .collect();
     output::check(&[("", &model)], &outputs).map_err(Refusal::of)?;
     let model = Model::compile(&model, &options)?;
-    let again = output.is_some() || options != Options::default();
+    let asked = formats != Formats::default() || options != Options::default();
+    let again = output.is_some() || asked;
     if again && !model.is_bundle() {
         return Err(Refusal::new(
             model.path.display(),
@@ -163,13 +135,17 @@ fn cache_format(name: &str) -> Result<CacheFormat, String> {
     named(name, CacheFormat::ALL, CacheFormat::name)
 }
 
+/// A format; `None` is `auto`.
+#[derive(Debug, Clone, Copy)]
+struct Choice<T>(Option<T>);
+
 /// A parser that also knows `auto`.
 fn auto_or<T>(
     format: fn(&str) -> Result<T, String>,
 ) -> impl Fn(&str) -> Result<Choice<T>, String> + Clone {
     move |name| match name {
-        "auto" => Ok(Choice::Auto),
-        _ => format(name).map(Choice::Of),
+        "auto" => Ok(Choice(None)),
+        _ => format(name).map(|format| Choice(Some(format))),
     }
 }
 

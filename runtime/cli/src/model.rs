@@ -31,6 +31,11 @@ impl Model {
         })
     }
 
+    /// The policy.
+    pub fn opened(&self) -> &Opened {
+        &self.opened
+    }
+
     /// Whether it was read from a bundle and compiled, not read as an image.
     pub fn is_bundle(&self) -> bool {
         self.opened.is_bundle()

@@ -63,6 +63,6 @@ pub use image::Image;
 pub use lads_image::op::{CacheFormat, WeightFormat};
 pub use reference::Reference;
 pub use report::{CompileReport, LayerReport, ProgramReport};
-pub use storage::{Evidence, Storage, Tuned, named};
+pub use storage::{Evidence, Formats, Storage, Tuned, named};
 pub use survey::{Field, Missing, Operand, Operator, Survey, Value, survey};
 pub use verify::PlanFault;

@@ -11,6 +11,7 @@ use lads_image::op::{CacheFormat, WeightFormat};
 use prost::Message as _;
 use serde::{Deserialize, Serialize};
 
+use crate::bundle::Bundle;
 use crate::error::BundleError;
 use crate::onnx::{StringStringEntryProto, fields};
 
@@ -87,6 +88,42 @@ impl fmt::Display for Storage {
             write!(f, " and an {} cache", self.cache.name())?;
         }
         Ok(())
+    }
+}
+
+/// What a person says of formats; what is left out is as the bundle was tuned, and with 32 bits where it was not.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Formats {
+    /// Of all weights.
+    pub weights: Option<WeightFormat>,
+    /// Of the weights of what is in the action and does not only select an index, if otherwise.
+    pub low_level: Option<WeightFormat>,
+    /// Of the KV caches.
+    pub cache: Option<CacheFormat>,
+}
+
+impl Formats {
+    /// What that is in this bundle; `None` if nothing was said.
+    pub fn storage(self, bundle: &Bundle) -> Option<Storage> {
+        if self == Self::default() {
+            return None;
+        }
+        let tuned = || bundle.tuned().map(|tuned| tuned.storage.clone());
+        let mut storage = match self.weights {
+            Some(weights) => Storage::of_weights(weights),
+            None => tuned().unwrap_or_default(),
+        };
+        if let Some(weights) = self.low_level {
+            for entry in bundle.acting_entries() {
+                let inside = format!("{entry}/");
+                storage.parts.retain(|part, _| !part.starts_with(&inside));
+                storage.parts.insert(entry, weights);
+            }
+        }
+        if let Some(cache) = self.cache {
+            storage.cache = cache;
+        }
+        Some(storage)
     }
 }
 
