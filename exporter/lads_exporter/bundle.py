@@ -12,12 +12,13 @@ import onnx
 from onnx import helper
 from safetensors.numpy import save as save_safetensors
 
-from . import __version__, contract as contracts, graphs, twin
+from . import __version__, contract as contracts, systems, twin
 from .config import UserError
 from .output import write_atomically
 
 GOLDEN_TOLERANCE = 1e-4
-GOLDEN_MARGIN = 1e-2  # smallest difference between the two best logits at any decision of a golden episode
+GOLDEN_MARGIN = 1e-2  # smallest difference between the two best logits at any decision of a golden episode, if an episode has it
+LEAST_MARGIN = 1e-3  # what the clearest one must have else
 
 
 def describe(family, environment, instructions, encoded, provenance, layer=-1, pooling="none", **parts):
@@ -48,25 +49,19 @@ def describe(family, environment, instructions, encoded, provenance, layer=-1, p
     return found
 
 
-def contract(setting, encoded, provenance):
-    """The contract of a LADS policy."""
+def contract(setting, encoded, provenance, exported):
+    """The contract of a trained policy."""
     config, environment = setting.config, setting.environment
-    high, encoder = config.high_level, config.encoder
-    family = {
-        "kind": "lads",
-        "horizon": encoder.horizon,
-        "codebook": {"size": encoder.codebook_size, "dim": encoder.codebook_dim},
-        "decision": {"rule": config.decision, "temperature": 1.0, "seed": 0},
-    }
+    high = config.high_level
     return describe(
-        family,
+        exported.family,
         environment,
         setting.instructions,
         encoded,
         {"setting": config.name, **provenance},
         layer=config.language.layer,
         pooling="mean" if config.language.pool else "none",
-        channels=contracts.channels(environment, words=[encoded.max_words, encoded.dim], segment=encoder.horizon),
+        channels=contracts.channels(environment, [encoded.max_words, encoded.dim], exported.noise, exported.segment),
         context={"words": encoded.max_words, "steps": high.context_steps, "beyond": config.beyond_context},
         network={"layers": high.layers, "heads": high.heads, "head_dim": high.hidden // high.heads},
     )
@@ -97,26 +92,30 @@ def golden_tensors(rollout, instruction, channels):
 
 
 def golden(model, candidates):
-    """The first candidate whose decisions are clear, as safetensors bytes. `model` has its contract in it.
+    """The first candidate whose decisions are clear, or the clearest one, as safetensors bytes. `model` has its contract in it.
 
     A candidate is an instruction's index, None for a policy without, and {name of a channel: [T, ...]}, or the array of the one
     observation. An episode longer than the context is cut; a close decision would make the self-test depend on rounding.
     """
     runner = twin.Twin(model)
     rows = {row["name"]: row for row in contracts.of_role(runner.contract, "observation")}
-    closest = []
+    best, clearest = 0.0, None
+    tried = 0
     for instruction, given in candidates:
         given = given if isinstance(given, dict) else {next(iter(rows)): given}
         kind = lambda name: contracts.DTYPES[rows[name]["dtype"]]
         channels = {name: np.ascontiguousarray(array[: runner.steps], kind(name)) for name, array in given.items()}
         rollout = twin.open_loop(runner, instruction, channels)
-        if rollout.margin >= GOLDEN_MARGIN:
-            return save_safetensors(golden_tensors(rollout, instruction, channels), metadata={"tolerance": str(GOLDEN_TOLERANCE)})
-        closest.append(rollout.margin)
-    raise UserError(
-        f"none of {len(closest)} episodes decides with a margin of {GOLDEN_MARGIN} at every decision"
-        f" (best {max(closest, default=0):.4f}); train longer or give more episodes"
-    )
+        tried += 1
+        if rollout.margin > best:
+            best, clearest = rollout.margin, golden_tensors(rollout, instruction, channels)
+        if best >= GOLDEN_MARGIN:
+            break
+    if best < LEAST_MARGIN:
+        raise UserError(
+            f"none of {tried} episodes decides with a margin of {LEAST_MARGIN} at every decision (best {best:.4f}); train longer or give more episodes"
+        )
+    return save_safetensors(clearest, metadata={"tolerance": str(GOLDEN_TOLERANCE)})
 
 
 def seal(model, found, candidates):
@@ -128,11 +127,11 @@ def seal(model, found, candidates):
     return model
 
 
-def assemble(lads, setting, encoded, provenance, candidates):
+def assemble(networks, setting, encoded, provenance, candidates):
     """The complete, checked bundle. `candidates` yields (instruction index, observations) for the golden episode."""
-    lads.eval()
-    model = graphs.build(lads, encoded, setting.config.encoder.horizon)
-    return seal(model, contract(setting, encoded, provenance), candidates)
+    networks.eval()
+    exported = systems.of(setting.config).export(networks, setting, encoded)
+    return seal(exported.model, contract(setting, encoded, provenance, exported), candidates)
 
 
 def save(model, path):

@@ -5,8 +5,19 @@ import json
 from pathlib import Path
 
 from . import acceptance
-from .config import UserError
+from .config import LADS, UserError
 from .training import CURVES, SUMMARY
+
+
+SYSTEMS = {
+    "lads": "LADS",
+    "vae": "VAE (or LADS with a VAE)",
+    "cluster": "Cluster",
+    "lang_dt": "Lang DT",
+    "lisa": "LISA",
+    "lcsd": "LCSD (our reading)",
+    "skilldiffuser": "SkillDiffuser",
+}
 
 
 def read_results(path):
@@ -81,17 +92,26 @@ def free_sentences(calibrated):
     return ["", "## Free sentences", "", *acceptance.lines(calibrated)]
 
 
+def _plans(summary):
+    """How the plans are used, where there are any."""
+    if "codebook_size" in summary:
+        share = summary["perplexity"] / summary["codebook_size"]
+        return [f"- codebook: perplexity {summary['perplexity']:.1f} of {summary['codebook_size']} over the dataset ({share:.0%}), {summary['revived']} codes revived"]
+    if "plan_elements" in summary:
+        return [f"- plans: {summary['plan_elements_in_use']} of {summary['plan_elements']} elements carry something, {summary['divergence']:.1f} nats in all"]
+    return []
+
+
 def write(folder, saved, sha256, results=None, beside=(), notes="", calibrated=None):
     """The card as Markdown. `folder` is the run's, `saved` its checkpoint, `notes` what a person has to say, `calibrated` which sentences it follows."""
     summary = json.loads((Path(folder) / SUMMARY).read_text(encoding="utf-8"))
     tables, environment, _ = saved["identity"]["tables"]
     steps = ", ".join(f"{name} {count} ({summary['seconds'][name]:.0f} s)" for name, count in summary["steps"].items())
     held_out = ", ".join(f"{name.removeprefix('val_')} {value:.4g}" for name, value in summary["validation"].items())
-    share = summary["perplexity"] / summary["codebook_size"]
     lines = [
         f"# Model card: {tables['name']}",
         "",
-        f"A LADS policy for {environment['id']} (version {environment['version']}), one ONNX file with the contract and a golden episode inside.",
+        f"A {SYSTEMS[tables.get('system', LADS)['kind']]} policy for {environment['id']} (version {environment['version']}), one ONNX file with the contract and a golden episode inside.",
         "Intended for simulation and study; it has seen no real robot.",
         "",
         f"- sha256 of the bundle: `{sha256}`",
@@ -99,7 +119,7 @@ def write(folder, saved, sha256, results=None, beside=(), notes="", calibrated=N
         *(f"- data, {name}: {value if isinstance(value, str) else json.dumps(value)}" for name, value in saved["notes"].items()),
         f"- language encoder: {tables['language']['encoder']}, layer {tables['language']['layer']}, sha256 `{saved['identity']['language_sha256']}`",
         f"- training: {summary['schedule']}, seed {summary['seed']}, steps {steps}",
-        f"- codebook: perplexity {summary['perplexity']:.1f} of {summary['codebook_size']} over the dataset ({share:.0%}), {summary['revived']} codes revived",
+        *_plans(summary),
         f"- held out: {held_out}",
         f"- versions: {', '.join(f'{name} {version}' for name, version in summary['versions'].items())}",
         *_results(results, sha256, beside),

@@ -108,6 +108,71 @@ class Training:
 
 
 @dataclass(frozen=True)
+class Lads:
+    kind: str
+    regressed: bool  # the high level regresses the plan and the nearest code is taken (w/o CP); false classifies
+
+
+@dataclass(frozen=True)
+class Vae:
+    kind: str
+    beta: float  # weight of the divergence from the prior, per element
+    rule: str  # which plan is taken: "mean", or "sample"
+
+
+@dataclass(frozen=True)
+class Cluster:
+    kind: str
+    points: int  # observations that are embedded in the plane
+    perplexity: float  # of t-SNE
+
+
+@dataclass(frozen=True)
+class LangDt:
+    kind: str
+
+
+@dataclass(frozen=True)
+class Lisa:
+    kind: str
+    low_level_layers: int
+    option_gradient: str  # which of an option's H copies carry its gradient: "first" (the published code's), or "all"
+
+
+@dataclass(frozen=True)
+class Lcsd:
+    kind: str
+    hidden: int  # of the denoiser and of the instruction's reconstruction
+    steps: int  # denoising passes
+    language: float  # weight of the instruction's reconstruction from the plans
+    average: float  # decay of the moving average of the denoiser's weights, which is what acts
+
+
+@dataclass(frozen=True)
+class SkillDiffuser:
+    kind: str
+    low_level_layers: int  # of the LISA that the high level comes from
+    option_gradient: str
+    width: int  # channels of the U-Net at its full length
+    multiples: list  # of the width, one per length
+    groups: int  # of the group norms
+    inverse: int  # hidden units of the inverse dynamics
+    schedule: int  # noise levels it is trained on
+    dropout: float  # share of windows whose option is left out in training
+    guidance: float
+    temperature: float  # of the noise
+    clip: float  # bound of the denoised rows
+    average: float
+    sampler: str  # "ddim", or "ddpm" over all levels
+    passes: int  # denoising passes of the sampler
+    diffusion: Stage  # the second stage; its batch is of windows
+
+
+SYSTEMS = {"lads": Lads, "vae": Vae, "cluster": Cluster, "lang_dt": LangDt, "lisa": Lisa, "lcsd": Lcsd, "skilldiffuser": SkillDiffuser}
+LADS = {"kind": "lads", "regressed": False}  # what a configuration without [system] trains
+
+
+@dataclass(frozen=True)
 class Config:
     name: str
     environment: str
@@ -121,6 +186,19 @@ class Config:
     alignment: Alignment
     data: Data
     training: Training
+    system: object  # one of SYSTEMS
+
+    @property
+    def period(self):
+        """Control steps from one plan to the next: a chunk of H states has H - 1 actions, and what has no plan or one at each step has 1."""
+        return {"skilldiffuser": self.encoder.horizon - 1, "lcsd": 1, "lang_dt": 1}.get(self.system.kind, self.encoder.horizon)
+
+
+def _system(table, where):
+    kind = table.get("kind") if isinstance(table, dict) else None
+    if kind not in SYSTEMS:
+        raise UserError(f"{where}: kind = {kind!r}: unknown system; known: {', '.join(SYSTEMS)}")
+    return _build(SYSTEMS[kind], table, where)
 
 
 def _build(kind, table, where):
@@ -135,7 +213,9 @@ def _build(kind, table, where):
         if name not in table:
             raise UserError(f"{where}: key {name!r} is missing")
         value = table[name]
-        if dataclasses.is_dataclass(field.type):
+        if field.name == "system":
+            value = _system(value, f"{where}[system]")
+        elif dataclasses.is_dataclass(field.type):
             value = _build(field.type, value, f"{where}[{name}]")
         elif field.type is float and type(value) is int:
             value = float(value)
@@ -187,21 +267,25 @@ class Setting:
 
 def from_tables(table, environment, instructions, where):
     """Checks the three tables of a setting against each other."""
-    config = _build(Config, table, str(where))
+    config = _build(Config, {"system": LADS} | table, str(where))
     for name, value, allowed in (
         ("decision", config.decision, ("argmax", "sample")),
         ("beyond_context", config.beyond_context, ("restart", "refuse")),
         ("training.schedule", config.training.schedule, ("joint", "staged")),
         ("training.ce_at", config.training.ce_at, ("all", "decisions")),
+        ("system.rule", getattr(config.system, "rule", "mean"), ("mean", "sample")),
+        ("system.option_gradient", getattr(config.system, "option_gradient", "all"), ("first", "all")),
+        ("system.sampler", getattr(config.system, "sampler", "ddim"), ("ddim", "ddpm")),
     ):
         if value not in allowed:
             raise UserError(f"{where}: {name} = {value!r}: must be one of {', '.join(allowed)}")
     if config.high_level.hidden % config.high_level.heads:
         raise UserError("high_level.hidden must be a multiple of high_level.heads")
-    steps, horizon = config.high_level.context_steps, config.encoder.horizon
-    if horizon < 1 or steps < 1 or steps % horizon:
+    steps, period = config.high_level.context_steps, config.period
+    if period < 1 or steps < 1 or steps % period:
         raise UserError(
-            f"{where}: high_level.context_steps = {steps} is no multiple of encoder.horizon = {horizon}: where the context starts anew,"
+            f"{where}: high_level.context_steps = {steps} is no multiple of the plan period of {period}"
+            f" (encoder.horizon = {config.encoder.horizon}): where the context starts anew,"
             " a plan would begin off the grid that the policy was trained on"
         )
     for key in ("id", "version", "control_period_s", "quaternion_order", "observation", "action"):
@@ -221,8 +305,14 @@ def from_tables(table, environment, instructions, where):
     return Setting(config, environment, rows, [table, environment, instructions])
 
 
-def load(path):
-    """Reads a configuration and the environment and instruction files it names."""
+def layered(table, over):
+    """A table with the values of another in the place of its own; tables within it are layered, [system] is replaced."""
+    both = {key: layered(table[key], value) for key, value in over.items() if key != "system" and isinstance(value, dict) and isinstance(table.get(key), dict)}
+    return table | over | both
+
+
+def load(path, *over):
+    """Reads a configuration and the environment and instruction files it names; `over` are files of a system's own values."""
     path = find(path)
     table = _parse(path, tomllib.loads)
     beside = {}
@@ -231,4 +321,7 @@ def load(path):
         if not isinstance(name, str):
             raise UserError(f"{path}: key {key!r} is missing")
         beside[key] = _parse(find(path.parent / name), parser)
-    return from_tables(table, beside["environment"], beside["instructions"], path)
+    for one in over:
+        table = layered(table, read_toml(one))
+    where = " with ".join(str(one) for one in (path, *over))
+    return from_tables(table, beside["environment"], beside["instructions"], where)

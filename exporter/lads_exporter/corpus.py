@@ -68,6 +68,10 @@ class Corpus:
         weights = [config.data.weights.get(row["id"], 1.0) for row in setting.instructions]
         self.own_texts = dataset.texts is not None
         self.weights = torch.ones(count) if self.own_texts else torch.tensor(weights)[self.instruction]
+        lengths = self.lengths[self.train]
+        self.transition_episodes = self.train.repeat_interleave(lengths)
+        self.transition_steps = torch.cat([torch.arange(n) for n in lengths.tolist()])
+        self.cumulative = self.weights[self.transition_episodes].double().cumsum(0)
 
     def _padded(self, rows, dataset):
         out = rows.new_zeros(len(dataset), self.steps, rows.shape[1])
@@ -97,6 +101,14 @@ class Corpus:
         drawn = torch.cat([self.draw(batch, generator) for _ in range(POOL)])
         return drawn[self.lengths[drawn].argsort(stable=True)].view(POOL, batch)
 
+    def draw_transitions(self, batch, generator):
+        """`batch` single steps of the training episodes by weight: episode, step, and the start of a window of H steps that it lies in."""
+        points = torch.rand(batch, generator=generator, dtype=torch.double) * self.cumulative[-1]
+        drawn = torch.searchsorted(self.cumulative, points).clamp(max=len(self.transition_steps) - 1)
+        episodes, steps = self.transition_episodes[drawn], self.transition_steps[drawn]
+        starts = (steps - torch.randint(self.horizon, (batch,), generator=generator)).clamp(min=0)
+        return tuple(x.to(self.device) for x in (episodes, steps, starts))
+
     def segments(self, episodes, offsets):
         """Cuts each episode into windows of H steps that start at its offset; the last one may be shorter."""
         rows, starts, places = [], [], []
@@ -122,10 +134,14 @@ class Corpus:
         starts = torch.cat([torch.arange(length) for length in lengths.tolist()])
         return self._windows(episodes[rows], starts, rows, starts)
 
-    @torch.no_grad()
     def codes(self, encode, episodes):
         """The code of the window that starts at each step of the episodes, [B, T], -1 beyond an episode's end."""
-        out = torch.full((len(episodes), self.steps), -1, dtype=torch.long, device=self.device)
+        return self.of_windows(encode, episodes, torch.full((len(episodes), self.steps), -1, dtype=torch.long))
+
+    @torch.no_grad()
+    def of_windows(self, encode, episodes, out):
+        """Fills `out` [B, T, ...] with what `encode` gives for the window that starts at each step of the episodes."""
+        out = out.to(self.device)
         for first, part in enumerate(torch.as_tensor(episodes).split(64)):
             windows = self.every_window(part)
             out[64 * first + windows.rows, windows.starts] = encode(windows)

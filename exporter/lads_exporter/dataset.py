@@ -58,7 +58,7 @@ def load(path, setting):
     return dataset
 
 
-def _sha256(path):
+def sha256(path):
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -134,7 +134,7 @@ def _read_safetensors(path, setting):
         floats["executed"],
         offsets,
         translate[labels],
-        _sha256(path),
+        sha256(path),
         notes,
         own,
     )
@@ -194,4 +194,4 @@ def _read_d4rl(path, setting):
     offsets = np.cumsum([0, *(len(row) for row in rows)])
     actions = actions[chosen].astype(np.float32)
     states = observations[chosen, :width].astype(np.float32)
-    return Dataset(states, None, actions, np.clip(actions, -1, 1), offsets, np.array(kept), _sha256(path), dict(notes))
+    return Dataset(states, None, actions, np.clip(actions, -1, 1), offsets, np.array(kept), sha256(path), dict(notes))

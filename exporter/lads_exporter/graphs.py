@@ -317,9 +317,13 @@ def trajectory_encode(graph, encoder, codes, normalizer, horizon):
         if not final:
             x = entry.op("LeakyRelu", [x], out + ".leaky", alpha=encoder.mlp[1].negative_slope)
     entry.output("latent", [1, linears[-1].out_features])
-    if codes is None:
-        return
-    offset = entry.op("Sub", [x, entry.weight("codebook", codes)], "offset")
+    if codes is not None:
+        nearest_code(entry, x, codes)
+
+
+def nearest_code(entry, latent, codes):
+    """The index of the code nearest to a latent [1, D]."""
+    offset = entry.op("Sub", [latent, entry.weight("codebook", codes)], "offset")
     square = entry.op("Mul", [offset, offset], "offset_squared")
     distance = entry.op("ReduceSum", [square, entry.integers("axis_one", [1])], "distance", keepdims=0)
     entry.op("ArgMin", [distance], "index", axis=0, keepdims=1)

@@ -86,6 +86,15 @@ class Block(nn.Module):
         return x + self.drop(self.down(F.relu(self.up(self.norm2(x)))))
 
 
+def start_weights(transformer):
+    """Weights of all linear layers and tables N(0, 0.02), biases 0."""
+    for module in transformer.modules():
+        if isinstance(module, (nn.Linear, nn.Embedding)):
+            nn.init.normal_(module.weight, 0.0, 0.02)
+        if isinstance(module, nn.Linear):
+            nn.init.zeros_(module.bias)
+
+
 class HighLevelPolicy(nn.Module):
     """pi_h: a causal transformer over words, states and actions; plan logits at every state token (equation 8).
 
@@ -104,11 +113,7 @@ class HighLevelPolicy(nn.Module):
         self.blocks = nn.ModuleList(Block(hidden, config.heads, config.dropout) for _ in range(config.layers))
         self.norm = nn.LayerNorm(hidden)
         self.head = nn.Linear(hidden, codes)
-        for module in self.modules():
-            if isinstance(module, (nn.Linear, nn.Embedding)):
-                nn.init.normal_(module.weight, 0.0, 0.02)
-            if isinstance(module, nn.Linear):
-                nn.init.zeros_(module.bias)
+        start_weights(self)
 
     def forward(self, words, observations, actions=None):
         """words: B tensors [L_i, E]; observations [B, T, O]; actions [B, T, A], or None -> logits [B, T, M].
@@ -255,7 +260,8 @@ class Alignment(nn.Module):
 class Lads(nn.Module):
     """All networks of one policy. `forward` is not defined: the parts are trained and exported separately."""
 
-    def __init__(self, setting, encoded):
+    def __init__(self, setting, encoded, head=None):
+        """head: the high level's outputs, if they are no logits over the codes."""
         super().__init__()
         config, o, a = setting.config, setting.observation_len, setting.action_len
         encoder = config.encoder
@@ -263,6 +269,6 @@ class Lads(nn.Module):
         self.encoder = TrajectoryEncoder(encoder.hidden, o, a, encoder.codebook_dim, encoder.observed or o, encoder.relative)
         self.codebook = Codebook(encoder)
         self.low_level = LowLevelPolicy(config.low_level, o, encoder.codebook_dim, a)
-        self.high_level = HighLevelPolicy(config.high_level, encoded.dim, o, a, encoder.codebook_size)
+        self.high_level = HighLevelPolicy(config.high_level, encoded.dim, o, a, head or encoder.codebook_size)
         sentence_dim = len(encoded.instructions[0].sentence)
         self.alignment = Alignment(config.alignment, encoder.codebook_dim, sentence_dim)

@@ -174,9 +174,12 @@ def _acting(model, contract, run):
     saved, setting = training.load_run(run)
     if saved["identity"]["dataset_sha256"] != contract["provenance"]["dataset_sha256"]:
         raise config.UserError(f"{run} was trained on other data than the bundle")
+    system = setting.config.system
+    if system.kind != "lads" or system.regressed:
+        raise config.UserError(f"{run}: its networks are folded when they are exported; leave --run out, the bundle has their weights")
     encoded = language.encode(setting.config.language, [row["text"] for row in setting.instructions])
     lads = Lads(setting, encoded)
-    lads.load_state_dict(saved["lads"])
+    lads.load_state_dict(saved["networks"])
     trained, exported = weights.from_lads(lads), weights.from_bundle(model, contract)
     if not all(torch.equal(a, b) for a, b in ((trained.codes, exported.codes), (trained.high_level.head.weight, exported.high_level.head.weight))):
         raise config.UserError(f"{run} is not the run that the bundle was exported from; name that one, or leave --run out")

@@ -1,19 +1,14 @@
-"""Training LADS: jointly by Algorithm 1, or in three stages.
+"""Training a system: a run is a folder with a checkpoint, the curves, and at the end a summary.
 
-The stop-gradients of equation 7 keep the cross-entropy from moving the plans and the other losses from
-moving the high level, so the stages minimise the same sum (equation 11) in turn:
-1. `plans`: encoder, codebook, low level and semantic regularisation;
-2. `low_level`: the low level alone, on the frozen codes of all windows;
-3. `high_level`: the transformer alone, on the frozen codes of all windows.
-
-Every step seeds the random numbers with (seed, stage, step): a resumed run does what an uninterrupted one
-would have done. An interrupt finishes the step at hand, writes a checkpoint and stops.
+Which stages there are and what each minimises is the system's (`systems`). Every step seeds the random numbers with (seed, stage, step): a
+resumed run does what an uninterrupted one would have done. An interrupt finishes the step at hand, writes a checkpoint and stops.
 """
 
 import csv
 import io
 import json
 import math
+import pickle
 import signal
 import time
 import zlib
@@ -23,126 +18,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from tqdm import tqdm
 
-from . import __version__, config as configuration, language
+from . import __version__, config as configuration, language, systems
 from .output import write_atomically
-from .codebook import nearest, perplexity
 from .config import UserError
 from .corpus import Corpus
-from .endings import Endings
 from .hindsight import relabel
-from .model import Lads
 
-STAGES = {"joint": ("joint",), "staged": ("plans", "low_level", "high_level")}
 LOG_EVERY, VALIDATE_EVERY, SAVE_SECONDS = 50, 500, 120
 CHECKPOINT, CURVES, SUMMARY = "checkpoint.pt", "curves.csv", "summary.json"
-COLUMNS = ("stage", "step", "learning_rate", "ms_per_step", "loss", "bc", "commitment", "align", "ce", "perplexity",
-           "revived", "val_bc", "val_perplexity", "val_ce", "val_accuracy")  # fmt: skip
-
-
-class Losses:
-    """The losses of Section 4 on a corpus, as functions of episodes."""
-
-    def __init__(self, lads, corpus, setting):
-        self.lads, self.corpus, self.config = lads, corpus, setting.config
-        self.endings = Endings(setting, corpus.device)
-        self.autocast = setting.config.training.bf16 and _fast_bfloat16(corpus.device)
-
-    def offsets(self, episodes, generator):
-        if not self.config.training.random_offset:
-            return torch.zeros(len(episodes), dtype=torch.long)
-        return torch.randint(self.corpus.horizon, (len(episodes),), generator=generator)
-
-    def plans(self, episodes, offsets):
-        """L_BC, the commitment term of L_VQ and L_align (equations 5, 6, 10); and the segments' codes [B, T].
-
-        The code of a segment stands at the step at which it starts, -1 at all other steps.
-        """
-        lads, segments = self.lads, self.corpus.segments(episodes, offsets)
-        latents = lads.encoder(segments.observations, segments.executed, segments.lengths)
-        plans, index, commitment = lads.codebook(latents)
-        valid = segments.valid
-        each = plans[:, None].expand(-1, self.corpus.horizon, -1)[valid]
-        actions = lads.low_level(segments.low_level_observations[valid], each)
-        losses = {"bc": F.mse_loss(actions, segments.actions[valid]), "commitment": commitment}
-        losses["align"] = self._align(plans, segments, episodes)
-        codes = torch.full((len(episodes), self.corpus.steps), -1, dtype=torch.long, device=self.corpus.device)
-        codes[segments.rows, segments.starts] = index
-        return losses, codes
-
-    def _align(self, plans, segments, episodes):
-        if self.config.alignment.weight == 0:
-            return plans.new_zeros(())
-        most = int(segments.places.max()) + 1
-        sequence = plans.new_zeros(len(episodes), most, plans.shape[1])
-        valid = torch.zeros(len(episodes), most, dtype=torch.bool, device=plans.device)
-        sequence[segments.rows, segments.places] = plans
-        valid[segments.rows, segments.places] = True
-        instruction = self.corpus.instruction[episodes].to(plans.device)
-        return self.lads.alignment(sequence, valid, self.corpus.sentences[instruction], instruction)
-
-    def high_level(self, episodes, codes):
-        """L_CE (equation 8) and the accuracy; codes [B, T] are the targets, -1 where there is none."""
-        corpus = self.corpus
-        length = int(corpus.lengths[episodes].max())
-        at = episodes.to(corpus.device)
-        words, codes = self._instructions(episodes, codes[:, :length])
-        observations, executed = corpus.observations[at, :length], corpus.executed[at, :length]
-        words, codes, observations, executed = self._contexts(words, codes, observations, executed)
-        with torch.autocast(corpus.device.type, torch.bfloat16, enabled=self.autocast):
-            logits = self.lads.high_level(words, observations, executed)
-        logits, targets = logits[codes >= 0], codes[codes >= 0]
-        return F.cross_entropy(logits, targets), (logits.argmax(-1) == targets).float().mean()
-
-    def _contexts(self, words, codes, observations, executed):
-        """Cuts trajectories that are longer than the context where the controller restarts it: a row for each context."""
-        most, length = self.config.high_level.context_steps, codes.shape[1]
-        if length <= most:
-            return words, codes, observations, executed
-        count = -(-length // most)
-        more = count * most - length
-        codes = F.pad(codes, (0, more), value=-1).reshape(-1, most)
-        observations, executed = (F.pad(x, (0, 0, 0, more)).reshape(-1, most, x.shape[-1]) for x in (observations, executed))
-        kept = (codes >= 0).any(1)
-        words = [words[row // count] for row in kept.nonzero()[:, 0].tolist()]
-        return words, codes[kept], observations[kept], executed[kept]
-
-    def _instructions(self, episodes, codes):
-        """The words of each episode's instruction and its targets; in training, some with another ending."""
-        words = [self.corpus.words[i] for i in self.corpus.instruction[episodes]]
-        if not self.lads.high_level.training:
-            return words, codes
-        if self.corpus.own_texts:  # labels of what was done have no order, so no ending
-            return [self._some_words(row) for row in words], codes
-        codes = codes.clone()
-        for row, episode in enumerate(episodes.tolist()):
-            other = self.endings.draw(int(self.corpus.instruction[episode]), int(self.corpus.lengths[episode]))
-            if other is not None:
-                words[row], steps = other
-                codes[row, steps:] = -1
-        return [self._some_words(row) for row in words], codes
-
-    def _some_words(self, words):
-        """The words, disturbed, less a random few; the last token ([SEP]) always stays."""
-        rate, noise = self.config.data.word_dropout, self.config.data.word_noise
-        if noise > 0:
-            words = words + noise * words.square().mean().sqrt() * torch.randn_like(words)
-        if rate == 0:
-            return words
-        keep = torch.rand(len(words), device=words.device) >= rate
-        keep[-1] = True
-        return words[keep]
-
-    @torch.no_grad()
-    def encode(self, segments):
-        latents = self.lads.encoder(segments.observations, segments.executed, segments.lengths)
-        return nearest(latents, self.lads.codebook.codes)
-
-
-def _fast_bfloat16(device):
-    return device.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+COLUMNS = ("stage", "step", "learning_rate", "ms_per_step", "loss", "bc", "commitment", "align", "ce", "kl", "noise", "language", "perplexity",
+           "revived", "val_bc", "val_perplexity", "val_ce", "val_accuracy", "val_kl", "val_noise")  # fmt: skip
 
 
 @contextmanager
@@ -157,40 +44,17 @@ def _matmul_precision(name):
 
 
 class Stage:
-    """One stage: its parameters, and the total loss of one step."""
+    """One stage: the parameters that it trains, and their optimiser."""
 
     def __init__(self, name, trainer):
-        self.name, self.trainer = name, trainer
-        self.lads, self.corpus, self.losses = trainer.lads, trainer.corpus, trainer.losses
+        self.name, self.trainer, self.system = name, trainer, trainer.system
         self.training = trainer.config.training
-        self.settings = getattr(self.training, name)
-        parts = {
-            "joint": ("encoder", "low_level", "alignment", "high_level"),
-            "plans": ("encoder", "low_level", "alignment"),
-            "low_level": ("low_level",),
-            "high_level": ("high_level",),
-        }[name]
-        self.modules = [getattr(self.lads, part) for part in parts]
-        if name in ("joint", "plans"):
-            self.modules.append(self.lads.codebook)
-        self.parameters = [value for part in parts for value in getattr(self.lads, part).parameters()]
+        self.settings = self.system.settings(trainer.config, name)
+        self.modules = [getattr(trainer.networks, part) for part in self.system.parts(name)]
+        self.parameters = [value for module in self.modules for value in module.parameters()]
         rate, decay = self.settings.learning_rate, self.settings.weight_decay
         self.optimizer = torch.optim.AdamW(self.parameters, rate, weight_decay=decay, fused=True)
-        self.codes = None
-        if name in ("low_level", "high_level"):
-            self.lads.eval()
-            self.codes = self.corpus.codes(self.losses.encode, range(len(self.corpus.lengths)))
-        if name == "high_level" and self.training.ce_at == "decisions":
-            self.codes[:, torch.arange(self.corpus.steps) % self.corpus.horizon > 0] = -1
-        if name == "low_level":
-            self._list_transitions()
-
-    def _list_transitions(self):
-        corpus = self.corpus
-        lengths = corpus.lengths[corpus.train]
-        self.episodes = corpus.train.repeat_interleave(lengths)
-        self.steps = torch.cat([torch.arange(n) for n in lengths.tolist()])
-        self.cumulative = corpus.weights[self.episodes].double().cumsum(0)
+        self.system.begin(name)
 
     def learning_rate(self, step):
         """Linear warm-up, then a cosine down to `final` of the rate."""
@@ -198,95 +62,26 @@ class Stage:
         cosine = 0.5 * (1 + math.cos(math.pi * step / s.steps))
         return s.learning_rate * min(1.0, (step + 1) / s.warmup) * (s.final + (1 - s.final) * cosine)
 
-    def loss(self, step):
-        """The total loss of a step and its parts."""
-        generator_of = lambda draw: torch.Generator().manual_seed(self.trainer.seed_of(self.name, "draw", draw))
-        if self.name == "low_level":
-            return self._low_level_loss(generator_of(step))
-        if self.name == "high_level":
-            episodes = self.corpus.draw_alike(self.settings.batch, step, generator_of)
-            ce, _ = self.losses.high_level(episodes, self.codes[episodes.to(self.corpus.device)])
-            return ce, {"ce": ce}
-        return self._plans_loss(step, generator_of(step))
-
-    def _low_level_loss(self, generator):
-        corpus, batch = self.corpus, self.settings.batch
-        points = torch.rand(batch, generator=generator, dtype=torch.double) * self.cumulative[-1]
-        drawn = torch.searchsorted(self.cumulative, points).clamp(max=len(self.steps) - 1)
-        episodes, steps = self.episodes[drawn], self.steps[drawn]
-        starts = (steps - torch.randint(corpus.horizon, (batch,), generator=generator)).clamp(min=0)
-        episodes, steps, starts = (x.to(corpus.device) for x in (episodes, steps, starts))
-        plans = self.lads.codebook.codes[self.codes[episodes, starts]]
-        bc = F.mse_loss(self.lads.low_level(corpus.shown(episodes, steps), plans), corpus.actions[episodes, steps])
-        return self.training.bc_weight * bc, {"bc": bc}
-
-    def _plans_loss(self, step, generator):
-        if step == self.trainer.config.encoder.kmeans_step:
-            self._start_codebook(generator)
-        episodes = self.corpus.draw(self.settings.batch, generator)
-        offsets = self.losses.offsets(episodes, generator)
-        parts, codes = self.losses.plans(episodes, offsets)
-        total = self.training.bc_weight * parts["bc"] + parts["commitment"]
-        total = total + self.trainer.config.alignment.weight * parts["align"]
-        if self.lads.codebook.started:
-            parts["perplexity"] = perplexity(codes[codes >= 0], len(self.lads.codebook.codes))
-            if self.name == "joint":
-                if self.training.ce_at == "all":
-                    codes = self.corpus.codes(self.losses.encode, episodes.tolist())
-                parts["ce"], _ = self.losses.high_level(episodes, codes)
-                total = total + parts["ce"]
-        return total, parts
-
-    @torch.no_grad()
-    def _start_codebook(self, generator):
-        latents = []
-        for episodes in self.corpus.train.split(64):
-            segments = self.corpus.segments(episodes, self.losses.offsets(episodes, generator))
-            latents.append(self.lads.encoder(segments.observations, segments.executed, segments.lengths))
-        self.lads.codebook.start(torch.cat(latents))
-
-    @torch.no_grad()
     def finish(self):
-        """After the stage that trains it, a policy's correction goes into its last layer.
+        self.system.finish(self.name)
 
-        High level: less what is frequent anyway, the logits say which plan the instruction speaks for. Low level: the mean of
-        random actions is small even where their direction is clear, and a policy that follows it is slow, so it has a gain.
-        """
-        if self.name in ("joint", "high_level"):
-            uses = self.lads.codebook.uses
-            self.lads.high_level.head.bias.sub_(self.trainer.config.high_level.balance * (uses / uses.sum()).log())
-        if self.name in ("joint", "low_level"):
-            gain = self.trainer.config.low_level.gain
-            self.lads.low_level.last.weight.mul_(gain)
-            self.lads.low_level.last.bias.mul_(gain)
-
-    @torch.no_grad()
     def validate(self):
-        """Losses on the held-out episodes, segmented from step 0."""
-        episodes = self.corpus.validation
-        self.lads.eval()
-        parts, codes = self.losses.plans(episodes, torch.zeros(len(episodes), dtype=torch.long))
-        out = {"val_bc": float(parts["bc"])}
-        if self.lads.codebook.started:
-            out["val_perplexity"] = perplexity(codes[codes >= 0], len(self.lads.codebook.codes))
-            if self.name in ("joint", "high_level"):
-                ce, accuracy = self.losses.high_level(episodes, codes)
-                out |= {"val_ce": float(ce), "val_accuracy": float(accuracy)}
-        return out
+        return self.system.validate(self.name)
 
     def advance(self, step):
         """One optimiser step; returns the parts of the loss as numbers."""
         torch.manual_seed(self.trainer.seed_of(self.name, "step", step))
-        self.lads.eval()
+        self.trainer.networks.eval()
         for module in self.modules:
             module.train()
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate(step)
-        total, parts = self.loss(step)
+        total, parts = self.system.loss(self.name, step)
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         torch.nn.utils.clip_grad_norm_(self.parameters, self.training.clip)
         self.optimizer.step()
+        self.system.after(self.name)
         numbers = {name: float(torch.as_tensor(value).detach()) for name, value in (parts | {"loss": total}).items()}
         if not math.isfinite(numbers["loss"]):
             raise UserError(f"the loss is no longer finite at step {step} of stage {self.name}; lower its learning_rate")
@@ -305,15 +100,15 @@ class Trainer:
             "seed": seed,
         }
         torch.manual_seed(self.seed_of("", "weights", 0))
-        self.lads = Lads(setting, encoded).to(device)
+        self.networks = systems.of(self.config).Networks(setting, encoded).to(device)
         data = self.config.data
         if data.hindsight > 0:
             dataset = relabel(dataset, setting, data.hindsight, data.hindsight_latest, data.hindsight_most, self.seed_of("", "hindsight", 0))
         own = encoded if dataset.texts is None else language.encode(self.config.language, dataset.texts)
         self.corpus = Corpus(dataset, setting, own, device)
-        self.lads.normalizer.mean.copy_(self.corpus.mean)
-        self.lads.normalizer.std.copy_(self.corpus.std)
-        self.losses = Losses(self.lads, self.corpus, setting)
+        self.networks.normalizer.mean.copy_(self.corpus.mean)
+        self.networks.normalizer.std.copy_(self.corpus.std)
+        self.system = systems.of(self.config).Training(self.networks, self.corpus, setting, self.seed_of)
         self.notes = dataset.notes
         self.golden = golden_candidates(dataset, self.corpus.validation.tolist(), setting)
         self.position = {"stage": 0, "step": 0}
@@ -327,11 +122,11 @@ class Trainer:
         path = self.out / CHECKPOINT
         if not path.is_file():
             raise UserError(f"nothing to resume: {path} does not exist")
-        saved = torch.load(path, map_location=self.corpus.device, weights_only=True)
+        saved = _read(path, self.corpus.device)
         for key, value in self.identity.items():
             if saved["identity"][key] != value:
                 raise UserError(f"{path} was made with another {key.removesuffix('_sha256')}; train into a new folder")
-        self.lads.load_state_dict(saved["lads"])
+        self.networks.load_state_dict(saved["networks"])
         self.position, self.curves, self.seconds = saved["position"], saved["curves"], saved["seconds"]
         return saved["optimizer"]
 
@@ -339,7 +134,7 @@ class Trainer:
         state = {
             "identity": self.identity,
             "position": self.position,
-            "lads": self.lads.state_dict(),
+            "networks": self.networks.state_dict(),
             "optimizer": stage.optimizer.state_dict() if stage else None,
             "curves": self.curves,
             "seconds": self.seconds,
@@ -360,7 +155,7 @@ class Trainer:
         if not resume and (self.out / CHECKPOINT).exists():
             raise UserError(f"{self.out / CHECKPOINT} exists; continue it with --resume or choose another --out")
         optimizer_state = self.resume() if resume else None
-        names = STAGES[self.config.training.schedule]
+        names = self.system.stages(self.config)
         with self._interruptible(), _matmul_precision("medium" if self.config.training.bf16 else "highest"):
             while self.position["stage"] < len(names):
                 name = names[self.position["stage"]]
@@ -380,7 +175,7 @@ class Trainer:
         steps, begun, saved = stage.settings.steps, time.monotonic(), time.monotonic()
         spent = self.seconds.get(stage.name, 0.0)
         sums, latest, counted_from = defaultdict(list), {}, time.monotonic()
-        bar = tqdm(total=steps, initial=self.position["step"], desc=stage.name, disable=quiet, unit="step")
+        bar = tqdm(total=steps, initial=self.position["step"], desc=stage.name, disable=quiet or None, unit="step")
         with bar:
             while self.position["step"] < steps and not self.stop:
                 step = self.position["step"]
@@ -396,9 +191,10 @@ class Trainer:
                         latest = stage.validate()
                         numbers |= latest
                     row |= {name: f"{value:.5g}" for name, value in numbers.items()}
-                    row["revived"] = int(self.lads.codebook.revived)
+                    if self.system.CODEBOOK:
+                        row["revived"] = int(self.networks.codebook.revived)
                     self.curves.append(row)
-                    shown = ("loss", "bc", "align", "ce", "perplexity")
+                    shown = ("loss", "bc", "align", "ce", "kl", "noise", "perplexity")
                     bar.set_postfix({name: f"{numbers[name]:.3g}" for name in shown if name in numbers} | _short(latest))
                     sums.clear()
                     counted_from = time.monotonic()
@@ -425,9 +221,6 @@ class Trainer:
                 signal.signal(number, previous)
 
     def _summarise(self, names):
-        self.lads.eval()
-        codes = self.corpus.codes(self.losses.encode, range(len(self.corpus.lengths)))
-        starts = codes[:, :: self.corpus.horizon]
         last = {}
         for row in self.curves:
             last |= {name: float(value) for name, value in row.items() if name.startswith("val_")}
@@ -438,11 +231,9 @@ class Trainer:
             "dataset_sha256": self.identity["dataset_sha256"],
             "episodes": len(self.corpus.lengths),
             "transitions": int(self.corpus.lengths.sum()),
-            "steps": {name: getattr(self.config.training, name).steps for name in names},
+            "steps": {name: self.system.settings(self.config, name).steps for name in names},
             "seconds": {name: round(self.seconds.get(name, 0.0), 1) for name in names},
-            "perplexity": perplexity(starts[starts >= 0], len(self.lads.codebook.codes)),
-            "codebook_size": len(self.lads.codebook.codes),
-            "revived": int(self.lads.codebook.revived),
+            **self.system.summary(),
             "validation": last,
             "versions": {"lads-exporter": __version__, "torch": torch.__version__},
         }
@@ -464,14 +255,28 @@ def _short(validation):
     return {name: f"{value:.3g}" for name, value in validation.items()}
 
 
-def load_run(folder):
-    """A finished or interrupted run's checkpoint and its setting."""
+def _read(path, device="cpu"):
+    """A checkpoint's contents."""
+    try:
+        saved = torch.load(path, map_location=device, weights_only=True)
+    except (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError) as error:
+        raise UserError(f"{path}: half written or damaged ({type(error).__name__}); it stays as it is: move its folder away and train anew") from error
+    if not isinstance(saved, dict) or "networks" not in saved:
+        raise UserError(f"{path} was made by an earlier version of this exporter; train it again")
+    return saved
+
+
+def load_run(folder, *over):
+    """A finished run's checkpoint and its setting; `over` are files of a system's values to export it with."""
     path = Path(folder) / CHECKPOINT
     if not path.is_file():
         raise UserError(f"no run in {folder}: {path} does not exist; train one first (make train)")
-    saved = torch.load(path, map_location="cpu", weights_only=True)
-    setting = configuration.from_tables(*saved["identity"]["tables"], path)
-    names = STAGES[setting.config.training.schedule]
+    saved = _read(path)
+    table, *beside = saved["identity"]["tables"]
+    for one in over:
+        table = configuration.layered(table, configuration.read_toml(one))
+    setting = configuration.from_tables(table, *beside, path)
+    names = systems.of(setting.config).Training.stages(setting.config)
     if saved["position"]["stage"] < len(names):
         raise UserError(f"{folder} is not finished (stage {names[saved['position']['stage']]}); continue it with --resume")
     return saved, setting

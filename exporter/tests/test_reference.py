@@ -61,14 +61,14 @@ def test_the_purpose_is_what_it_is_for(tiny):
 def test_only_the_bundles_own_run_is_rolled_out(policy, monkeypatch):
     setting, encoded, lads, model = policy
     contract = contracts.of(model)
-    saved = {"identity": {"dataset_sha256": contract["provenance"]["dataset_sha256"]}, "lads": lads.state_dict()}
+    saved = {"identity": {"dataset_sha256": contract["provenance"]["dataset_sha256"]}, "networks": lads.state_dict()}
     monkeypatch.setattr(training, "load_run", lambda folder: (saved, setting))
     monkeypatch.setattr(reference.language, "encode", lambda language, texts: encoded)
     acting, source = reference._acting(model, contract, "run")
     assert source == "the run's checkpoint" and torch.equal(acting.codes, lads.codebook.codes)
     # The same plans with another high level are another run.
-    saved["lads"] = {name: value.clone() for name, value in lads.state_dict().items()}
-    saved["lads"]["high_level.head.weight"][0, 0] += 1
+    saved["networks"] = {name: value.clone() for name, value in lads.state_dict().items()}
+    saved["networks"]["high_level.head.weight"][0, 0] += 1
     with pytest.raises(config.UserError, match="run is not the run that the bundle was exported from"):
         reference._acting(model, contract, "run")
 

@@ -63,9 +63,9 @@ def test_joint_step_moves_everything_and_the_stages_only_their_part(tmp_path):
         if name == "joint":
             for step in range(32):
                 stage.advance(step)
-        before = {key: value.clone() for key, value in trainer.lads.state_dict().items()}
+        before = {key: value.clone() for key, value in trainer.networks.state_dict().items()}
         stage.advance(40)
-        after = trainer.lads.state_dict()
+        after = trainer.networks.state_dict()
         moved[name] = {key.split(".")[0] for key in after if not torch.equal(before[key], after[key])}
     everything = {"encoder", "codebook", "low_level", "alignment", "high_level"}
     assert moved["joint"] == everything
@@ -80,21 +80,21 @@ def test_cross_entropy_does_not_move_the_plans(tmp_path):
     stage = Stage("joint", trainer)
     for step in range(32):
         stage.advance(step)
-    trainer.lads.zero_grad()
+    trainer.networks.zero_grad()
     episodes = trainer.corpus.train[:4]
-    parts, codes = trainer.losses.plans(episodes, torch.tensor([0, 1, 2, 3]))
+    parts, codes = trainer.system.plans(episodes, torch.tensor([0, 1, 2, 3]))
     assert (codes >= 0).sum(1).tolist() == [-(-(int(n) - k) // 4) for k, n in enumerate(trainer.corpus.lengths[episodes])]
-    trainer.losses.high_level(episodes, codes)[0].backward()
-    assert all(value.grad is None for value in trainer.lads.encoder.parameters())
-    assert any(value.grad.abs().max() > 0 for value in trainer.lads.high_level.parameters())
+    trainer.system.high_level(episodes, codes)[0].backward()
+    assert all(value.grad is None for value in trainer.networks.encoder.parameters())
+    assert any(value.grad.abs().max() > 0 for value in trainer.networks.high_level.parameters())
 
 
 def test_trajectories_longer_than_the_context_are_cut_where_the_controller_restarts_it(tmp_path):
     setting = setting_for("staged")
     setting.tables[0]["high_level"]["context_steps"] = 12
     trainer = trainer_for(tmp_path / "run", config.from_tables(*setting.tables, "test"))
-    trainer.lads.eval()
-    corpus, high_level = trainer.corpus, trainer.lads.high_level
+    trainer.networks.eval()
+    corpus, high_level = trainer.corpus, trainer.networks.high_level
     episodes = corpus.validation.repeat(2)
     codes = torch.randint(5, (len(episodes), corpus.steps))
     losses, hits = [], []
@@ -108,8 +108,8 @@ def test_trajectories_longer_than_the_context_are_cut_where_the_controller_resta
             logits = high_level(words, corpus.observations[[episode], part], corpus.executed[[episode], part])[0]
             losses.append(torch.nn.functional.cross_entropy(logits, codes[row, part], reduction="none"))
             hits.append(logits.argmax(-1) == codes[row, part])
-    trainer.losses.autocast = False
-    loss, accuracy = trainer.losses.high_level(episodes, codes)
+    trainer.system.autocast = False
+    loss, accuracy = trainer.system.high_level(episodes, codes)
     torch.testing.assert_close(loss, torch.cat(losses).mean())
     torch.testing.assert_close(accuracy, torch.cat(hits).float().mean())
 
@@ -151,7 +151,7 @@ def test_resumed_run_equals_an_uninterrupted_one(tmp_path, schedule, stop_at):
     with pytest.raises(UserError, match="--resume"):
         resumed.run(quiet=True)
     assert resumed.run(resume=True, quiet=True)
-    for (name, a), b in zip(whole.lads.state_dict().items(), resumed.lads.state_dict().values()):
+    for (name, a), b in zip(whole.networks.state_dict().items(), resumed.networks.state_dict().values()):
         assert torch.equal(a, b), name
 
 
@@ -191,16 +191,14 @@ def test_fresh_noise_and_word_dropout(tmp_path):
     assert ((first - corpus.states[at]).abs() <= corpus.noise + 1e-6).all()
     tables = copy.deepcopy(trainer.setting.tables)
     tables[0]["data"]["word_dropout"] = 0.5
-    losses = trainer.losses
-    losses.config = config.from_tables(*tables, "test").config
+    contexts = trainer.system.contexts
+    contexts.config = config.from_tables(*tables, "test").config
     words = corpus.words[0]
-    losses.lads.train()
-    lengths = {len(losses._some_words(words)) for _ in range(50)}
+    lengths = {len(contexts.some_words(words)) for _ in range(50)}
     assert len(lengths) > 2 and max(lengths) <= len(words)
-    assert all(torch.equal(losses._some_words(words)[-1], words[-1]) for _ in range(20))
-    losses.lads.eval()
+    assert all(torch.equal(contexts.some_words(words)[-1], words[-1]) for _ in range(20))
     codes = torch.zeros(6, corpus.steps, dtype=torch.long)
-    shown, same = losses._instructions(corpus.train[:6], codes)
+    shown, same = contexts.instructions(corpus.train[:6], codes, training=False)
     assert same is codes
     assert all(row is corpus.words[i] for row, i in zip(shown, corpus.instruction[corpus.train[:6]]))
 
@@ -285,7 +283,7 @@ def test_unknown_and_missing_keys_are_named():
 def test_a_context_off_the_grid_of_plans_is_refused(steps):
     tables = copy.deepcopy(config.load("configs/tiny.toml").tables)
     tables[0]["high_level"]["context_steps"] = steps
-    with pytest.raises(UserError, match=f"context_steps = {steps} is no multiple of encoder.horizon = 4"):
+    with pytest.raises(UserError, match=f"context_steps = {steps} is no multiple of the plan period of 4"):
         config.from_tables(*tables, "test")
 
 

@@ -9,7 +9,7 @@ mod mutate;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use lads_compiler::{CacheFormat, Options, WeightFormat};
+use lads_compiler::{CacheFormat, Options, Storage, WeightFormat};
 use lads_proof::reference::Reference;
 use mutate::{Model, Normals, Said};
 
@@ -37,7 +37,7 @@ struct Bench {
 }
 
 impl Bench {
-    fn add(&self, kind: &mut Kind, what: &str, bytes: &[u8], options: Options) {
+    fn add(&self, kind: &mut Kind, what: &str, bytes: &[u8], options: &Options) {
         kind.changes += 1;
         let judged = match mutate::verify(bytes, options, &self.reference, self.every) {
             Said::Judged(judged) => judged,
@@ -104,7 +104,7 @@ fn weights(model: &Model, bench: &Bench) -> Vec<Kind> {
                 change(values, tensor.rows, &mut normals);
             });
             if changed.bytes() != model.bytes() {
-                bench.add(&mut kind, &tensor.name, changed.bytes(), Options::default());
+                bench.add(&mut kind, &tensor.name, changed.bytes(), &Options::exact());
             }
         }
         kind
@@ -128,7 +128,7 @@ fn contract(model: &Model, bench: &Bench) -> Kind {
                 &mut kind,
                 &pointer,
                 model.with_contract(&changed).bytes(),
-                Options::default(),
+                &Options::exact(),
             );
         }
     }
@@ -148,16 +148,18 @@ fn options(model: &Model, bench: &Bench) -> Kind {
         WeightFormat::Int8,
     ];
     for weights in formats {
-        for low_level in [None, Some(WeightFormat::F32)] {
+        for low_level in [weights, WeightFormat::F32] {
             for cache in [CacheFormat::F32, CacheFormat::F16] {
+                let storage = Storage::of_weights(weights)
+                    .with_part("low_level/act", low_level)
+                    .with_cache(cache);
+                let what = storage.to_string();
                 let options = Options {
-                    weights,
-                    low_level,
-                    cache,
+                    storage: Some(storage),
                     force: true,
                     ..Options::default()
                 };
-                bench.add(&mut kind, &options.to_string(), model.bytes(), options);
+                bench.add(&mut kind, &what, model.bytes(), &options);
             }
         }
     }
@@ -169,14 +171,14 @@ fn harmless(model: &Model, bench: &Bench) -> Kind {
         name: "harmless".to_owned(),
         ..Kind::default()
     };
-    bench.add(&mut kind, "nothing", model.bytes(), Options::default());
+    bench.add(&mut kind, "nothing", model.bytes(), &Options::exact());
     for seed in 0..10 {
         let noisy = mutate::noisy(model, 1e-6, 100 + seed);
         bench.add(
             &mut kind,
             &format!("noise of 1e-6 on all weights, seed {seed}"),
             noisy.bytes(),
-            Options::default(),
+            &Options::exact(),
         );
     }
     for step in [1, 7] {
@@ -185,7 +187,7 @@ fn harmless(model: &Model, bench: &Bench) -> Kind {
             &mut kind,
             &format!("plans renumbered by {step}"),
             renumbered.bytes(),
-            Options::default(),
+            &Options::exact(),
         );
     }
     kind

@@ -14,6 +14,7 @@ pub mod random;
 pub mod recordings;
 #[cfg(feature = "report")]
 pub mod report;
+pub mod tune;
 pub mod verify;
 #[cfg(feature = "viewer")]
 pub mod viewer;

@@ -246,7 +246,11 @@ fn bad_bundles_are_refused() {
         "lads.contract",
         "some.contract",
     );
-    refused(&plain, &[], &["altered.onnx", "lads.contract", "export"]);
+    refused(
+        &plain,
+        &[],
+        &["altered.onnx", "lads.contract", "lads import"],
+    );
     let newer = altered(
         &tiny_bundle(),
         folder.path(),

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::time::{Duration, Instant};
 
-use lads_compiler::{Bundle, CacheFormat, Options, WeightFormat};
+use lads_compiler::{Bundle, CacheFormat, Options, Storage, WeightFormat};
 use serde_json::Value;
 
 /// A file of the project, by its path from the root.
@@ -85,14 +85,16 @@ fn a_given_image_is_what_is_verified() {
         path.to_str().unwrap().to_owned()
     });
     let options = Options {
-        weights: WeightFormat::F16,
-        low_level: Some(WeightFormat::F32),
-        cache: CacheFormat::F16,
+        storage: Some(
+            Storage::of_weights(WeightFormat::F16)
+                .with_part("low_level/act", WeightFormat::F32)
+                .with_cache(CacheFormat::F16),
+        ),
         ..Options::default()
     };
     let compile = |bundle: &str| {
         let bundle = Bundle::open(&project_file(bundle)).unwrap();
-        let image = lads_compiler::compile_with(&bundle, options).unwrap();
+        let image = lads_compiler::compile_with(&bundle, &options).unwrap();
         image.as_bytes().to_vec()
     };
     let mut bytes = compile("models/kitchen.onnx");

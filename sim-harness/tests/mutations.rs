@@ -23,7 +23,7 @@ fn shipped() -> (Model, Reference) {
 }
 
 fn judged(model: &Model, reference: &Reference) -> Box<Judged> {
-    match mutate::verify(model.bytes(), Options::default(), reference, EVERY) {
+    match mutate::verify(model.bytes(), &Options::exact(), reference, EVERY) {
         Said::Judged(judged) => judged,
         Said::Refused(why) => panic!("{why}"),
     }

@@ -6,7 +6,9 @@
 
 use std::sync::OnceLock;
 
-use lads_compiler::{Bundle, CacheFormat, Image, Options, WeightFormat, compile, compile_with};
+use lads_compiler::{
+    Bundle, CacheFormat, Image, Options, Storage, WeightFormat, compile, compile_with,
+};
 use lads_core::{
     ChannelId, DType, Data, GuardConfig, GuardedController, Instruction, Policy, Tick,
 };
@@ -85,15 +87,17 @@ fn images() -> &'static [Vec<u32>] {
         };
         let bundle = Bundle::from_bytes(TINY).expect("the bundle is sound");
         let smaller = Options {
-            weights: WeightFormat::Int8,
-            low_level: Some(WeightFormat::F16),
-            cache: CacheFormat::F16,
+            storage: Some(
+                Storage::of_weights(WeightFormat::Int8)
+                    .with_part("low_level/act", WeightFormat::F16)
+                    .with_cache(CacheFormat::F16),
+            ),
             force: true,
             ..Options::default()
         };
-        let mut images: Vec<Vec<u32>> = [Options::default(), smaller]
+        let mut images: Vec<Vec<u32>> = [Options::exact(), smaller]
             .iter()
-            .map(|&options| words(&compile_with(&bundle, options).expect("it compiles")))
+            .map(|options| words(&compile_with(&bundle, options).expect("it compiles")))
             .collect();
         if std::env::var_os(FOLDER).is_some() {
             let family = |kind| words(&compiled(&folder().join(format!("{kind}.onnx"))));

@@ -13,7 +13,7 @@ use std::hint::black_box;
 use std::path::Path;
 use std::process::Command;
 
-use lads_compiler::{Bundle, Options, WeightFormat, compile_with};
+use lads_compiler::{Bundle, Options, Storage, WeightFormat, compile_with};
 use lads_core::{
     ChannelId, Contract, Controller, DType, Data, Decision, Instruction, Policy, StepReport,
 };
@@ -189,11 +189,11 @@ fn a_step_executes_the_same_number_of_instructions_whatever_it_observes() {
     let bundle = Bundle::open(&project_path("models/kitchen.onnx")).unwrap();
     for (number, case) in CASES.iter().enumerate() {
         let options = Options {
-            weights: case.0,
+            storage: Some(Storage::of_weights(case.0)),
             tolerance: Some(0.1),
             ..Options::default()
         };
-        let image = compile_with(&bundle, options).unwrap();
+        let image = compile_with(&bundle, &options).unwrap();
         let Some(counts) = counts(NAME, number, image.as_bytes()) else {
             println!("skipped: valgrind is not installed");
             return;
@@ -215,7 +215,7 @@ fn every_place_in_the_schedule_of_every_family_takes_one_number_of_instructions(
     }
     for (number, kind) in KINDS.iter().enumerate() {
         let bundle = Bundle::open(&folder().join(format!("{kind}.onnx"))).unwrap();
-        let image = compile_with(&bundle, Options::default()).unwrap();
+        let image = compile_with(&bundle, &Options::default()).unwrap();
         let Some(counts) = counts(NAME, number, image.as_bytes()) else {
             println!("skipped: valgrind is not installed");
             return;

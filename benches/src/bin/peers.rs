@@ -72,7 +72,7 @@ fn run(arguments: &Arguments) -> Result<Report, BenchError> {
                 format_args!("known are {known}"),
             )
         })?;
-        let opened = lads_host::open_with(path, options(weights));
+        let opened = lads_host::open_with(path, &options(weights));
         let opened = opened.map_err(|error| BenchError::of(&error))?;
         if !opened.is_bundle() {
             return Err(BenchError::new(

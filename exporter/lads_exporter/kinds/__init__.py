@@ -10,7 +10,7 @@ import torch
 
 from .. import bundle, random_policy
 from ..config import UserError
-from . import common, diffusion, history, images, lads, lang_dt, lisa, plain, vae
+from . import common, history, images, lads, lang_dt, lcsd, lisa, plain, skilldiffuser, vae
 from .common import Sizes
 
 
@@ -36,8 +36,8 @@ KINDS = {
     "lang_dt": _of(lang_dt.LangDt, lang_dt.build, lang_dt.contract),
     "lisa": _of(lisa.Lisa, lisa.build, lisa.contract),
     "vae": _of(vae.Vae, vae.build, vae.contract),
-    "lcsd": _of(diffusion.Lcsd, diffusion.build_lcsd, diffusion.contract_lcsd),
-    "skilldiffuser": _of(diffusion.SkillDiffuser, diffusion.build_skilldiffuser, diffusion.contract_skilldiffuser, Sizes(horizon=7, steps=42)),
+    "lcsd": _of(lcsd.Lcsd, lcsd.build, lcsd.contract),
+    "skilldiffuser": _of(skilldiffuser.SkillDiffuser, skilldiffuser.build, skilldiffuser.contract, Sizes(horizon=7, steps=42)),
     "history": _of(history.History, history.build, history.contract),
     "plain": _of(plain.Plain, plain.build_plain, plain.contract),
     "recurrent": _of(plain.Recurrent, plain.build_recurrent, plain.contract_recurrent),

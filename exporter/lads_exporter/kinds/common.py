@@ -1,7 +1,7 @@
-"""What the small random policies of every family share: a made-up bench, its instructions, sizes, and parts of networks.
+"""What policies of every family share: sizes and parts of networks; and a made-up bench with instructions for small random ones.
 
-They exist to prove that the runtime runs a family: networks of the family's shape in PyTorch, with random weights, as the entries that
-the contract names. Invariant: the same kind and seed give the same bundle.
+The random ones exist to prove that the runtime runs a family. Invariant: the same kind and seed give the same bundle. Trained policies (`systems`)
+fill in `Sizes` from their configuration and take networks and entry graphs from here.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from .. import bundle, config, contract as contracts, graphs, language, random_policy
-from ..model import HighLevelPolicy, Normalizer
+from ..model import HighLevelPolicy
 
 ENVIRONMENT = {
     "id": "random-bench",
@@ -38,32 +38,33 @@ WORDS = language.encode(config.Language("random-12", -1, False), [row["text"] fo
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of the networks; the names are the configuration's."""
+    """Sizes of the networks, those of the bench's where nothing is said; the names are the configuration's."""
 
+    observation: int = len(ENVIRONMENT["observation"])
+    action: int = len(ENVIRONMENT["action"])
+    words: language.Encoded = WORDS
     hidden: int = 32
     layers: int = 2
     heads: int = 4
+    dropout: float = 0.0
     steps: int = 40
     horizon: int = 4
     codes: int = 6
     plan: int = 5
     window: int = 3
-
-    @property
-    def observation(self):
-        return len(ENVIRONMENT["observation"])
-
-    @property
-    def action(self):
-        return len(ENVIRONMENT["action"])
+    low_level_layers: int = 2
 
     @property
     def transformer(self):
-        return config.HighLevel(self.hidden, self.layers, self.heads, 0.0, self.steps, 0.0)
+        return config.HighLevel(self.hidden, self.layers, self.heads, self.dropout, self.steps, 0.0)
 
     @property
     def network(self):
         return {"layers": self.layers, "heads": self.heads, "head_dim": self.hidden // self.heads}
+
+    @property
+    def low_level_network(self):
+        return self.network | {"layers": self.low_level_layers}
 
     @property
     def codebook(self):
@@ -78,35 +79,29 @@ class Codes(nn.Module):
         self.table = nn.Parameter(torch.zeros(sizes.codes, sizes.plan))
 
 
-def normalizer():
-    """Statistics of the bench's observations."""
-    found = Normalizer(len(ENVIRONMENT["observation"]))
-    random_policy.place_normalizer(found, ENVIRONMENT["observation"])
-    return found
-
-
 def high_level(sizes, outputs, actions=True):
     """The transformer that hears the words; its head has so many outputs. Without `actions` its history is of observations only."""
-    return HighLevelPolicy(sizes.transformer, WORDS.dim, sizes.observation, sizes.action if actions else None, outputs)
+    return HighLevelPolicy(sizes.transformer, sizes.words.dim, sizes.observation, sizes.action if actions else None, outputs)
 
 
 def randomize(policy, seed):
     """Random weights in all parts of a policy: plans differ from step to step, and few actions are at their limits."""
     generator = torch.Generator().manual_seed(seed)
     random_policy.draw_weights(policy, generator)
+    random_policy.place_normalizer(policy.normalizer, ENVIRONMENT["observation"])
     with torch.no_grad():
         for module in policy.modules():
             if isinstance(module, nn.Embedding):
                 module.weight.copy_(0.3 * torch.randn(module.weight.shape, generator=generator))
-            for head in (getattr(module, name) for name in ("head", "inverse_last") if hasattr(module, name)):
-                head.weight.mul_(0.3 if head.out_features == len(ENVIRONMENT["action"]) else 2)
+            if hasattr(module, "head"):
+                module.head.weight.mul_(0.3 if module.head.out_features == len(ENVIRONMENT["action"]) else 2)
     return policy.eval()
 
 
-def graph_of(policy):
+def graph_of(policy, sizes):
     """A graph with the table of instructions and the entry that hears one."""
     graph = graphs.Graph()
-    graphs.known_instructions(graph, policy.high_level, WORDS)
+    graphs.known_instructions(graph, policy.high_level, sizes.words)
     return graph
 
 

@@ -9,7 +9,7 @@ from onnx import TensorProto
 from torch import nn
 
 from .. import graphs
-from ..model import Block
+from ..model import Block, Dropout
 from . import common
 from .lisa import Lisa, option_token, run_blocks
 
@@ -25,7 +25,8 @@ class HistoryPolicy(nn.Module):
         self.embed_action = nn.Linear(sizes.action, sizes.hidden)
         self.embed_position = nn.Embedding(sizes.window + sizes.horizon, sizes.hidden)
         self.embed_norm = nn.LayerNorm(sizes.hidden)
-        self.blocks = nn.ModuleList(Block(sizes.hidden, sizes.heads, 0.0) for _ in range(sizes.layers))
+        self.drop = Dropout(0.0)
+        self.blocks = nn.ModuleList(Block(sizes.hidden, sizes.heads, 0.0) for _ in range(sizes.low_level_layers))
         self.norm = nn.LayerNorm(sizes.hidden)
         self.head = nn.Linear(sizes.hidden, sizes.action)
 
@@ -36,7 +37,7 @@ class HistoryPolicy(nn.Module):
         places = torch.cat([torch.arange(before), self.window + torch.arange(steps)])
         pairs = pairs[-(before + steps) :] + self.embed_position.weight[places][:, None]
         tokens = torch.cat([self.embed_option.weight[index][None], pairs.flatten(0, 1)])
-        return self.head(run_blocks(self, tokens)[2 + 2 * before :: 2])
+        return self.head(run_blocks(self, tokens[None])[0][2 + 2 * before :: 2])
 
 
 class History(Lisa):
@@ -94,7 +95,7 @@ def _append(graph, policy, normalizer, sizes):
 
 
 def build(policy, sizes):
-    graph = common.graph_of(policy)
+    graph = common.graph_of(policy, sizes)
     common.select_at_every_token(graph, policy)
     _plan(graph, policy.low_level)
     _recall(graph, policy.low_level, sizes)
@@ -111,6 +112,6 @@ def contract(sizes, seed):
         "decision": common.argmax(),
         "window": sizes.window,
         "memory": {"dim": 2 * sizes.hidden},
-        "low_level": sizes.network,
+        "low_level": sizes.low_level_network,
     }
     return common.contract(family, sizes, seed)

@@ -3,6 +3,7 @@
 from torch import nn
 
 from .. import graphs
+from ..model import Normalizer
 from . import common
 
 
@@ -11,7 +12,7 @@ class LangDt(nn.Module):
 
     def __init__(self, sizes):
         super().__init__()
-        self.normalizer = common.normalizer()
+        self.normalizer = Normalizer(sizes.observation)
         self.high_level = common.high_level(sizes, sizes.action)
 
     def forward(self, words, observations, actions):
@@ -20,7 +21,7 @@ class LangDt(nn.Module):
 
 
 def build(policy, sizes):
-    graph = common.graph_of(policy)
+    graph = common.graph_of(policy, sizes)
     for first in (True, False):
         graphs.high_level_step(graph, policy.high_level, policy.normalizer, first, "action", "previous_action")
     return graph.model("lang_dt")

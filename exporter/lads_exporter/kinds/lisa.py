@@ -5,38 +5,47 @@ from onnx import TensorProto
 from torch import nn
 
 from .. import graphs
-from ..model import Block
+from ..model import Block, Dropout, Normalizer, start_weights
 from . import common
 
 LEVEL = "low_level"
 
 
 class ChunkPolicy(nn.Module):
-    """A causal transformer over (option, observation, action) of one plan's steps; the action is read at the observation."""
+    """A causal transformer over (option, observation, action) of one plan's steps; the action is read at the observation.
 
-    def __init__(self, sizes):
+    An option is a row of a table; while it is trained `embed_option` is a layer on the plan instead (`systems.lisa`).
+    """
+
+    def __init__(self, sizes, embed_option=None):
         super().__init__()
-        self.embed_option = nn.Embedding(sizes.codes, sizes.hidden)
+        self.embed_option = embed_option or nn.Embedding(sizes.codes, sizes.hidden)
         self.embed_observation = nn.Linear(sizes.observation, sizes.hidden)
         self.embed_action = nn.Linear(sizes.action, sizes.hidden)
         self.embed_timestep = nn.Embedding(sizes.steps, sizes.hidden)
         self.embed_norm = nn.LayerNorm(sizes.hidden)
-        self.blocks = nn.ModuleList(Block(sizes.hidden, sizes.heads, 0.0) for _ in range(sizes.layers))
+        self.drop = Dropout(sizes.dropout)
+        self.blocks = nn.ModuleList(Block(sizes.hidden, sizes.heads, sizes.dropout) for _ in range(sizes.low_level_layers))
         self.norm = nn.LayerNorm(sizes.hidden)
         self.head = nn.Linear(sizes.hidden, sizes.action)
+        start_weights(self)
 
     def forward(self, index, start, observations, actions):
         """The plan `index` from timestep `start`: normalised observations [T, O], actions [T, A] as executed -> actions [T, A]."""
-        time = self.embed_timestep.weight[start : start + len(observations)]
-        option = self.embed_option.weight[index] + time
-        tokens = torch.stack([option, self.embed_observation(observations) + time, self.embed_action(actions) + time], 1).flatten(0, 1)
-        return self.head(run_blocks(self, tokens[:-1])[1::3])
+        options = self.embed_option.weight[index].expand(1, len(observations), -1)
+        return self.chunks(options, torch.tensor([start]), observations[None], actions[None])[0]
+
+    def chunks(self, options, starts, observations, actions):
+        """N plans of H steps: options [N, H, d] embedded, starts [N], observations [N, H, O], actions [N, H, A] -> actions [N, H, A]."""
+        time = self.embed_timestep(starts[:, None] + torch.arange(options.shape[1], device=starts.device))
+        tokens = torch.stack([options + time, self.embed_observation(observations) + time, self.embed_action(actions) + time], 2)
+        return self.head(run_blocks(self, tokens.flatten(1, 2)[:, :-1])[:, 1::3]).float()
 
 
 class Lisa(nn.Module):
     def __init__(self, sizes):
         super().__init__()
-        self.normalizer = common.normalizer()
+        self.normalizer = Normalizer(sizes.observation)
         self.high_level = common.high_level(sizes, sizes.codes, actions=False)
         self.low_level = ChunkPolicy(sizes)
 
@@ -46,12 +55,12 @@ class Lisa(nn.Module):
 
 
 def run_blocks(policy, tokens):
-    """tokens [S, d] before the first norm -> rows [S, d] after the last, causal."""
-    x = policy.embed_norm(tokens)[None]
-    mask = torch.triu(torch.full((1, 1, len(tokens), len(tokens)), -1e9), 1)
+    """tokens [N, S, d] before the first norm -> rows [N, S, d] after the last, causal."""
+    x = policy.drop(policy.embed_norm(tokens.float()))
+    mask = torch.triu(torch.full((1, 1, tokens.shape[1], tokens.shape[1]), -1e9, device=tokens.device), 1).expand(len(tokens), -1, -1, -1)
     for block in policy.blocks:
         x = block(x, mask)
-    return policy.norm(x)[0]
+    return policy.norm(x)
 
 
 def option_token(entry, table, index, time=None):
@@ -83,13 +92,16 @@ def _low_level(graph, policy, normalizer, sizes, first):
 
 
 def build(policy, sizes):
-    graph = common.graph_of(policy)
+    graph = common.graph_of(policy, sizes)
     common.select_at_every_token(graph, policy)
     for first in (True, False):
         _low_level(graph, policy.low_level, policy.normalizer, sizes, first)
     return graph.model("lisa")
 
 
+def family(sizes, decision):
+    return {"kind": "lisa", "horizon": sizes.horizon, "codebook": sizes.codebook, "decision": decision, "low_level": sizes.low_level_network}
+
+
 def contract(sizes, seed):
-    family = {"kind": "lisa", "horizon": sizes.horizon, "codebook": sizes.codebook, "decision": common.argmax(), "low_level": sizes.network}
-    return common.contract(family, sizes, seed)
+    return common.contract(family(sizes, common.argmax()), sizes, seed)

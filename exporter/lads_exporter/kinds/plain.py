@@ -7,6 +7,7 @@ from onnx import TensorProto
 from torch import nn
 
 from .. import bundle, contract as contracts, graphs
+from ..model import Normalizer
 from . import common
 
 ENTRY = "policy/act"
@@ -18,7 +19,7 @@ class Plain(nn.Module):
 
     def __init__(self, sizes):
         super().__init__()
-        self.normalizer = common.normalizer()
+        self.normalizer = Normalizer(sizes.observation)
         self.first = nn.Linear(sizes.observation, sizes.hidden)
         self.middle = nn.Linear(sizes.hidden, sizes.hidden)
         self.last = nn.Linear(sizes.hidden, sizes.action)
@@ -34,7 +35,7 @@ class Recurrent(nn.Module):
 
     def __init__(self, sizes):
         super().__init__()
-        self.normalizer = common.normalizer()
+        self.normalizer = Normalizer(sizes.observation)
         self.first = nn.Linear(sizes.observation, sizes.hidden)
         self.gru = nn.GRU(sizes.hidden, 24)
         self.lstm = nn.LSTM(24, 16)
@@ -53,7 +54,7 @@ class Stacked(nn.Module):
 
     def __init__(self, sizes):
         super().__init__()
-        self.normalizer = common.normalizer()
+        self.normalizer = Normalizer(sizes.observation)
         self.first = nn.Linear(self.ROWS * sizes.observation + len(COMMAND), sizes.hidden)
         self.last = nn.Linear(sizes.hidden, sizes.action)
 
@@ -72,7 +73,7 @@ class Camera(nn.Module):
 
     def __init__(self, sizes):
         super().__init__()
-        self.normalizer = common.normalizer()
+        self.normalizer = Normalizer(sizes.observation)
         self.pixels = nn.Linear(6 * 8 * 3, 12)
         self.first = nn.Linear(sizes.observation + 12 + self.MODES, sizes.hidden)
         self.last = nn.Linear(sizes.hidden, sizes.action)

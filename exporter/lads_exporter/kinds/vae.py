@@ -4,7 +4,7 @@ import torch
 from torch import nn
 
 from .. import config, graphs
-from ..model import LowLevelPolicy, TrajectoryEncoder
+from ..model import LowLevelPolicy, Normalizer, TrajectoryEncoder
 from . import common
 
 LOG_STD = (-10.0, 2.0)
@@ -15,7 +15,7 @@ class Vae(nn.Module):
 
     def __init__(self, sizes):
         super().__init__()
-        self.normalizer = common.normalizer()
+        self.normalizer = Normalizer(sizes.observation)
         self.high_level = common.high_level(sizes, 2 * sizes.plan)
         low_level = config.LowLevel(sizes.hidden, 4, 0.2, 1.0)
         self.low_level = LowLevelPolicy(low_level, sizes.observation, sizes.plan, sizes.action)
@@ -50,7 +50,7 @@ def _sample(graph, dim):
 
 
 def build(policy, sizes):
-    graph = common.graph_of(policy)
+    graph = common.graph_of(policy, sizes)
     mean, log_std = (_half(policy.high_level.head, part) for part in (0, 1))
     for first in (True, False):
         entry, x, _ = graphs.high_level_state(graph, policy.high_level, policy.normalizer, first, "action")
@@ -65,6 +65,9 @@ def build(policy, sizes):
     return graph.model("vae")
 
 
+def family(sizes, rule, seed):
+    return {"kind": "vae", "horizon": sizes.horizon, "plan": {"dim": sizes.plan}, "decision": {"rule": rule, "seed": seed}}
+
+
 def contract(sizes, seed):
-    family = {"kind": "vae", "horizon": sizes.horizon, "plan": {"dim": sizes.plan}, "decision": {"rule": "sample", "seed": seed}}
-    return common.contract(family, sizes, seed, noise=[sizes.plan], segment=sizes.horizon)
+    return common.contract(family(sizes, "sample", seed), sizes, seed, noise=[sizes.plan], segment=sizes.horizon)

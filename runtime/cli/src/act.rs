@@ -76,8 +76,8 @@ pub fn act(
     pipe.answer_all(input, output)
 }
 
-/// Sampling at the contract's temperature, or at 1 where the contract's rule is argmax.
-fn sampling(policy: &Policy<'_>, seed: u64) -> Decision {
+/// The rule of `--sample`: at the contract's temperature, or at 1 where the contract's rule is argmax.
+pub fn sampling(policy: &Policy<'_>, seed: u64) -> Decision {
     let temperature = match policy.contract().decision() {
         Decision::Sample { temperature, .. } => temperature,
         Decision::Argmax => 1.0,
@@ -157,7 +157,7 @@ impl Pipe<'_, '_> {
             self.controller
                 .step_with(&seen.given(), action)
                 .map_err(|error| match error {
-                    StepError::Input(error) => seen.refused(&error),
+                    StepError::Input(error) => lads_host::refused(&error, self.policy.contract()),
                     other => other.to_string(),
                 })?;
         let selected = report.selected.map(|selected| selected.index);

@@ -56,7 +56,7 @@ pub fn bench(request: &Request) -> Result<Report, Refusal> {
     })?;
     let mut models = vec![];
     for &weights in &request.weights {
-        let model = Model::compile(&request.model, options(weights))?;
+        let model = Model::compile(&request.model, &options(weights))?;
         models.push((weights.name(), model));
     }
     if models.is_empty() {

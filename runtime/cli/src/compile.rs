@@ -6,7 +6,7 @@ use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use lads_compiler::{CacheFormat, Options, WeightFormat};
+use lads_compiler::{Bundle, CacheFormat, Formats, Options, WeightFormat, named};
 use lads_host::output;
 
 use crate::model::Model;
@@ -27,18 +27,19 @@ pub struct Request {
     /// A Rust source to write: the image as a constant, aligned byte array
     #[arg(long, value_name = "FILE")]
     emit_rust: Option<PathBuf>,
-    /// How the weights are stored: f32; int16 or int8, with which the inputs of a layer are rounded too, and which are faster
-    /// than f32 on x86-64; f16 or bf16, which are decoded. Fewer bits than 32 have to pass a gate: the golden episode replays
-    /// with the same plans, and with actions inside the tolerance
-    #[arg(long, value_name = "FORMAT", default_value = "f32", value_parser = weight_format)]
-    weights: WeightFormat,
-    /// How the weights of the low level are stored, if otherwise: with f32 the actions of a plan keep their bits, and all
-    /// that fewer bits elsewhere can do is to choose another plan
+    /// How the weights are stored: auto, as the bundle was tuned (`lads-run tune`), and f32 where it was not; f32; int16 or
+    /// int8, with which the inputs of a layer are rounded too, and which are faster than f32 on x86-64; f16 or bf16, which are
+    /// decoded. Fewer bits than 32 have to pass a gate: the golden episode replays with the same plans, and with actions inside
+    /// the tolerance
+    #[arg(long, value_name = "FORMAT", default_value = "auto", value_parser = auto_or(weight_format))]
+    weights: Choice<WeightFormat>,
+    /// How the weights are stored of what is in the action and does not only choose a plan, if otherwise: with f32 the actions
+    /// of a plan keep their bits, and all that fewer bits elsewhere can do is to choose another plan
     #[arg(long, value_name = "FORMAT", value_parser = weight_format)]
     low_level: Option<WeightFormat>,
-    /// How the KV cache is stored: f32, or f16 in half the memory. It has to pass the same gate
-    #[arg(long, value_name = "FORMAT", default_value = "f32", value_parser = cache_format)]
-    cache: CacheFormat,
+    /// How the KV cache is stored: auto, with the weights; f32; or f16 in half the memory. It has to pass the same gate
+    #[arg(long, value_name = "FORMAT", default_value = "auto", value_parser = auto_or(cache_format))]
+    cache: Choice<CacheFormat>,
     /// Largest difference of an action that the gate, and later the image's self-test, accept, in the action's units; the
     /// bundle's own is meant for 32-bit weights
     #[arg(long, value_name = "DIFFERENCE", value_parser = tolerance)]
@@ -50,24 +51,26 @@ pub struct Request {
 
 /// Compiles as requested.
 pub fn compile(request: Request) -> Result<(), Refusal> {
+    // What is no bundle is refused below, with what it is instead.
+    let bundle = Bundle::open(&request.model).ok();
+    let formats = Formats {
+        weights: request.weights.0,
+        low_level: request.low_level,
+        cache: request.cache.0,
+    };
+    let options = Options {
+        storage: bundle.as_ref().and_then(|bundle| formats.storage(bundle)),
+        tolerance: request.tolerance,
+        force: request.force,
+    };
     let Request {
         model,
         output,
         emit_c,
         emit_rust,
-        weights,
-        low_level,
-        cache,
-        tolerance,
         force,
+        ..
     } = request;
-    let options = Options {
-        weights,
-        low_level,
-        cache,
-        tolerance,
-        force,
-    };
     let outputs: Vec<_> = [
         ("-o", &output),
         ("--emit-c", &emit_c),
@@ -77,8 +80,9 @@ pub fn compile(request: Request) -> Result<(), Refusal> {
     .filter_map(|(option, path)| Some((option, path.as_deref()?)))
     .collect();
     output::check(&[("", &model)], &outputs).map_err(Refusal::of)?;
-    let model = Model::compile(&model, options)?;
-    let again = output.is_some() || options != Options::default();
+    let model = Model::compile(&model, &options)?;
+    let asked = formats != Formats::default() || options != Options::default();
+    let again = output.is_some() || asked;
     if again && !model.is_bundle() {
         return Err(Refusal::new(
             model.path.display(),
@@ -108,11 +112,19 @@ pub fn compile(request: Request) -> Result<(), Refusal> {
         draft.commit().map_err(|error| unwritable(path, &error))?;
         print(&format!("{}: {bytes} bytes\n", path.display()))?;
     }
-    if options.is_exact() || force {
+    let Some(bundle) = bundle else {
         return Ok(());
+    };
+    let storage = options.storage(&bundle);
+    if storage.is_exact() || force {
+        return if options.storage.is_none() && bundle.tuned().is_none() {
+            print("f32 weights: the bundle is not tuned to fewer bits; `lads-run tune` does it\n")
+        } else {
+            Ok(())
+        };
     }
     let line = self_test::self_test(&model)?;
-    print(&format!("{options}: {line}\n"))
+    print(&format!("{storage}: {line}\n"))
 }
 
 pub fn weight_format(name: &str) -> Result<WeightFormat, String> {
@@ -123,13 +135,18 @@ fn cache_format(name: &str) -> Result<CacheFormat, String> {
     named(name, CacheFormat::ALL, CacheFormat::name)
 }
 
-fn named<T: Copy, const N: usize>(
-    name: &str,
-    known: [T; N],
-    name_of: fn(T) -> &'static str,
-) -> Result<T, String> {
-    let found = known.into_iter().find(|&format| name_of(format) == name);
-    found.ok_or_else(|| format!("known are {}", known.map(name_of).join(", ")))
+/// A format; `None` is `auto`.
+#[derive(Debug, Clone, Copy)]
+struct Choice<T>(Option<T>);
+
+/// A parser that also knows `auto`.
+fn auto_or<T>(
+    format: fn(&str) -> Result<T, String>,
+) -> impl Fn(&str) -> Result<Choice<T>, String> + Clone {
+    move |name| match name {
+        "auto" => Ok(Choice(None)),
+        _ => format(name).map(|format| Choice(Some(format))),
+    }
 }
 
 fn tolerance(text: &str) -> Result<f32, String> {

@@ -7,7 +7,10 @@ pub mod foreign;
 mod json;
 mod text;
 
+use std::path::Path;
+
 use lads_core::{Beyond, Controller, DType, Data, Decision, Noise, Policy, QuaternionOrder, Role};
+use lads_host::Opened;
 use lads_host::schedule::{self, Cost, Place, Steps};
 use lads_image::records::{
     EntryRecord, Event, PortRecord, Scope, SourceKind, StateKind, StateRecord,
@@ -45,34 +48,32 @@ pub fn observations(model: &Model) -> Result<String, Refusal> {
 
 /// A policy that can describe itself, for people or as JSON.
 pub struct Report<'m> {
-    model: &'m Model,
+    path: &'m Path,
+    opened: &'m Opened,
     policy: Policy<'m>,
     tables: Tables<'m>,
     places: Vec<Place>,
 }
 
 impl<'m> Report<'m> {
-    /// The report on a policy that was read.
-    pub fn of(model: &'m Model) -> Result<Self, Refusal> {
-        let policy = model.policy();
-        let tables = Tables::new(policy.image()).map_err(|error| {
-            Refusal::new(
-                model.path.display(),
-                error,
-                "compile it again from its bundle",
-            )
-        })?;
-        let places = schedule::places(&policy);
-        Ok(Self {
-            model,
+    /// The report on a policy that was read from `path`.
+    pub fn of(path: &'m Path, opened: &'m Opened) -> Self {
+        let policy = opened.policy();
+        let tables = match Tables::new(policy.image()) {
+            Ok(tables) => tables,
+            Err(error) => unreachable!("they were checked when the policy was opened: {error}"),
+        };
+        Self {
+            path,
+            opened,
             policy,
             tables,
-            places,
-        })
+            places: schedule::places(&policy),
+        }
     }
 
     fn form(&self) -> &'static str {
-        if self.model.is_bundle() {
+        if self.opened.is_bundle() {
             "bundle"
         } else {
             "image"

@@ -17,18 +17,23 @@ pub struct Model {
 }
 
 impl Model {
-    /// Reads and, where it is a bundle, compiles the policy at `path`, with 32-bit weights.
+    /// Reads and, where it is a bundle, compiles the policy at `path`, its numbers stored as it was tuned.
     pub fn open(path: &Path) -> Result<Self, Refusal> {
-        Self::compile(path, Options::default())
+        Self::compile(path, &Options::default())
     }
 
-    /// The same with other weights or another cache; an image has those that it was compiled with.
-    pub fn compile(path: &Path, options: Options) -> Result<Self, Refusal> {
+    /// The same, stored otherwise; an image has those that it was compiled with.
+    pub fn compile(path: &Path, options: &Options) -> Result<Self, Refusal> {
         let opened = lads_host::open_with(path, options);
         Ok(Self {
             path: path.to_owned(),
             opened: opened.map_err(|error| Refusal::of(chain(&error)))?,
         })
+    }
+
+    /// The policy.
+    pub fn opened(&self) -> &Opened {
+        &self.opened
     }
 
     /// Whether it was read from a bundle and compiled, not read as an image.

@@ -3,7 +3,7 @@
 //! Invariant: there are as many values as the observation channels have elements, one channel behind the other. What can fail: a line
 //! that is none, or a number that is no value of its channel's type; the message names channel and element.
 
-use lads_core::{Channel, ChannelId, Contract, DType, Data, InputError};
+use lads_core::{Channel, ChannelId, Contract, DType, Data};
 
 use crate::line::{self, Form, LineError};
 
@@ -91,21 +91,6 @@ impl Seen {
             place -= values.held.len();
         }
         String::new()
-    }
-
-    /// What the controller does not take, with the names of channel and element.
-    pub fn refused(&self, error: &InputError) -> String {
-        let found = (self.channels.iter()).find(|values| values.id.0 == error.channel());
-        let Some((values, element)) = found.zip(error.element()) else {
-            return error.to_string();
-        };
-        let at = values.element(element);
-        match error {
-            InputError::OutOfLimits {
-                value, min, max, ..
-            } => format!("{at} is {value}, its limits are {min} to {max}"),
-            _ => format!("{at} is not finite"),
-        }
     }
 }
 
@@ -226,17 +211,6 @@ mod tests {
         assert_eq!(
             error("0,0,0,0,0.5"),
             "value 5 is 0.5, no integer of 32 bits (channel `mode`, element 0)"
-        );
-        let beyond = InputError::OutOfLimits {
-            channel: 0,
-            index: 1,
-            value: 9.0,
-            min: -1.0,
-            max: 1.0,
-        };
-        assert_eq!(
-            seen.refused(&beyond),
-            "channel `joints`, element 1 `knee` is 9, its limits are -1 to 1"
         );
     }
 }

@@ -5,6 +5,8 @@ mod common;
 use std::fs;
 use std::path::Path;
 
+use lads_compiler::{CacheFormat, Evidence, Storage, Tuned, WeightFormat};
+
 use common::{altered, answer, lads, refused, tiny};
 
 #[test]
@@ -29,7 +31,7 @@ fn weights_of_fewer_bits_pass_a_gate() {
     // What only helps to choose the plan takes fewer bits with no other tolerance, and the self-test says so.
     let smaller = ["--weights", "f16", "--low-level", "f32", "--cache", "f16"];
     let said = answer(&compile(&smaller), "");
-    let stored = "f16 weights (low level f32) and an f16 cache: self-test passed";
+    let stored = "f16 weights (low_level/act f32) and an f16 cache: self-test passed";
     assert!(said.contains(stored), "{said}");
     answer(&["self-test", image], "");
     for (flag, value, known) in [
@@ -39,6 +41,59 @@ fn weights_of_fewer_bits_pass_a_gate() {
         ("--tolerance", "0", "positive"),
     ] {
         refused(&compile(&[flag, value]), "", &[value, known]);
+    }
+}
+
+#[test]
+fn a_bundle_is_compiled_as_it_was_tuned_unless_something_else_is_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let (model, image) = (path("tuned.onnx"), path("tuned.lads"));
+    let plain = fs::read(tiny()).unwrap();
+    let untuned = tiny();
+    let untuned = untuned.to_str().unwrap();
+    let said = answer(&["compile", untuned, "-o", &image], "");
+    assert!(said.contains("lads-run tune"), "{said}");
+    let exact = fs::read(&image).unwrap();
+    let storage = Storage::of_weights(WeightFormat::F16)
+        .with_part("low_level/act", WeightFormat::F32)
+        .with_cache(CacheFormat::F16);
+    let tuned = Tuned::new(storage, Evidence::default()).written_into(&plain);
+    fs::write(&model, tuned.unwrap()).unwrap();
+    for (more, stored) in [
+        (&[][..], "f16 weights (low_level/act f32) and an f16 cache"),
+        (&["--cache", "f32"], "f16 weights (low_level/act f32)"),
+        (
+            &["--weights", "f16", "--low-level", "f32"],
+            "f16 weights (low_level/act f32)",
+        ),
+        (
+            &["--weights", "f32", "--cache", "f16"],
+            "f32 weights and an f16 cache",
+        ),
+    ] {
+        let arguments = [&["compile", &model, "-o", &image], more].concat();
+        let said = answer(&arguments, "");
+        assert!(
+            said.contains(&format!("{stored}: self-test passed")),
+            "{said}"
+        );
+    }
+    let as_exact = ["compile", &model, "-o", &image, "--weights", "f32"];
+    answer(&as_exact, "");
+    assert_eq!(fs::read(&image).unwrap().len(), exact.len());
+    // Every command that takes a bundle follows.
+    let said = answer(&["inspect", &model], "");
+    assert!(said.contains("f16"), "{said}");
+    // A record for parts that are not there is refused by all of them.
+    let stray = Storage::default().with_part("low_level/dance", WeightFormat::Int8);
+    let stray = Tuned::new(stray, Evidence::default()).written_into(&plain);
+    fs::write(&model, stray.unwrap()).unwrap();
+    for arguments in [
+        ["self-test", &model].to_vec(),
+        ["compile", &model, "-o", &image].to_vec(),
+    ] {
+        refused(&arguments, "", &["tuned.onnx", "low_level/dance", "tune"]);
     }
 }
 

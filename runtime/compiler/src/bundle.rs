@@ -9,11 +9,12 @@ use bytes::Bytes;
 use prost::Message;
 
 use crate::contract::Contract;
-use crate::digest::sha256;
+use crate::digest;
 use crate::entries;
 use crate::error::BundleError;
 use crate::golden::Golden;
 use crate::onnx::{self, GraphProto, ModelProto};
+use crate::storage::{Tuned, without_record};
 
 /// How many instructions are offered when one is not known.
 const NEAREST: usize = 3;
@@ -23,7 +24,9 @@ const NEAREST: usize = 3;
 pub struct Bundle {
     contract: Contract,
     golden: Golden,
+    tuned: Option<Tuned>,
     sha256: String,
+    untuned_sha256: String,
     bytes: usize,
     pub(crate) model: ModelProto,
 }
@@ -69,6 +72,12 @@ impl Bundle {
             problem: "missing from the model's metadata".into(),
         })?;
         let golden = Golden::parse(golden, &contract)?;
+        let tuned = Tuned::find(property)?;
+        let sha256 = digest::sha256(bytes);
+        let untuned_sha256 = match tuned {
+            Some(_) => digest::sha256(&without_record(bytes)?),
+            None => sha256.clone(),
+        };
         let graph = model.graph.as_ref().ok_or_else(|| BundleError::NotOnnx {
             problem: "it has no graph".into(),
         })?;
@@ -77,7 +86,9 @@ impl Bundle {
         Ok(Self {
             contract,
             golden,
-            sha256: sha256(bytes),
+            tuned,
+            sha256,
+            untuned_sha256,
             bytes: bytes.len(),
             model,
         })
@@ -93,9 +104,30 @@ impl Bundle {
         &self.golden
     }
 
+    /// How an image's numbers are to be stored, and on what evidence; `None` until the bundle is tuned.
+    pub fn tuned(&self) -> Option<&Tuned> {
+        self.tuned.as_ref()
+    }
+
+    /// Names of the entry graphs whose outputs reach the action, not only the choice of an index.
+    pub fn acting_entries(&self) -> Vec<String> {
+        let blueprint = self.contract.family.kind().blueprint(&self.contract);
+        let acting = blueprint.entries.iter().filter(|entry| entry.acts);
+        let mut names: Vec<_> = acting
+            .filter_map(|entry| entry.graph().map(str::to_owned))
+            .collect();
+        names.dedup();
+        names
+    }
+
     /// SHA-256 of the file, hexadecimal.
     pub fn sha256(&self) -> &str {
         &self.sha256
+    }
+
+    /// SHA-256 of the file as it was before it was tuned: what a reference names, from which the bundle was tuned.
+    pub fn untuned_sha256(&self) -> &str {
+        &self.untuned_sha256
     }
 
     /// Size of the file.

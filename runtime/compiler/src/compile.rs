@@ -1,10 +1,9 @@
 //! The whole way from a bundle to an image.
 
-use std::collections::HashMap;
-use std::fmt;
+use std::collections::{HashMap, HashSet};
 
 use lads_core::{Controller, Policy, PolicyError, ScheduleError, Workspace};
-use lads_image::op::{CacheFormat, WeightFormat, WeightSpan};
+use lads_image::op::{CacheFormat, WeightSpan};
 
 use crate::bundle::Bundle;
 use crate::entries::{self, LOOKUP_INSTRUCTION, Signature};
@@ -18,6 +17,7 @@ use crate::lower::{Cache, Weights, lower};
 use crate::plan::{Placed, plan};
 use crate::reach::Reach;
 use crate::report::{CompileReport, ProgramReport};
+use crate::storage::Storage;
 use crate::tensor::Tensor;
 use crate::verify::verify;
 
@@ -30,14 +30,10 @@ pub(crate) struct Made {
 }
 
 /// What a compilation may choose.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct Options {
-    /// How the weights of dense layers are stored.
-    pub weights: WeightFormat,
-    /// How those of the low level are, if otherwise: they alone are in the action, all others only help to choose the plan.
-    pub low_level: Option<WeightFormat>,
-    /// How the KV cache is stored.
-    pub cache: CacheFormat,
+    /// How weights and caches are stored; left out, as the bundle was [tuned](Bundle::tuned), and with 32 bits where it was not.
+    pub storage: Option<Storage>,
     /// How far an action may be from the recorded one, instead of what the bundle says; the image's self-test keeps to it too.
     pub tolerance: Option<f32>,
     /// Whether an image is made even if the gate refuses it; its self-test then fails.
@@ -45,47 +41,38 @@ pub struct Options {
 }
 
 impl Options {
-    /// Whether nothing is stored with fewer bits than it was computed with.
-    pub fn is_exact(&self) -> bool {
-        let weights = [self.weights, self.low_level()];
-        weights == [WeightFormat::F32; 2] && self.cache == CacheFormat::F32
+    /// Everything with 32 bits, whatever the bundle was tuned to.
+    pub fn exact() -> Self {
+        Self {
+            storage: Some(Storage::default()),
+            ..Self::default()
+        }
     }
 
-    fn low_level(&self) -> WeightFormat {
-        self.low_level.unwrap_or(self.weights)
+    /// How the numbers of this bundle's image are stored.
+    pub fn storage(&self, bundle: &Bundle) -> Storage {
+        let tuned = || bundle.tuned().map(|tuned| tuned.storage.clone());
+        self.storage.clone().or_else(tuned).unwrap_or_default()
     }
 }
 
-/// For example `f16 weights (low level f32) and an f16 cache`.
-impl fmt::Display for Options {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        write!(f, "{} weights", self.weights.name())?;
-        if self.low_level() != self.weights {
-            write!(f, " (low level {})", self.low_level().name())?;
-        }
-        match self.cache {
-            CacheFormat::F32 => Ok(()),
-            CacheFormat::F16 => f.write_str(" and an f16 cache"),
-        }
-    }
-}
-
-/// Compiles a bundle with 32-bit weights and cache.
+/// Compiles a bundle, its numbers stored as it was [tuned](Bundle::tuned), or with 32 bits.
 pub fn compile(bundle: &Bundle) -> Result<Image, CompileError> {
-    compile_with(bundle, Options::default())
+    compile_with(bundle, &Options::default())
 }
 
 /// Compiles a bundle. Weights or a cache of fewer bits have to pass a gate, unless forced: the image that was made replays the bundle's golden
 /// episode with the same indices, and with actions inside the episode's tolerance.
-pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileError> {
+pub fn compile_with(bundle: &Bundle, options: &Options) -> Result<Image, CompileError> {
     let contract = bundle.contract();
+    let storage = options.storage(bundle);
     let blueprint = contract.family.kind().blueprint(contract);
     let signatures =
         entries::signatures(bundle.graph(), contract, &blueprint).map_err(CompileError::Bundle)?;
     let model = Model::new(&bundle.model, bundle.graph())?;
-    let caches = caches(bundle, &blueprint, &signatures, options.cache)?;
+    let caches = caches(bundle, &blueprint, &signatures, storage.cache)?;
     let reach = Reach::new(contract, &blueprint);
-    let mut weights = Weights::default();
+    let mut weights = Weights::new(&storage);
     let (mut made, mut programs) = (vec![], vec![]);
     // In the order of the blueprint: whole matrices come before the parts of them that other programs need, and what runs in every
     // control step comes first.
@@ -93,11 +80,7 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
         let Some(fused) = fused(&model, &signatures, &blueprint, entry)? else {
             continue;
         };
-        weights.format = if entry.acts {
-            options.low_level()
-        } else {
-            options.weights
-        };
+        weights.entry = entry.graph().unwrap_or_default();
         let cache = entry.cache.as_ref().and_then(|name| caches.get(name));
         let lowered = lower(
             &entry.name,
@@ -123,6 +106,7 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
             ops: placed.ops.len(),
             arena_len: placed.arena_len as usize,
             arena_lower_bound: placed.lower_bound as usize,
+            layers: lowered.layers,
         });
         made.push(Made {
             entry: index,
@@ -130,6 +114,7 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
             tokens: lowered.tokens,
         });
     }
+    known_parts(&storage, &signatures, &programs)?;
     let words = match signatures
         .iter()
         .find(|known| known.entry == LOOKUP_INSTRUCTION)
@@ -163,10 +148,32 @@ pub fn compile_with(bundle: &Bundle, options: Options) -> Result<Image, CompileE
     let cache_len = image::rows_len(&parts);
     let image = image::write(bundle, &parts, report(cache_len))?;
     let policy = Policy::new_checked(image.as_bytes()).map_err(CompileError::Image)?;
-    if !options.is_exact() && !options.force {
-        gate(&policy, options, parts.tolerance)?;
+    if !storage.is_exact() && !options.force {
+        gate(&policy, &storage, parts.tolerance)?;
     }
     Ok(image)
+}
+
+/// Refuses exceptions for entries and layers that there are not.
+fn known_parts(
+    storage: &Storage,
+    signatures: &[Signature],
+    programs: &[ProgramReport],
+) -> Result<(), CompileError> {
+    let layers = programs.iter().flat_map(|program| &program.layers);
+    let known: HashSet<&str> = signatures
+        .iter()
+        .map(|signature| signature.entry.as_str())
+        .chain(layers.map(|layer| layer.node.as_str()))
+        .collect();
+    let parts = storage.parts.keys().map(String::as_str);
+    let unknown: Vec<_> = parts.filter(|part| !known.contains(part)).collect();
+    if unknown.is_empty() {
+        return Ok(());
+    }
+    Err(CompileError::UnknownParts {
+        parts: unknown.join(", ").into(),
+    })
 }
 
 /// Refuses memory of more f32 elements than a policy gets.
@@ -179,7 +186,7 @@ fn bounded(elements: usize) -> Result<(), CompileError> {
 }
 
 /// The golden episode, in memory of its own.
-fn gate(policy: &Policy, options: Options, tolerance: f32) -> Result<(), CompileError> {
+fn gate(policy: &Policy, storage: &Storage, tolerance: f32) -> Result<(), CompileError> {
     bounded(policy.arena_len().saturating_add(policy.state_len()))?;
     let mut arena = vec![0.0; policy.arena_len()];
     let mut state = vec![0.0; policy.state_len()];
@@ -190,7 +197,7 @@ fn gate(policy: &Policy, options: Options, tolerance: f32) -> Result<(), Compile
     })?;
     let replayed = Controller::new(*policy, workspace).self_test();
     replayed.map(|_| ()).map_err(|error| CompileError::Gate {
-        stored: options.to_string().into(),
+        stored: storage.to_string().into(),
         error,
         tolerance,
     })
@@ -264,7 +271,7 @@ fn instruction_words(
     bundle: &Bundle,
     model: &Model,
     signature: &Signature,
-    weights: &mut Weights,
+    weights: &mut Weights<'_>,
 ) -> Result<Vec<(u32, WeightSpan)>, CompileError> {
     let contract = bundle.contract();
     let [most, dim] = contract.words().unwrap_or_default();

@@ -92,6 +92,12 @@ pub enum BundleError {
         /// What is wrong with it.
         problem: Line,
     },
+    /// The record of how an image's numbers are stored does not read.
+    #[error("`lads.storage`: {problem}; tune the bundle again: `lads-run tune`")]
+    Storage {
+        /// What is wrong with it.
+        problem: Line,
+    },
     /// One of the above, in a file.
     #[error("{path}: {source}", path = path.display())]
     File {
@@ -149,6 +155,14 @@ pub enum CompileError {
         error: SelfTestError,
         /// Largest absolute difference of an action that counts as equal.
         tolerance: f32,
+    },
+    /// Formats for parts that the bundle does not have.
+    #[error(
+        "the storage names {parts}, and the bundle has no entry and no layer of that name; tune the bundle again, or name others"
+    )]
+    UnknownParts {
+        /// All of them, with commas.
+        parts: Line,
     },
     /// The policy is too large for an image, whose offsets have 32 bits.
     #[error(

@@ -21,6 +21,7 @@ use crate::contract::Network;
 use crate::error::CompileError;
 use crate::fuse::Fused;
 use crate::graph::{Graph, Id, Op, Type, topological};
+use crate::report::LayerReport;
 
 use view::View;
 pub(crate) use weights::Weights;
@@ -37,6 +38,7 @@ pub(crate) struct Lowered {
     pub inputs: Vec<(String, Place)>,
     pub outputs: Vec<(String, Place)>,
     pub tokens: usize,
+    pub layers: Vec<LayerReport>,
 }
 
 /// A KV cache: for each layer keys, in whole blocks of sixteen tokens, then values, `[capacity, heads * head_dim]`.
@@ -107,7 +109,7 @@ pub(crate) fn lower(
     entry: &str,
     fused: &Fused,
     cache: Cache,
-    weights: &mut Weights,
+    weights: &mut Weights<'_>,
 ) -> Result<Lowered, CompileError> {
     let order = topological(&fused.graph, &fused.roots(), &HashMap::new());
     let mut lowering = Lowering::new(fused, &order, cache, weights);
@@ -147,6 +149,7 @@ pub(crate) fn lower(
         buffers,
         input_ports,
         output_ports,
+        layers,
         ..
     } = lowering;
     Ok(Lowered {
@@ -155,6 +158,7 @@ pub(crate) fn lower(
         inputs: input_ports,
         outputs: output_ports,
         tokens: fused.tokens,
+        layers,
     })
 }
 
@@ -164,9 +168,9 @@ fn is_cache(name: &str) -> bool {
 }
 
 /// An entry on its way to ops.
-struct Lowering<'a> {
+struct Lowering<'a, 's> {
     g: &'a Graph,
-    weights: &'a mut Weights,
+    weights: &'a mut Weights<'s>,
     cache: Cache,
     ops: Vec<op::Op>,
     buffers: Vec<Span>,
@@ -188,10 +192,12 @@ struct Lowering<'a> {
     borders: HashMap<Id, [usize; 4]>,
     input_ports: Vec<(String, Place)>,
     output_ports: Vec<(String, Place)>,
+    /// The dense layers, in their order.
+    layers: Vec<LayerReport>,
 }
 
-impl<'a> Lowering<'a> {
-    fn new(fused: &'a Fused, order: &[Id], cache: Cache, weights: &'a mut Weights) -> Self {
+impl<'a, 's> Lowering<'a, 's> {
+    fn new(fused: &'a Fused, order: &[Id], cache: Cache, weights: &'a mut Weights<'s>) -> Self {
         let mut pending: HashMap<Id, usize> = HashMap::new();
         let uses = order
             .iter()
@@ -216,6 +222,7 @@ impl<'a> Lowering<'a> {
             borders: HashMap::new(),
             input_ports: vec![],
             output_ports: vec![],
+            layers: vec![],
         }
     }
 

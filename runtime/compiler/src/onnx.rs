@@ -14,6 +14,8 @@ use prost::Message;
 
 use crate::error::BundleError;
 
+pub(crate) use envelope::fields;
+
 /// A model file.
 #[derive(Clone, PartialEq, Message)]
 pub struct ModelProto {
@@ -225,7 +227,7 @@ pub mod data_type {
 
 /// Reads a model file.
 pub fn decode(bytes: &Bytes) -> Result<ModelProto, BundleError> {
-    envelope::check(bytes)?;
+    fields(bytes)?;
     let model = ModelProto::decode(bytes.clone()).map_err(|error| BundleError::NotOnnx {
         problem: format!("its protocol buffer does not decode: {error}").into(),
     })?;

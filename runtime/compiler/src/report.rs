@@ -1,6 +1,22 @@
 //! Sizes of what was compiled.
 
 use std::fmt;
+use std::ops::Range;
+
+use lads_image::op::WeightFormat;
+
+/// One dense layer of a program.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LayerReport {
+    /// Name of the ONNX node that it was made from, or of that node's first output.
+    pub node: String,
+    /// Number of weights.
+    pub weights: usize,
+    /// How they are stored.
+    pub format: WeightFormat,
+    /// Where: the 4-byte words of the image's weights. Layers of several programs may share them.
+    pub words: Range<usize>,
+}
 
 /// One program of an image.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -15,6 +31,8 @@ pub struct ProgramReport {
     pub arena_len: usize,
     /// Largest sum of values that live at the same time: no plan needs less.
     pub arena_lower_bound: usize,
+    /// Its dense layers, in their order.
+    pub layers: Vec<LayerReport>,
 }
 
 /// What a compilation made.

@@ -28,6 +28,7 @@ use crate::import::Model;
 use crate::lower::{Cache, Lowered, Weights, lower};
 use crate::onnx::ModelProto;
 use crate::plan::{Placed, plan};
+use crate::storage::Storage;
 use crate::verify::verify;
 
 /// A program as far as the stages before the image take it.
@@ -48,7 +49,8 @@ fn compiled(
     let entry = Model::new(model, graph)?.import(signature, &HashMap::new())?;
     let outputs: Vec<String> = outputs.iter().map(|&output| output.into()).collect();
     let fused = fuse(entry, signature, &outputs)?;
-    let mut weights = Weights::default();
+    let storage = Storage::default();
+    let mut weights = Weights::new(&storage);
     let lowered = lower(&signature.entry, &fused, cache, &mut weights)?;
     let placed = plan(&lowered);
     verify(&lowered, &placed).expect("the memory plan is proven");

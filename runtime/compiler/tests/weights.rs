@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use lads_compiler::{
-    Bundle, CacheFormat, CompileError, Image, Options, WeightFormat, compile_with,
+    Bundle, CacheFormat, CompileError, Image, Options, Storage, WeightFormat, compile_with,
 };
 use lads_core::{Controller, Instruction, Isa, Policy, SelfTest, SelfTestError, Workspace};
 use lads_image::Tables;
@@ -16,7 +16,7 @@ fn tiny() -> Bundle {
 
 fn options(weights: WeightFormat, tolerance: f32) -> Options {
     Options {
-        weights,
+        storage: Some(Storage::of_weights(weights)),
         tolerance: Some(tolerance),
         ..Options::default()
     }
@@ -82,7 +82,7 @@ fn largest_difference(a: &[f32], b: &[f32]) -> f32 {
 #[test]
 fn fewer_bits_are_admitted_inside_a_tolerance() {
     let bundle = tiny();
-    let exact = compile_with(&bundle, Options::default()).unwrap();
+    let exact = compile_with(&bundle, &Options::exact()).unwrap();
     let reference = actions(&exact, Isa::detect());
     let mut bytes = exact.as_bytes().len();
     // From the largest difference that this bundle shows, doubled.
@@ -92,7 +92,7 @@ fn fewer_bits_are_admitted_inside_a_tolerance() {
         (WeightFormat::Bf16, 4e-3),
         (WeightFormat::Int8, 7e-3),
     ] {
-        let image = compile_with(&bundle, options(format, tolerance)).unwrap();
+        let image = compile_with(&bundle, &options(format, tolerance)).unwrap();
         let policy = Policy::new_checked(image.as_bytes()).unwrap();
         assert_eq!(policy.golden().unwrap().tolerance(), tolerance);
         let passed = self_test(&policy).unwrap();
@@ -131,10 +131,10 @@ fn fewer_bits_are_admitted_inside_a_tolerance() {
 fn what_changes_the_policy_is_refused_unless_forced() {
     let bundle = tiny();
     let default = Options {
-        weights: WeightFormat::Bf16,
+        storage: Some(Storage::of_weights(WeightFormat::Bf16)),
         ..Options::default()
     };
-    let refused = compile_with(&bundle, default).unwrap_err();
+    let refused = compile_with(&bundle, &default).unwrap_err();
     assert!(
         matches!(
             refused,
@@ -152,7 +152,7 @@ fn what_changes_the_policy_is_refused_unless_forced() {
         force: true,
         ..default
     };
-    let image = compile_with(&bundle, forced).unwrap();
+    let image = compile_with(&bundle, &forced).unwrap();
     let policy = Policy::new_checked(image.as_bytes()).unwrap();
     assert!(self_test(&policy).is_err());
 }
@@ -161,30 +161,32 @@ fn what_changes_the_policy_is_refused_unless_forced() {
 #[test]
 fn what_only_chooses_plans_may_take_fewer_bits_and_no_tolerance() {
     let bundle = tiny();
-    let exact = compile_with(&bundle, Options::default()).unwrap();
+    let exact = compile_with(&bundle, &Options::exact()).unwrap();
     let (reference, margins) = replayed(&exact, Isa::detect());
-    let halves = Options {
-        cache: CacheFormat::F16,
-        ..Options::default()
-    };
-    let mixed = Options {
-        weights: WeightFormat::F16,
-        low_level: Some(WeightFormat::F32),
-        ..halves
+    let halves = Storage::default().with_cache(CacheFormat::F16);
+    let mixed = Storage::of_weights(WeightFormat::F16)
+        .with_part("low_level/act", WeightFormat::F32)
+        .with_cache(CacheFormat::F16);
+    let compiled = |storage: &Storage| {
+        let options = Options {
+            storage: Some(storage.clone()),
+            ..Options::default()
+        };
+        compile_with(&bundle, &options).unwrap()
     };
     let state = |image: &Image| {
         let policy = Policy::new_checked(image.as_bytes()).unwrap();
         policy.state_len()
     };
-    for (options, text) in [
-        (halves, "f32 weights and an f16 cache"),
-        (mixed, "f16 weights (low level f32) and an f16 cache"),
+    for (storage, text) in [
+        (&halves, "f32 weights and an f16 cache"),
+        (&mixed, "f16 weights (low_level/act f32) and an f16 cache"),
     ] {
         assert_eq!(
-            (options.to_string().as_str(), options.is_exact()),
+            (storage.to_string().as_str(), storage.is_exact()),
             (text, false)
         );
-        let image = compile_with(&bundle, options).unwrap();
+        let image = compiled(storage);
         let own = replayed(&image, Isa::portable());
         assert!(Isa::all().all(|isa| replayed(&image, isa) == own), "{text}");
         assert_eq!(
@@ -195,7 +197,7 @@ fn what_only_chooses_plans_may_take_fewer_bits_and_no_tolerance() {
         let [half, full] = [&image, &exact].map(state);
         assert!(half < full * 3 / 5, "{text}: {half} of {full} words");
     }
-    let image = compile_with(&bundle, mixed).unwrap();
+    let image = compiled(&mixed);
     let of = |program, format| {
         let layers = layers(&image, program);
         !layers.is_empty() && layers.iter().all(|&found| found == format)

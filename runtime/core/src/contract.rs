@@ -10,7 +10,7 @@ use lads_image::records::{self, ContractRecord, InstructionRecord, NoiseRule, Se
 use lads_image::tables::Tables;
 
 use crate::errors::InputError;
-use crate::inputs::MAX_OBSERVATIONS;
+use crate::inputs::{self, Data, MAX_OBSERVATIONS};
 
 mod channel;
 
@@ -229,6 +229,11 @@ impl<'a> Contract<'a> {
     /// The first observation channel, the only one of most policies.
     pub fn observation(&self) -> Channel<'a> {
         self.known(self.observation)
+    }
+
+    /// Whether a control step would take these values: all observation channels once, each with finite values inside its limits.
+    pub fn check_observations(&self, given: &[(ChannelId, Data)]) -> Result<(), InputError> {
+        inputs::check(self, Role::Observation, given, 0).map(|_| ())
     }
 
     /// Elements of the first observation channel.

@@ -3,7 +3,7 @@
 //! - [`open()`] reads a policy from either of its forms, a bundle (ONNX), which it compiles, or a compiled image. An [`Opened`] is a
 //!   policy that was checked; [`Opened::load`] gives it memory, and [`Loaded::controller`] puts it to work.
 //! - [`Memory`] and [`Aligned`] are memory in large pages, where the operating system has them.
-//! - [`instruction`] finds a known instruction by what a person wrote.
+//! - [`instruction`] finds a known instruction by what a person wrote; [`refused()`] says which value a controller did not take.
 //! - [`schedule`] says which programs run at which step, and what that costs; [`stored()`] in which formats weights and caches lie.
 //! - [`output`] is the one place where a command writes a file, [`input`] the one where it reads a whole one that a person named.
 //!
@@ -29,6 +29,7 @@ mod memory;
 mod open;
 pub mod output;
 mod pages;
+mod refused;
 pub mod schedule;
 mod stored;
 
@@ -37,4 +38,5 @@ pub use memory::{Memory, MemoryError};
 pub use open::{Loaded, OpenError, Opened, Problem, from_bytes, open};
 #[cfg(feature = "compile")]
 pub use open::{from_bytes_with, open_with};
+pub use refused::refused;
 pub use stored::stored;

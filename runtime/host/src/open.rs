@@ -24,31 +24,31 @@ pub struct Opened {
     bundle: Option<Box<Bundle>>,
 }
 
-/// Reads the policy at `path`; a bundle is compiled with 32-bit weights.
+/// Reads the policy at `path`; a bundle is compiled, its numbers stored as it was tuned.
 pub fn open(path: &Path) -> Result<Opened, OpenError> {
     at(path, from_bytes)
 }
 
-/// Reads a policy from a file's content; a bundle is compiled with 32-bit weights.
+/// Reads a policy from a file's content; a bundle is compiled, its numbers stored as it was tuned.
 pub fn from_bytes(bytes: &[u8]) -> Result<Opened, OpenError> {
     if is_image(bytes) {
         return image(bytes);
     }
     #[cfg(feature = "compile")]
-    return compiled(bytes, Options::default());
+    return compiled(bytes, &Options::default());
     #[cfg(not(feature = "compile"))]
     return Err(Problem::NoCompiler.into());
 }
 
 /// Reads the policy at `path` and compiles it as `options` say; an image has what it was compiled with.
 #[cfg(feature = "compile")]
-pub fn open_with(path: &Path, options: Options) -> Result<Opened, OpenError> {
+pub fn open_with(path: &Path, options: &Options) -> Result<Opened, OpenError> {
     at(path, |bytes| from_bytes_with(bytes, options))
 }
 
 /// Reads a policy from a file's content and compiles it as `options` say; an image has what it was compiled with.
 #[cfg(feature = "compile")]
-pub fn from_bytes_with(bytes: &[u8], options: Options) -> Result<Opened, OpenError> {
+pub fn from_bytes_with(bytes: &[u8], options: &Options) -> Result<Opened, OpenError> {
     if is_image(bytes) {
         image(bytes)
     } else {
@@ -89,7 +89,7 @@ fn image(bytes: &[u8]) -> Result<Opened, OpenError> {
 }
 
 #[cfg(feature = "compile")]
-fn compiled(bytes: &[u8], options: Options) -> Result<Opened, OpenError> {
+fn compiled(bytes: &[u8], options: &Options) -> Result<Opened, OpenError> {
     let bundle = Bundle::from_bytes(bytes).map_err(Problem::Bundle)?;
     let image = lads_compiler::compile_with(&bundle, options).map_err(Problem::Compile)?;
     let image = Aligned::new(image.as_bytes());

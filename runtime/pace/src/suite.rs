@@ -1,6 +1,6 @@
 //! Brings all contenders to the start: opens what they need and compares what they compute, before anything is timed.
 
-use lads_compiler::{CacheFormat, Options, WeightFormat};
+use lads_compiler::{CacheFormat, Options, Storage, WeightFormat};
 use lads_core::{Controller, Policy};
 use lads_host::Memory;
 
@@ -19,11 +19,10 @@ const BROKEN: f32 = 0.1;
 /// is otherwise the machine's, only has to tell a sound policy from a broken one.
 pub fn options(weights: WeightFormat) -> Options {
     if weights == WeightFormat::F32 {
-        return Options::default();
+        return Options::exact();
     }
     Options {
-        weights,
-        cache: CacheFormat::F16,
+        storage: Some(Storage::of_weights(weights).with_cache(CacheFormat::F16)),
         tolerance: Some(BROKEN),
         ..Options::default()
     }

@@ -101,6 +101,8 @@ pub struct Answers {
     pub largest_action_difference: f64,
     /// What it may be.
     pub action_tolerance: f64,
+    /// Decisions of the reference in them; none where it selects nothing, or says nothing about what it selects.
+    pub decisions: usize,
     /// Decisions whose logits were compared.
     pub compared_decisions: usize,
     /// Largest difference of a logit in these, up to a constant added to all of a decision's.
@@ -149,6 +151,7 @@ impl Answers {
         answers.renumbered = numbering.is_another();
         for episode in &traced {
             answers.episodes += 1;
+            answers.decisions += episode.decided_at.len();
             answers.longest_episode = answers.longest_episode.max(episode.replay.replies.len());
             let Some((step, what)) = episode.judge(&numbering, &mut answers) else {
                 continue;

@@ -7,7 +7,7 @@
 //!    reference's questions otherwise (a logit or an action beyond its tolerance, another plan although the reference's margin is no close call,
 //!    decisions at other steps, another encoding of a trajectory); if the reference's actions lead through other states; or if a test finds a paired
 //!    difference larger than its margin (1 % over all of them together).
-//! 2. **EQUIVALENT** if none of this holds, contract, actions, logits and states were compared at all, and every paired difference is
+//! 2. **EQUIVALENT** if none of this holds, contract, actions, states and, where the reference decides, logits were compared at all, and every paired difference is
 //!    equivalent: two one-sided tests at 5 %, within 0.05 for rates and 0.1 for the N-rate.
 //! 3. **INCONCLUSIVE** otherwise; then it says how many more episodes of each instruction would decide, if it stays as it is.
 //!
@@ -73,7 +73,7 @@ impl Verdict {
 /// Where the reference came from.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ReferenceUsed {
-    /// SHA-256 of the bundle whose weights it ran.
+    /// SHA-256 of the bundle whose weights it ran; empty where it is not known to be any bundle's.
     pub bundle_sha256: String,
     /// Whether that is the verified bundle.
     pub same_bundle: bool,
@@ -315,12 +315,14 @@ fn notes(
 /// What nothing was found about: silence is no agreement.
 fn uncompared(contract: &Compared, policy: &Answers, environment: &Physics) -> Vec<String> {
     let counts = [
-        ("action", policy.compared_steps),
-        ("logit", policy.compared_decisions),
-        ("state", environment.states),
+        ("action", policy.compared_steps, true),
+        ("logit", policy.compared_decisions, policy.decisions > 0),
+        ("state", environment.states, true),
     ];
-    let none = counts.iter().filter(|(_, compared)| *compared == 0);
-    let none = none.map(|(what, _)| {
+    let none = counts
+        .iter()
+        .filter(|&&(_, compared, wanted)| wanted && compared == 0);
+    let none = none.map(|(what, ..)| {
         format!("no {what} was compared: the reference's traces hold none that could be")
     });
     let unrecorded = contract.fields.is_empty().then(|| {

@@ -56,6 +56,19 @@ impl Compared {
         restricted(String::new(), image, run, &mut compared.image_differing);
         compared
     }
+
+    /// Compares the contract of the run with what is known of the reference's, which may be a part: a field that nobody states is not compared.
+    pub fn with_stated(run: &Value, stated: &Value) -> Self {
+        let mut compared = Self::default();
+        // What is stated takes the place of what the run says, so the sides are exchanged back.
+        restricted(String::new(), stated, run, &mut compared.differing);
+        for difference in &mut compared.differing {
+            std::mem::swap(&mut difference.run, &mut difference.reference);
+        }
+        let names = stated.as_object().into_iter().flat_map(|all| all.keys());
+        compared.fields = names.cloned().collect();
+        compared
+    }
 }
 
 /// The name of the contract's field that a place is in.
@@ -203,6 +216,18 @@ mod tests {
             found.differing.is_empty() && found.image_differing.is_empty(),
             "{found:?}"
         );
+    }
+
+    #[test]
+    fn only_what_is_stated_is_compared() {
+        let stated = json!({"decision": {"rule": "argmax"}, "period": 0.02});
+        let mut run = contract();
+        run["period"] = json!(0.04);
+        let found = Compared::with_stated(&run, &stated);
+        assert_eq!(fields(&found.differing), ["period"]);
+        assert_eq!(found.differing[0].run, "0.04");
+        assert_eq!(found.differing[0].reference, "0.02");
+        assert_eq!(found.fields, ["decision", "period"]);
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Episodes that are kept: in memory, in files, replayed, and as sequences of plans.
 
 pub mod plans;
-pub mod recorder;
 pub mod replay;
-pub mod trace;
+
+pub use lads_record as recorder;
+pub use lads_record::trace;

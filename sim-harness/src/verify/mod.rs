@@ -90,7 +90,9 @@ pub fn run(
     };
     let used = ReferenceUsed {
         bundle_sha256: reference.bundle_sha256.clone(),
-        same_bundle: reference.bundle_sha256 == contract.bundle_sha256(),
+        // Tuning changes how an image's numbers are stored, not the policy.
+        same_bundle: [bundle.sha256(), bundle.untuned_sha256()]
+            .contains(&reference.bundle_sha256.as_str()),
         weights_from: reference.weights_from.clone(),
         words_from: reference.words_from.clone(),
         logits_from: reference.logits_from.clone(),

@@ -242,7 +242,7 @@ impl Judged {
 
 /// Compares a bundle with its reference: the contract, and the policy's answers to the first traced episode of the instructions whose index
 /// is a multiple of `every`.
-pub fn verify(bytes: &[u8], options: Options, reference: &Reference, every: usize) -> Said {
+pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usize) -> Said {
     let opened = match lads_host::from_bytes_with(bytes, options) {
         Ok(opened) => opened,
         Err(refused) => return Said::Refused(refused.to_string()),

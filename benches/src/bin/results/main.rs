@@ -130,7 +130,7 @@ fn images(bundle: &Bundle) -> Result<Vec<(&'static str, Aligned)>, BenchError> {
     let mut images = vec![];
     for weights in WeightFormat::ALL {
         let full = weights == WeightFormat::F32;
-        match compile_with(bundle, options(weights)) {
+        match compile_with(bundle, &options(weights)) {
             Ok(image) => images.push((weights.name(), Aligned::new(image.as_bytes()))),
             Err(error) if full => return Err(about("models/kitchen.onnx", error)),
             Err(error) => say(&format!("without {} weights: {error}", weights.name())),

@@ -13,7 +13,7 @@ impl Report<'_> {
         let contract = self.policy.contract();
         let golden = self.policy.golden();
         json!({
-            "file": self.model.path.display().to_string(),
+            "file": self.path.display().to_string(),
             "form": self.form(),
             "bundle_sha256": contract.bundle_sha256(),
             "stored": lads_host::stored(&self.policy),

@@ -11,7 +11,7 @@ use super::{Report, beyond, bytes, decision, dtype, noise, quaternions, role};
 impl Display for Report<'_> {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let contract = self.policy.contract();
-        let path = self.model.path.display();
+        let path = self.path.display();
         let [id, version] = [contract.environment_id(), contract.environment_version()];
         let (family, form) = (contract.family(), self.form());
         writeln!(f, "{path}: {family} policy for {id} {version} ({form})")?;

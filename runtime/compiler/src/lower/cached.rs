@@ -13,7 +13,7 @@ struct Rows {
     stride: u32,
 }
 
-impl Lowering<'_> {
+impl Lowering<'_, '_> {
     /// Rows of a matrix, each contiguous.
     fn rows(&mut self, id: Id) -> Result<Rows, String> {
         let shape = self.shape(id)?;

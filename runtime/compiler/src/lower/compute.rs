@@ -8,6 +8,7 @@ use lads_image::op::{
 use super::Lowering;
 use super::view::{View, four};
 use crate::graph::{Id, Op, Type, Unary};
+use crate::report::LayerReport;
 
 pub(super) type Done = Result<(), String>;
 
@@ -15,7 +16,7 @@ pub(super) fn product(shape: &[usize]) -> usize {
     shape.iter().product()
 }
 
-impl Lowering<'_> {
+impl Lowering<'_, '_> {
     /// Lowers one node; its operands are lowered.
     pub(super) fn node(&mut self, id: Id) -> Done {
         let computed = matches!(self.g.op(id), Op::ArgMin | Op::ArgMax | Op::ToIndex);
@@ -399,7 +400,8 @@ impl Lowering<'_> {
             .constant(x[1])
             .cloned()
             .ok_or("reads weights that are not constant")?;
-        let packed = self.weights.packed(&matrix)?;
+        let (_, node) = self.g.origin(id);
+        let packed = self.weights.packed(&matrix, node)?;
         let bias = if bias { Some(self.plain(x[2])?) } else { None };
         let rows = self.contiguous(x[0])?;
         let y = match x.last() {
@@ -407,6 +409,12 @@ impl Lowering<'_> {
             _ => self.allocate(id, &shape),
         };
         let (k, n) = (matrix.shape[0] as u32, matrix.shape[1] as u32);
+        self.layers.push(LayerReport {
+            node: node.to_owned(),
+            weights: matrix.shape[0] * matrix.shape[1],
+            format: packed.format,
+            words: packed.w.offset as usize..(packed.w.offset + packed.w.len) as usize,
+        });
         let op = Linear {
             x: rows,
             format: packed.format,

@@ -44,7 +44,7 @@ struct Images {
     pixel: usize,
 }
 
-impl Lowering<'_> {
+impl Lowering<'_, '_> {
     /// Decides which borders images get: the largest that a convolution wants, a residual that of its sum.
     pub(super) fn plan_borders(&mut self, order: &[Id]) {
         for &id in order.iter().rev() {

@@ -14,6 +14,7 @@ use lads_kernels::{
     stored,
 };
 
+use crate::storage::Storage;
 use crate::tensor::Tensor;
 
 /// Elements of a cache line: what each tensor starts at a multiple of.
@@ -41,10 +42,12 @@ pub(crate) struct Packed {
 }
 
 /// The weights of an image.
-#[derive(Debug, Default)]
-pub(crate) struct Weights {
-    /// How matrices that are packed from now on are stored; everything else is `f32`.
-    pub format: WeightFormat,
+#[derive(Debug)]
+pub(crate) struct Weights<'s> {
+    /// How matrices are stored; everything else is `f32`.
+    storage: &'s Storage,
+    /// The entry graph whose layers are being stored.
+    pub entry: &'s str,
     /// In words: of what is stored with fewer bits, several to an element here.
     pub data: Vec<f32>,
     /// By content, as a hash: where blocks with that hash start.
@@ -53,24 +56,36 @@ pub(crate) struct Weights {
     stored: HashMap<(usize, Form), (Arc<Tensor>, WeightSpan)>,
 }
 
-impl Weights {
+impl<'s> Weights<'s> {
+    /// None yet.
+    pub fn new(storage: &'s Storage) -> Self {
+        Self {
+            storage,
+            entry: "",
+            data: vec![],
+            places: HashMap::new(),
+            stored: HashMap::new(),
+        }
+    }
+
     /// Stores a tensor as it is.
     pub fn plain(&mut self, tensor: &Arc<Tensor>) -> Result<WeightSpan, String> {
         let data = tensor.as_f32().ok_or("reads integers as numbers")?;
         self.once(tensor, Form::Plain, |this| this.store(data))
     }
 
-    /// Stores a `[k, n]` matrix in the panels that `Linear` reads.
-    pub fn packed(&mut self, tensor: &Arc<Tensor>) -> Result<Packed, String> {
+    /// Stores the `[k, n]` matrix of the layer that was made from `node`, in the panels that `Linear` reads.
+    pub fn packed(&mut self, tensor: &Arc<Tensor>, node: &str) -> Result<Packed, String> {
         let data = tensor.as_f32().ok_or("reads integers as numbers")?;
         let &[k, n] = &tensor.shape[..] else {
             return Err("has weights that are no matrix".into());
         };
         // One step for inputs of any size would be too coarse for the small ones.
-        let format = if self.format.is_scaled() && is_uneven(data, n) {
+        let asked = self.storage.of(self.entry, node);
+        let format = if asked.is_scaled() && is_uneven(data, n) {
             WeightFormat::F32
         } else {
-            self.format
+            asked
         };
         let (w, scales) = match format {
             WeightFormat::F32 => (self.panels(tensor, format, [k, n], data)?, None),
@@ -278,17 +293,19 @@ mod tests {
     use std::sync::Arc;
 
     use super::{WeightFormat, Weights};
+    use crate::storage::Storage;
     use crate::tensor::Tensor;
 
     /// The format that a `[k, 20]` matrix gets, whose inputs have these weights.
     fn format(wanted: WeightFormat, inputs: &[f32]) -> WeightFormat {
         let data = inputs.iter().flat_map(|&w| [w; 20]).collect();
-        let mut weights = Weights {
-            format: wanted,
-            ..Weights::default()
+        let storage = Storage {
+            weights: wanted,
+            ..Storage::default()
         };
         let matrix = Arc::new(Tensor::f32(&[inputs.len(), 20], data));
-        weights.packed(&matrix).unwrap().format
+        let stored = Weights::new(&storage).packed(&matrix, "layer");
+        stored.unwrap().format
     }
 
     #[test]

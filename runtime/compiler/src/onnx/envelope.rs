@@ -1,4 +1,4 @@
-//! Walks the top-level fields of a protocol buffer, to tell a model that was cut off from a file that never was one.
+//! The top-level fields of a protocol buffer: tells a model that was cut off from a file that never was one.
 //!
 //! A field is a varint key (`number << 3 | wire type`) and its value; see the protocol buffer encoding specification. The
 //! walk looks at keys and lengths only, so it is exact about where the file ends.
@@ -8,8 +8,17 @@ use crate::error::BundleError;
 /// The highest field number of a `ModelProto`.
 const LAST_MODEL_FIELD: u64 = 26;
 
-/// Accepts what looks like a complete `ModelProto`.
-pub(super) fn check(bytes: &[u8]) -> Result<(), BundleError> {
+/// One field as it lies in the file.
+pub(crate) struct Field<'b> {
+    pub number: u64,
+    /// Key and value.
+    pub whole: &'b [u8],
+    /// What a field of varying length holds; empty for the other wire types.
+    pub value: &'b [u8],
+}
+
+/// The fields of what looks like a complete `ModelProto`.
+pub(crate) fn fields(bytes: &[u8]) -> Result<Vec<Field<'_>>, BundleError> {
     let not_onnx = |problem: &str| BundleError::NotOnnx {
         problem: problem.into(),
     };
@@ -17,15 +26,16 @@ pub(super) fn check(bytes: &[u8]) -> Result<(), BundleError> {
         return Err(not_onnx("it is empty"));
     }
     let mut at = 0;
-    let mut fields = 0;
+    let mut fields = vec![];
     while at < bytes.len() {
+        let start = at;
         let cut = |needed: u64| BundleError::Truncated {
             needed,
             got: bytes.len() as u64,
         };
         // A file that fails in its first field never was a model; later, it was cut off.
         let Some(key) = varint(bytes, &mut at) else {
-            return Err(if fields == 0 {
+            return Err(if fields.is_empty() {
                 not_onnx("its first bytes are no field")
             } else {
                 cut(bytes.len() as u64 + 1)
@@ -49,16 +59,21 @@ pub(super) fn check(bytes: &[u8]) -> Result<(), BundleError> {
             _ => return Err(not_onnx("its fields are not a model's")),
         };
         if end > bytes.len() as u64 {
-            return Err(if fields == 0 {
+            return Err(if fields.is_empty() {
                 not_onnx("its first field is longer than the file")
             } else {
                 cut(end)
             });
         }
+        let value = if wire == 2 { at } else { end as usize };
         at = end as usize;
-        fields += 1;
+        fields.push(Field {
+            number,
+            whole: &bytes[start..at],
+            value: &bytes[value..at],
+        });
     }
-    Ok(())
+    Ok(fields)
 }
 
 /// Reads a varint of at most ten bytes and moves `at` behind it.

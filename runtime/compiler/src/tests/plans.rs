@@ -137,6 +137,7 @@ fn reads_of_nothing_are_found() {
         inputs: vec![("a".into(), Place::Span(a))],
         outputs: vec![("y".into(), Place::Span(c))],
         tokens: 0,
+        layers: vec![],
     };
     let sound = program(vec![unary(a, b), unary(b, c)]);
     assert_eq!(verify(&sound, &plan(&sound)), Ok(()));
@@ -191,6 +192,7 @@ proptest! {
             outputs: if buffers.len() > 2 { vec![("y".into(), Place::Span(output))] } else { vec![] },
             buffers,
             tokens: 0,
+            layers: vec![],
         };
         let placed = plan(&lowered);
         prop_assert_eq!(verify(&lowered, &placed), Ok(()));

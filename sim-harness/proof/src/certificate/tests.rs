@@ -10,6 +10,7 @@ fn certificate(n: usize, both: usize, run_only: usize, reference_only: usize) ->
     let policy = Answers {
         episodes: 2,
         compared_steps: 9,
+        decisions: 3,
         compared_decisions: 3,
         ..Answers::default()
     };

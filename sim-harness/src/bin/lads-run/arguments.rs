@@ -74,6 +74,9 @@ pub struct Run {
 pub enum Job {
     /// Run the episodes of a reference and say whether the policy is the reference's: exit code 0 EQUIVALENT, 1 DIFFERENT, 3 INCONCLUSIVE
     Verify(Verify),
+    /// Find the smallest formats of weights and caches that keep every plan of a reference's questions, and write them with the evidence into
+    /// the bundle, where everything that compiles it finds them
+    Tune(Tune),
     /// Compute the actions of a log again and name the first step that differs (exit code 1); runs no episode
     Replay(Replay),
     /// Print the plans that the trajectory encoder sees in a log, in the form that --plans takes; runs no episode
@@ -94,7 +97,7 @@ pub struct PolicyArguments {
     #[arg(long)]
     pub model: PathBuf,
     /// Run this program image of the bundle, made by `lads compile`, for instance with weights or a cache of fewer bits; left out, the
-    /// bundle is compiled with 32-bit weights
+    /// bundle is compiled as it was tuned, and with 32 bits where it was not
     #[arg(long, value_name = "LADS")]
     pub image: Option<PathBuf>,
     /// Instructions that the kernels run on; left out, the widest of this CPU. The results have the same bits on all
@@ -237,12 +240,26 @@ pub struct Verify {
     pub threads: Option<usize>,
 }
 
-impl Verify {
-    /// The reference's file.
-    pub fn reference(&self) -> PathBuf {
-        let beside = || self.policy.model.with_extension("reference.json");
-        self.reference.clone().unwrap_or_else(beside)
-    }
+/// The reference's file: the one that was named, else the one beside the model.
+pub fn reference(named: Option<&Path>, model: &Path) -> PathBuf {
+    let beside = || model.with_extension("reference.json");
+    named.map_or_else(beside, Path::to_owned)
+}
+
+#[derive(Debug, Args)]
+pub struct Tune {
+    /// The policy bundle (ONNX)
+    #[arg(long)]
+    pub model: PathBuf,
+    /// The reference, whose traced episodes are the questions; left out, the file beside the model that ends in .reference.json
+    #[arg(long, value_name = "FILE")]
+    pub reference: Option<PathBuf>,
+    /// Write the bundle to this file; left out, it replaces the model
+    #[arg(short, long, value_name = "FILE")]
+    pub output: Option<PathBuf>,
+    /// Instructions that the kernels run on; left out, the widest of this CPU. The results have the same bits on all
+    #[arg(long)]
+    pub isa: Option<IsaName>,
 }
 
 #[derive(Debug, Args)]

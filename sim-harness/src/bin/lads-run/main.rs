@@ -1,5 +1,5 @@
 //! `lads-run`: drives a bundle's policy through the simulated environment that its contract names, and reports success rates and latency;
-//! its subcommands verify the policy, replay and encode recordings, sweep over faults, show and film episodes.
+//! its subcommands verify and tune the policy, replay and encode recordings, sweep over faults, show and film episodes.
 //!
 //! Everything that can be wrong is looked at before the first episode: arguments, the place for the JSON, the bundle, its golden episode,
 //! the instruction, the assets, and whether contract and environment fit. Any of it ends with one line on stderr and exit code 2; an
@@ -17,6 +17,7 @@ mod recordings;
 mod report;
 mod rollouts;
 mod sweep;
+mod tune;
 mod verify;
 mod viewer;
 
@@ -65,6 +66,7 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
     };
     match job {
         Job::Verify(verify) => verify::run(verify, &stop),
+        Job::Tune(asked) => tune::run(asked, &stop),
         Job::Replay(replay) => recordings::replay(replay),
         Job::Encode(encode) => recordings::encode(encode),
         Job::Sweep(asked) => sweep::run(asked, &stop),

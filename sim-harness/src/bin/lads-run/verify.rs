@@ -13,7 +13,7 @@ use lads_sim::verify::certificate::Certificate;
 use lads_sim::verify::page::Page;
 use lads_sim::verify::reference::Reference;
 
-use crate::arguments::{LanguageArguments, Verify, Wanted};
+use crate::arguments::{LanguageArguments, Verify, Wanted, reference};
 use crate::bench;
 use crate::end::{End, print, refused, unwritable};
 use crate::{given, progress, some_episodes, threads, unfinished};
@@ -22,7 +22,7 @@ use crate::{given, progress, some_episodes, threads, unfinished};
 pub fn run(asked: &Verify, stop: &AtomicBool) -> Result<ExitCode, End> {
     some_episodes(asked.episodes)?;
     let threads = threads(asked.threads, false)?;
-    let file = asked.reference();
+    let file = reference(asked.reference.as_deref(), &asked.policy.model);
     let inputs = [
         ("--model", Some(&asked.policy.model)),
         ("--image", asked.policy.image.as_ref()),

@@ -8,18 +8,17 @@ use mcap::read::{MessageStream, metadata};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use serde::de::DeserializeOwned;
 
-use super::schema::{
+use crate::schema::{
     ACTION, COMPLETION, EPISODE, GRIPPER, LOGITS, OBSERVATION, PLAN, TIMING, TOPICS,
 };
-use super::{
+use crate::trace::{Step, Trace};
+use crate::{
     ActionMessage, CompletionMessage, EpisodeMessage, FORMAT_VERSION, Flight, GripperMessage, Log,
     LogError, METADATA, Origin, PERIOD, PlanMessage, TimingMessage, Values,
 };
-use crate::environment::Completion;
-use crate::rollout::Episode;
-use crate::trace::{Step, Trace};
+use lads_proof::episode::{Completion, Episode};
 
-/// Reads a log as [`super::write`] writes it; messages of other topics are passed over.
+/// Reads a log as [`crate::write`] writes it; messages of other topics are passed over.
 pub fn read(path: &Path) -> Result<Log, LogError> {
     let bytes = lads_host::input::read(path)?;
     whole(&bytes)?;

@@ -1,4 +1,4 @@
-//! The flight recorder: episodes as an MCAP file that Foxglove opens and that [`crate::replay`] computes again.
+//! The flight recorder: episodes as an MCAP file that Foxglove opens and that `lads-run replay` computes again.
 //!
 //! One channel per kind of message, JSON with a JSON schema each:
 //!
@@ -18,9 +18,11 @@
 //! C libraries out of the build.
 //!
 //! What can fail: the disk; and reading a file that is cut off, damaged or something else.
+#![forbid(unsafe_code)]
 
 mod read;
 mod schema;
+pub mod trace;
 mod write;
 
 use std::collections::BTreeMap;

@@ -7,10 +7,10 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::{WriteOptions, Writer};
 use serde::Serialize;
 
-use super::schema::{
+use crate::schema::{
     ACTION, COMPLETION, EPISODE, GRIPPER, LOGITS, OBSERVATION, PLAN, TIMING, TOPICS,
 };
-use super::{
+use crate::{
     ActionMessage, CompletionMessage, EpisodeMessage, FORMAT_VERSION, Flight, GripperMessage, Log,
     METADATA, Origin, PERIOD, PlanMessage, TimingMessage, Values,
 };

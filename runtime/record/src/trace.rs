@@ -3,7 +3,7 @@
 //! A trace is kept in memory while episodes run and written afterwards, so that recording cannot slow the control loop down by waiting for
 //! a disk, and an interrupted run leaves nothing half-written. It costs some 0.3 kB per control step.
 
-use crate::rollout::Episode;
+use lads_proof::episode::Episode;
 
 /// One control step. Lengths and units are the contract's.
 #[derive(Debug, Clone, PartialEq)]

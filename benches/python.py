@@ -1,0 +1,202 @@
+"""What the Python package costs: a step beside Rust and ONNX Runtime, an import, batches over threads, the size of a wheel.
+
+    make wheel && .venv/bin/python -m pip install target/wheels/lads-*.whl
+    .venv/bin/python benches/python.py [--seconds 10] [--rust target/release/examples/step_cost]
+
+Contenders are measured in turns, a share of some milliseconds at a time; the fastest share of each counts when hot, the median at a control
+period. Needs the exporter's environment (PyTorch, ONNX Runtime).
+"""
+
+import argparse
+import gc
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+from torch import nn
+
+PROJECT = Path(__file__).parents[1]
+sys.path.insert(0, str(PROJECT / "exporter"))
+
+import lads  # noqa: E402
+from lads.vector import Controllers  # noqa: E402
+from lads_exporter import bundle, contract as contracts, graphs, random_policy  # noqa: E402
+from lads_exporter.twin import Entry  # noqa: E402
+
+# Seconds of a share: shorter than what a busy system gives a process at a time, so that the fastest one was not interrupted.
+SHARE = 0.002
+WIDTHS = (51, 512, 256, 128, 14)
+ENTRY = "policy/act"
+
+
+def legged(activation):
+    """A policy of a legged robot's size, 51-512-256-128-14, with random weights, as a bundle."""
+    names = lambda kind, count: [{"name": f"{kind}{i}", "unit": "1", "min": -10.0, "max": 10.0} for i in range(count)]
+    environment = {
+        "id": "legged-bench",
+        "version": "1",
+        "control_period_s": 0.02,
+        "quaternion_order": "none",
+        "reference": "default position",
+        "observation": names("observation", WIDTHS[0]),
+        "action": [{**row, "joint": row["name"], "interface": "position"} for row in names("action", WIDTHS[-1])],
+    }
+    torch.manual_seed(0)
+    graph = graphs.Graph()
+    entry = graphs.Entry(graph, ENTRY)
+    x = entry.input("observation", [1, WIDTHS[0]])
+    for place, (inputs, outputs) in enumerate(zip(WIDTHS, WIDTHS[1:])):
+        layer, last = nn.Linear(inputs, outputs), place == len(WIDTHS) - 2
+        name = "action" if last else f"layer{place}"
+        x = entry.gemm(x, entry.weight(f"{name}.weight", layer.weight), entry.weight(f"{name}.bias", layer.bias), name)
+        x = x if last else entry.op(activation, [x], f"{name}.{activation.lower()}")
+    entry.output("action", [1, WIDTHS[-1]])
+    channels = contracts.channels(environment)
+    contract = bundle.describe({"kind": "plain"}, environment, [], None, {"setting": "bench", "seed": 0}, channels=channels)
+    candidates = ((None, random_policy.channels(contract, 20, n)) for n in range(1, 50))
+    return bundle.seal(graph.model("plain"), contract, candidates)
+
+
+def legged_policy(folder):
+    """-> the activation that the compiler takes, the path, the model."""
+    for activation in ("Elu", "Tanh"):
+        try:
+            model = legged(activation)
+            path = folder / f"{activation}.onnx"
+            onnx.save(model, path)
+            lads.open(path)
+            return activation, path, model
+        except lads.errors.CompileError as error:
+            print(f"{activation}: {error}")
+    raise SystemExit("neither compiles")
+
+
+def hot(contenders, seconds):
+    """Microseconds of one call of each and its share's calls, in turns, the fastest share."""
+    calls = {}
+    for name, call in contenders.items():
+        start = time.perf_counter()
+        for _ in range(20):
+            call()
+        calls[name] = max(1, int(SHARE * 20 / (time.perf_counter() - start)))
+    best = dict.fromkeys(contenders, float("inf"))
+    deadline = time.perf_counter() + seconds
+    while time.perf_counter() < deadline:
+        for name, call in contenders.items():
+            count = range(calls[name])
+            start = time.perf_counter()
+            for _ in count:
+                call()
+            best[name] = min(best[name], (time.perf_counter() - start) / calls[name] * 1e6)
+    return best
+
+
+def paced(contenders, seconds, rate=50):
+    """Microseconds of one call of each at a control period, median, in turns call by call."""
+    found = {name: [] for name in contenders}
+    deadline = time.perf_counter()
+    for _ in range(int(seconds * rate)):
+        for name, call in contenders.items():
+            deadline += 1 / rate
+            time.sleep(max(0.0, deadline - time.perf_counter()))
+            start = time.perf_counter()
+            call()
+            found[name].append((time.perf_counter() - start) * 1e6)
+    return {name: statistics.median(times) for name, times in found.items()}
+
+
+def stepper(policy):
+    """A call of `step` on the golden episode's first observation."""
+    golden = policy.golden
+    controller = policy.controller(golden.instruction)
+    (seen,) = (values[0].copy() for values in golden.observations.values())
+    out = np.zeros(policy.contract.action.shape, np.float32)
+    return lambda: controller.step(seen, out)
+
+
+def beside_rust(program, path, policy, seconds):
+    """Microseconds of a step from Python and from Rust, in turns, the fastest share of each."""
+    call = stepper(policy)
+    python = native = float("inf")
+    deadline = time.perf_counter() + seconds
+    while time.perf_counter() < deadline:
+        python = min(python, hot({"python": call}, seconds / 20)["python"])
+        share = str(max(1, int(SHARE / (python * 1e-6))))
+        done = subprocess.run([program, path, share], check=True, capture_output=True, text=True)
+        native = min(native, float(done.stdout) / 1000)
+    return python, native
+
+
+def scaling(policy, seconds, count=8):
+    """Microseconds of a step of 8 controllers on one thread and on two."""
+    golden = policy.golden
+    (seen,) = (np.repeat(values[:1], count, 0) for values in golden.observations.values())
+    out = np.zeros((count, *policy.contract.action.shape), np.float32)
+    batches = {threads: Controllers(policy, count, golden.instruction, threads=threads) for threads in (1, 2)}
+    best = hot({threads: lambda batch=batch: batch.step(seen, out) for threads, batch in batches.items()}, seconds)
+    return best[1], best[2]
+
+
+def importing():
+    """Milliseconds that the package takes beyond numpy, the fastest of ten, interpreter's start apart."""
+    code = "import numpy, time; start = time.perf_counter(); import lads; print((time.perf_counter() - start) * 1000)"
+    return min(float(subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout) for _ in range(10))
+
+
+def leak(policy, controllers):
+    """Growth of this process's memory in kB over so many controllers that each take a step."""
+    golden = policy.golden
+    (seen,) = (values[0].copy() for values in golden.observations.values())
+
+    def make(count):
+        for _ in range(count):
+            policy.controller(golden.instruction).step(seen)
+        gc.collect()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4
+
+    make(1000)
+    before = make(1)
+    start = time.perf_counter()
+    grown = make(controllers) - before
+    return grown, (time.perf_counter() - start) / controllers * 1e6
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=10.0, help="for each comparison")
+    parser.add_argument("--controllers", type=int, default=100_000)
+    parser.add_argument("--rust", type=Path, help="the example step_cost of lads-host, built in release")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        activation, path, model = legged_policy(Path(folder))
+        plain = lads.open(path)
+        session = Entry(model, ENTRY).session
+        (seen,) = (values[0].copy() for values in plain.golden.observations.values())
+        given = {f"{ENTRY}/observation": seen[None]}
+        print(f"policy {'-'.join(map(str, WIDTHS))}, {activation}")
+        contenders = {"lads": stepper(plain), "onnxruntime": lambda: session.run(None, given)}
+        for name, found in (("hot", hot(contenders, arguments.seconds)), ("at 50 Hz", paced(contenders, arguments.seconds))):
+            ratio = found["lads"] / found["onnxruntime"]
+            print(f"  {name}: lads {found['lads']:.2f} us, onnxruntime {found['onnxruntime']:.2f} us, ratio {ratio:.2f}")
+        kitchen = lads.open(PROJECT / "models/kitchen.onnx")
+        if arguments.rust:
+            for name, policy in ((str(path), plain), (str(PROJECT / "models/kitchen.onnx"), kitchen)):
+                python, native = beside_rust(arguments.rust, name, policy, arguments.seconds)
+                print(f"  step of {Path(name).stem}: from Python {python:.2f} us, from Rust {native:.2f} us, {python - native:+.2f} us")
+        one, two = scaling(kitchen, arguments.seconds)
+        print(f"8 controllers of kitchen: one thread {one:.0f} us, two {two:.0f} us, {one / two:.2f} times faster")
+        print(f"import: {importing():.1f} ms")
+        grown, each = leak(plain, arguments.controllers)
+        print(f"{arguments.controllers} controllers: {grown} kB more memory, {each:.0f} us each")
+        for wheel in sorted((PROJECT / "target/wheels").glob("lads-*.whl")):
+            print(f"wheel: {wheel.name}, {wheel.stat().st_size / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    main()

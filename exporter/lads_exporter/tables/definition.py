@@ -1,0 +1,138 @@
+"""A table's file: what is measured, how, in which tracks, and by which systems.
+
+Everything in it is checked before anything runs: unknown keys, systems and configurations are named, all at once.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+from .. import config
+from ..config import UserError
+
+MEASURES = ("success", "n_rate")
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    episodes: int  # of each instruction
+    seed: int
+    noise: str
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    name: str
+    config: str  # the base configuration of all its systems
+    note: str
+    seeds: list  # of the training, of systems that say nothing else
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    id: str
+    title: str
+    config: str  # values over the track's base configuration
+    published: dict  # split -> [mean, deviation], [mean] or []
+    tracks: list = dataclasses.field(default_factory=list)  # none: all
+    weights: str = ""  # trains nothing: takes the run of this system, and exports it with its own configuration
+    seeds: dict = dataclasses.field(default_factory=dict)  # track -> seeds of its own
+
+    @property
+    def trained(self):
+        """The id of the system whose run it is exported from."""
+        return self.weights or self.id
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    name: str
+    title: str
+    measure: str  # "success" of the whole instruction, in per cent, or "n_rate"
+    data: str
+    splits: list  # names of lads-run's splits
+    headings: list  # what the table calls them
+    evaluation: Evaluation
+    tracks: list
+    systems: list
+    folder: Path  # where the file lies; paths in it are relative to it
+
+    def path(self, name):
+        return self.folder / name
+
+    def system(self, id):
+        return next(row for row in self.systems if row.id == id)
+
+    def rows(self, track):
+        """The systems of a track."""
+        return [row for row in self.systems if not row.tracks or track.name in row.tracks]
+
+    def seeds(self, system, track):
+        return system.seeds.get(track.name, track.seeds)
+
+    def configuration(self, track, system):
+        """The files of a system's configuration in a track: base, then the system's."""
+        return [self.path(track.config), self.path(system.config)]
+
+
+def _row(kind, table, where):
+    """A dataclass from a TOML table; fields with a default may be left out."""
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    problems = [f"unknown key {key!r}" for key in table if key not in fields]
+    for name, field in fields.items():
+        if name not in table:
+            if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+                problems.append(f"key {name!r} is missing")
+        elif not isinstance(table[name], field.type):
+            problems.append(f"{name} must be {field.type.__name__}, not {table[name]!r}")
+    if problems:
+        raise UserError(f"{where}: {'; '.join(problems)}")
+    return kind(**table)
+
+
+def load(path):
+    """Reads and checks a table and every configuration that it names."""
+    path = config.find(path)
+    table = dict(config.read_toml(path))
+    parts = {"evaluation": Evaluation, "track": Track, "system": System}
+    missing = [key for key in parts if key not in table]
+    if missing:
+        raise UserError(f"{path}: [{missing[0]}] is missing")
+    for key in ("track", "system"):
+        if not isinstance(table[key], list) or not all(isinstance(row, dict) for row in table[key]):
+            raise UserError(f"{path}: {key}s are a list of tables, [[{key}]]")
+    table["evaluation"] = _row(Evaluation, table["evaluation"], f"{path}[evaluation]")
+    for key, many in (("track", "tracks"), ("system", "systems")):
+        table[many] = [_row(parts[key], row, f"{path}[[{key}]] {row.get('id', row.get('name', ''))}") for row in table.pop(key)]
+    found = _row(Table, table | {"folder": path.parent}, path)
+    _check(found, path)
+    return found
+
+
+def _check(table, path):
+    problems = []
+    if table.measure not in MEASURES:
+        problems.append(f"measure = {table.measure!r}: must be one of {', '.join(MEASURES)}")
+    if len(table.splits) != len(table.headings):
+        problems.append("splits and headings must be as many")
+    if table.evaluation.episodes < 1:
+        problems.append(f"evaluation.episodes = {table.evaluation.episodes}: must be at least 1")
+    for row in (*table.tracks, *table.systems):
+        lists = [row.seeds] if isinstance(row, Track) else row.seeds.values()
+        if not all(isinstance(seeds, list) and seeds and all(type(seed) is int and seed >= 0 for seed in seeds) for seeds in lists):
+            problems.append(f"seeds of {getattr(row, 'id', None) or row.name!r}: must be lists of whole numbers from 0 on")
+    ids, tracks = [row.id for row in table.systems], [row.name for row in table.tracks]
+    problems += [f"system {id!r} stands twice" for id in {id for id in ids if ids.count(id) > 1}]
+    for row in table.systems:
+        problems += [f"system {row.id!r}: unknown track {name!r}; known: {', '.join(tracks)}" for name in [*row.tracks, *row.seeds] if name not in tracks]
+        problems += [f"system {row.id!r}: the paper has no split {name!r}" for name in row.published if name not in table.splits]
+        if row.weights and row.weights not in ids:
+            problems.append(f"system {row.id!r}: weights = {row.weights!r}: unknown system; known: {', '.join(ids)}")
+    for track in table.tracks:
+        for row in table.rows(track):
+            try:
+                config.load(*table.configuration(track, row))
+            except UserError as error:
+                problems.append(f"system {row.id!r} in track {track.name!r}: {error}")
+    if problems:
+        raise UserError(f"{path}: " + "\n  ".join(problems))

@@ -1,0 +1,175 @@
+"""One system and one seed in one track: train, export, evaluate, each by the command that a person would type.
+
+A job's folder carries the hash of all that its weights depend on (configuration, dataset, language encoder, seed), so other inputs mean another
+folder, and nothing is overwritten. What is finished is kept; an interrupted training goes on. What can fail: a command ends with an
+error, which is the job's; a checkpoint or a results file that is there is damaged or of another protocol, and is named.
+"""
+
+import hashlib
+import json
+import subprocess
+import sys
+import threading
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from .. import card, config, language
+from ..config import UserError
+from ..training import CHECKPOINT, SUMMARY
+
+CHANGES_NOTHING = ("sampler", "passes", "guidance", "temperature", "clip", "rule")  # of [system]: what only an export depends on
+
+
+class Stopped(Exception):
+    """The command was interrupted; its state is kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where a table's jobs find and leave things."""
+
+    runs: Path
+    data: Path
+    data_sha256: str
+    lads_run: Path
+    threads: int = 1  # of a training: sums depend on their number
+
+
+class Processes:
+    """The commands that run; `stop` ends them in good order."""
+
+    def __init__(self):
+        self.running, self.stopped, self.lock = set(), False, threading.Lock()
+
+    def run(self, command, log):
+        """Runs a command whose output goes to a file; an error carries its last line."""
+        with self.lock:
+            if self.stopped:
+                raise Stopped
+            with open(log, "ab") as file:
+                process = subprocess.Popen([str(part) for part in command], stdout=file, stderr=subprocess.STDOUT, start_new_session=True)
+            self.running.add(process)
+        code = process.wait()
+        with self.lock:
+            self.running.discard(process)
+        if self.stopped or code == 130:
+            raise Stopped
+        if code:
+            lines = Path(log).read_text(errors="replace").strip().splitlines() or ["no output"]
+            raise UserError(f"{' '.join(str(part) for part in command[:4])} ... failed ({code}): {lines[-1]}; all of it is in {log}")
+
+    def stop(self):
+        with self.lock:
+            self.stopped = True
+            for process in self.running:
+                process.terminate()
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    table: object
+    track: object
+    system: object
+    seed: int
+    place: Place
+
+    @property
+    def label(self):
+        return f"{self.track.name} {self.system.title} seed {self.seed}"
+
+    @property
+    def trained(self):
+        """The system whose run this is."""
+        return self.table.system(self.system.trained)
+
+    @property
+    def folder(self):
+        return self.place.runs / self.table.name / self.track.name / f"{self.trained.id}-seed{self.seed}-{self.inputs[:12]}"
+
+    @cached_property
+    def inputs(self):
+        """The hash of all that the trained weights depend on."""
+        setting = config.load(*self.table.configuration(self.track, self.trained))
+        tables = json.loads(json.dumps(setting.tables))
+        own = tables[0].get("system", {})
+        tables[0]["system"] = {key: value for key, value in own.items() if key not in CHANGES_NOTHING}
+        encoder = setting.config.language.encoder
+        known = encoder if encoder.startswith("random-") else language.weights_sha256(encoder)
+        parts = [tables, self.place.data_sha256, known, self.seed, self.place.threads]
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def bundle(self):
+        return self.folder / f"{self.system.id}.onnx"
+
+    @property
+    def results(self):
+        return self.folder / f"{self.system.id}.results.json"
+
+    @property
+    def finished(self):
+        return self.results.is_file() and self.bundle.is_file()
+
+    def run(self, processes):
+        """Does what is not done yet."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        log = self.folder / "log.txt"
+        exporter = [sys.executable, "-m", "lads_exporter"]
+        base, over = self.table.configuration(self.track, self.trained)
+        if not (self.folder / SUMMARY).is_file():
+            resume = ["--resume"] if (self.folder / CHECKPOINT).is_file() else []
+            options = ["--config", base, "--system", over, "--data", self.place.data, "--out", self.folder, "--seed", self.seed, "--threads", self.place.threads]
+            processes.run([*exporter, "train", *options, *resume], log)
+        if not self.bundle.is_file():
+            own = ["--system", self.table.path(self.system.config)]
+            processes.run([*exporter, "export", "--run", self.folder, *own, "-o", self.bundle], log)
+        if not self.results.is_file():
+            evaluate(self.table, self.bundle, self.results, self.place, processes, log)
+        self.numbers()
+
+    def numbers(self):
+        """Results and training time of a finished job."""
+        sha256 = hashlib.sha256(self.bundle.read_bytes()).hexdigest()
+        found = checked_results(self.table, self.results, sha256)
+        try:
+            summary = json.loads((self.folder / SUMMARY).read_text())
+            seconds = sum(summary["seconds"].values())
+        except (OSError, ValueError, KeyError) as error:
+            raise UserError(f"{self.folder / SUMMARY}: not a training's summary ({error!r}); move the folder away to train anew") from error
+        return {"results": found, "sha256": sha256, "training_s": seconds, "summary": summary}
+
+
+def evaluate(table, bundle, results, place, processes, log, uniform=False):
+    """Runs a bundle by lads-run; the results appear whole or not at all."""
+    partial = results.with_suffix(".partial")
+    asked = table.evaluation
+    command = [place.lads_run, "--model", bundle, "--episodes", asked.episodes, "--seed", asked.seed, "--noise", asked.noise, "--threads", 1, "--json", partial]
+    processes.run([*command, *(["--uniform"] if uniform else [])], log)
+    partial.replace(results)
+
+
+def checked_results(table, path, sha256=None):
+    """A results file that is of this table's protocol, and of the bundle; else what it is of instead."""
+    found = card.read_results(path)
+    asked = table.evaluation
+    pairs = [("seed", found.get("seed"), asked.seed), ("noise", found.get("noise"), asked.noise)]
+    pairs.append(("episodes_per_instruction", found.get("episodes_per_instruction"), asked.episodes))
+    if sha256:
+        pairs.append(("bundle_sha256", found.get("bundle_sha256"), sha256))
+    pairs += [(f"split {name}", "absent", "present") for name in table.splits if name not in found["splits"]]
+    wrong = [f"{name} is {got}, not {wanted}" for name, got, wanted in pairs if got != wanted]
+    if wrong:
+        raise UserError(f"{path}: of another protocol ({'; '.join(wrong)}); it stays as it is: move it away, and the same command measures anew")
+    return found
+
+
+def all_jobs(table, place):
+    """Track by track, seed by seed; those that export another's run come after it."""
+    return [
+        Job(table, track, system, seed, place)
+        for track in table.tracks
+        for system in sorted(table.rows(track), key=lambda row: bool(row.weights))
+        for seed in table.seeds(system, track)
+    ]
+

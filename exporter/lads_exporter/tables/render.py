@@ -1,0 +1,193 @@
+"""models/tables.json and models/TABLES.md: the paper's number, ours with mean and deviation over seeds, and the uncertainty within them.
+
+`tables.json` holds every table that was ever run, one key each; a run replaces its own only. TABLES.md is written from it alone.
+"""
+
+import json
+import math
+import statistics
+from pathlib import Path
+
+from safetensors import safe_open
+
+from ..config import UserError
+from ..output import write_atomically
+
+FORMAT, VERSION = "lads-tables", 1
+JSON, MARKDOWN = "tables.json", "TABLES.md"
+Z = 1.959963984540054  # of 95 %
+
+
+def wilson(count, total):
+    """The Wilson score interval of a share, 95 %."""
+    if total == 0:
+        return [0.0, 1.0]
+    share, z2 = count / total, Z * Z
+    centre = (share + z2 / (2 * total)) / (1 + z2 / total)
+    half = Z / (1 + z2 / total) * math.sqrt(share * (1 - share) / total + z2 / (4 * total * total))
+    return [max(0.0, centre - half), min(1.0, centre + half)]
+
+
+def summarise(splits):
+    """One split of several seeds' results: means over the seeds, intervals within them."""
+    rates, full = [row["n_rate"] for row in splits], [row["full_success"] for row in splits]
+    episodes, count = sum(row["episodes"] for row in splits), sum(row["full_success_count"] for row in splits)
+    errors = [row["n_rate_standard_error"] for row in splits]
+    deviation = lambda values: statistics.stdev(values) if len(values) > 1 else None
+    return {
+        "episodes": episodes,
+        "success": statistics.mean(full),
+        "success_deviation": deviation(full),
+        "success_interval": wilson(count, episodes),
+        "success_by_seed": full,
+        "n_rate": statistics.mean(rates),
+        "n_rate_deviation": deviation(rates),
+        "n_rate_standard_error": math.sqrt(sum(error * error for error in errors)) / len(errors),
+        "n_rate_by_seed": rates,
+        "k_rate": [statistics.mean(row["k_rate"][k] for row in splits) for k in range(len(splits[0]["k_rate"]))],
+    }
+
+
+def expert(place):
+    """How often the scripted expert carried out all of an instruction while the data were collected; None where no expert made them."""
+    with safe_open(place.data, "numpy") as file:
+        notes = file.metadata() or {}
+    counts = [json.loads(notes.get(key, "0")) for key in ("attempts", "discarded")]
+    if not all(isinstance(count, dict) for count in counts):  # one for each instruction, where an expert followed them
+        return None
+    attempts, discarded = (sum(count.values()) for count in counts)
+    return {"attempts": attempts, "discarded": discarded, "success": 1 - discarded / attempts, "success_interval": wilson(attempts - discarded, attempts)}
+
+
+def entry(table, place, jobs, uniform):
+    """What tables.json says of one table. jobs: [(job, its numbers or None)]."""
+    tracks = []
+    for track in table.tracks:
+        rows = []
+        for system in table.rows(track):
+            own = [(job.seed, found) for job, found in jobs if job.track == track and job.system == system]
+            done = [(seed, found) for seed, found in own if found]
+            row = {"id": system.id, "title": system.title, "published": system.published, "seeds_asked": [seed for seed, _ in own]}
+            row |= {"seeds": [seed for seed, _ in done], "bundle_sha256": [found["sha256"] for _, found in done]}
+            if done:
+                row["training_s"] = statistics.mean(found["training_s"] for _, found in done)
+                row["splits"] = {name: summarise([found["results"]["splits"][name] for _, found in done]) for name in table.splits}
+                row["summary"] = [{key: found["summary"].get(key) for key in ("perplexity", "codebook_size", "plan_elements_in_use", "validation", "steps")} for _, found in done]
+            rows.append(row)
+        tracks.append({"name": track.name, "config": Path(track.config).name, "note": track.note, "rows": rows})
+    asked = table.evaluation
+    found = {
+        "title": table.title,
+        "measure": table.measure,
+        "splits": dict(zip(table.splits, table.headings)),
+        "protocol": {"episodes_per_instruction": asked.episodes, "seed": asked.seed, "noise": asked.noise},
+        "dataset_sha256": place.data_sha256,
+        "threads": place.threads,
+        "uniform": {name: summarise([uniform["splits"][name]]) for name in table.splits} if uniform else None,
+        "expert": expert(place),
+        "tracks": tracks,
+    }
+    return found
+
+
+def check(models):
+    """Refuses a tables.json that is something else, before anything is run."""
+    read(Path(models) / JSON)
+
+
+def read(path):
+    if not path.is_file():
+        return {"format": FORMAT, "format_version": VERSION, "tables": {}}
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        ours = found["format"] == FORMAT and found["format_version"] == VERSION and isinstance(found["tables"], dict)
+    except (ValueError, KeyError, TypeError):
+        ours = False
+    if not ours:
+        raise UserError(f"{path}: not this exporter's tables; it stays as it is: name another folder with --models")
+    return found
+
+
+def write(models, table, place, jobs, uniform):
+    path = Path(models) / JSON
+    found = read(path)
+    found["tables"][table.name] = entry(table, place, jobs, uniform)
+    write_atomically(path, (json.dumps(found, indent=1) + "\n").encode())
+    write_atomically(Path(models) / MARKDOWN, markdown(found).encode())
+
+
+def _published(values, measure):
+    return " ± ".join(f"{value:.1f}" if measure == "success" else f"{value:.2f}" for value in values) or "-"
+
+
+def _ours(split, measure):
+    """Mean ± deviation over seeds (interval within)."""
+    if measure == "success":
+        deviation = "" if split["success_deviation"] is None else f" ± {100 * split['success_deviation']:.1f}"
+        low, high = split["success_interval"]
+        return f"{100 * split['success']:.1f}{deviation} ({100 * low:.1f}-{100 * high:.1f})"
+    deviation = "" if split["n_rate_deviation"] is None else f" ± {split['n_rate_deviation']:.2f}"
+    half = Z * split["n_rate_standard_error"]
+    low, high = split["success_interval"]
+    return f"{split['n_rate']:.2f}{deviation} ({split['n_rate'] - half:.2f}-{split['n_rate'] + half:.2f}); all {100 * split['success']:.0f} % ({100 * low:.0f}-{100 * high:.0f})"
+
+
+def _minutes(seconds):
+    return f"{seconds / 60:.0f} min"
+
+
+def _line(cells):
+    return "| " + " | ".join(cells) + " |"
+
+
+def _row(table, row):
+    cells = [row["title"], ", ".join(str(seed) for seed in row["seeds"]) or "-"]
+    for split in table["splits"]:
+        cells.append(_published(row["published"].get(split, []), table["measure"]))
+        cells.append(_ours(row["splits"][split], table["measure"]) if "splits" in row else "not finished")
+    first = next(iter(row["splits"].values())) if "splits" in row else None
+    cells.append(str(sum(split["episodes"] for split in row["splits"].values())) if first else "-")
+    cells.append(_minutes(row["training_s"]) if first else "-")
+    cells.append(", ".join(f"`{sha256[:12]}`" for sha256 in row["bundle_sha256"]) or "-")
+    return _line(cells)
+
+
+def _others(table):
+    """The rows that no track trains."""
+    width = 2 * len(table["splits"])
+    lines = []
+    if table["uniform"]:
+        cells = [cell for split in table["splits"] for cell in ("-", _ours(table["uniform"][split], table["measure"]))]
+        lines.append(_line(["uniform random actions", "-", *cells, str(sum(split["episodes"] for split in table["uniform"].values())), "-", "-"]))
+    if table["expert"]:
+        found = table["expert"]
+        low, high = found["success_interval"]
+        text = f"all {100 * found['success']:.0f} % ({100 * low:.0f}-{100 * high:.0f})"
+        lines.append(_line(["scripted expert, while the data were collected", "-", "-", text, *["-"] * (width - 2), str(found["attempts"]), "-", "-"]))
+    return lines
+
+
+MEASURES = {
+    "success": "Per cent of episodes in which the whole instruction was carried out: mean over seeds ± their standard deviation (Wilson 95 % interval over all episodes).",
+    "n_rate": "N-rate, sub-tasks carried out of the four commanded: mean over seeds ± their standard deviation (95 % interval by the standard error within the seeds);"
+    " all: episodes with all four (Wilson 95 %).",
+}
+
+
+def markdown(found):
+    """TABLES.md."""
+    lines = ["# The paper's tables", ""]
+    lines += ["Every system trained here, exported as one bundle, and run by the same runtime in `lads-run`. Written by `make table ENV=kitchen|lorel`"]
+    lines += ["(`python -m lads_exporter table`) from tables.json; do not edit. The paper's numbers stand beside ours, on other data than its own."]
+    for name, table in found["tables"].items():
+        asked = table["protocol"]
+        lines += ["", f"## {table['title']}", "", MEASURES[table["measure"]], ""]
+        lines += [f"{asked['episodes_per_instruction']} episodes of each instruction, seed {asked['seed']}, noise {asked['noise']}; data `{table['dataset_sha256'][:12]}`; trained with {table['threads']} thread."]
+        for track in table["tracks"]:
+            heads = ["system", "seeds"]
+            heads += [f"{heading}, {whose}" for heading in table["splits"].values() for whose in ("paper", "ours")]
+            lines += ["", f"### {name}, {track['name']} track ({track['config']})", "", track["note"], ""]
+            lines += [_line([*heads, "episodes", "training", "bundle"]), _line(["---"] * (len(heads) + 3))]
+            lines += [_row(table, row) for row in track["rows"]]
+            lines += _others(table)
+    return "\n".join([*lines, ""])

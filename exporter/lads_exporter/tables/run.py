@@ -1,0 +1,124 @@
+"""All jobs of a table, some at a time on this machine, and the numbers of those that are finished.
+
+After every job the tables are written anew, so that a reader always sees what is known. An interrupt stops trainings at their next step, in
+their checkpoints.
+"""
+
+import signal
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+from .. import dataset
+from ..config import UserError
+from . import render
+from .definition import load
+from .jobs import Place, Processes, Stopped, all_jobs, checked_results, evaluate
+
+
+def duration(seconds):
+    minutes = round(seconds / 60)
+    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min"
+
+
+class Progress:
+    """One line per event, with the time that is left by what the finished jobs took."""
+
+    def __init__(self, count, done):
+        self.count, self.done, self.took = count, done, []
+
+    def finished(self, label, seconds):
+        self.done += 1
+        self.took.append(seconds)
+        self.say(f"{label}: finished in {duration(seconds)}")
+
+    def say(self, text):
+        left = self.count - self.done
+        guess = f"; about {duration(left * sum(self.took) / len(self.took))} of work left" if self.took and left else ""
+        print(f"[{self.done}/{self.count}] {text}{guess}", flush=True)
+
+
+@contextmanager
+def _stoppable(processes):
+    def handler(number, frame):
+        processes.stop()
+
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, previous in before.items():
+            signal.signal(number, previous)
+
+
+def floor(table, place, jobs, processes):
+    """Uniform random actions in the same episodes: needs a bundle for its limits, whichever is finished."""
+    path = place.runs / table.name / "uniform.results.json"
+    if not path.is_file():
+        job = next((job for job in jobs if job.finished), None)
+        if job is None:
+            return None
+        evaluate(table, job.bundle, path, place, processes, path.with_name("uniform.log.txt"), uniform=True)
+    return checked_results(table, path)
+
+
+def run(path, data=None, runs="runs/tables", lads_run="target/release/lads-run", models="models", at_once=1):
+    """Runs a table's file to its end, or until it is stopped -> whether it reached the end."""
+    if at_once < 1:
+        raise UserError(f"--jobs {at_once}: must be at least 1")
+    table = load(path)
+    place = _place(table, data, runs, lads_run)
+    render.check(models)
+    jobs, processes = all_jobs(table, place), Processes()
+    groups = {}
+    for job in jobs:
+        groups.setdefault(job.folder, []).append(job)
+    known = {job: job.numbers() for job in jobs if job.finished}
+    progress = Progress(len(jobs), len(known))
+    progress.say(f"{table.title}: jobs in {place.runs / table.name}")
+    failures, writing = [], threading.Lock()
+
+    def write():
+        with writing:
+            render.write(models, table, place, [(job, known.get(job)) for job in jobs], floor(table, place, jobs, processes))
+
+    def work(group):
+        for job in group:
+            if job in known or processes.stopped:
+                continue
+            begun = time.monotonic()
+            try:
+                progress.say(f"{job.label}: begins")
+                job.run(processes)
+                known[job] = job.numbers()
+                progress.finished(job.label, time.monotonic() - begun)
+                write()
+            except Stopped:
+                return
+            except UserError as error:
+                failures.append(f"{job.label}: {error}")
+                progress.say(f"{job.label}: {error}")
+
+    with _stoppable(processes), ThreadPoolExecutor(at_once) as pool:
+        for outcome in [pool.submit(work, group) for group in groups.values()]:
+            outcome.result()
+        if not processes.stopped:
+            write()
+    if failures:
+        raise UserError(f"{len(failures)} of {len(jobs)} jobs failed:\n  " + "\n  ".join(failures))
+    return not processes.stopped
+
+
+def _place(table, data, runs, lads_run):
+    data = Path(data) if data else table.path(table.data)
+    lads_run = Path(lads_run)
+    problems = []
+    if not data.is_file():
+        problems.append(f"no dataset at {data}; collect one first (make collect ENV={table.name})")
+    if not lads_run.is_file():
+        problems.append(f"no program at {lads_run}; build it first: cargo build --release -p lads-sim")
+    if problems:
+        raise UserError("; ".join(problems))
+    return Place(Path(runs).resolve(), data.resolve(), dataset.sha256(data), lads_run.resolve())

@@ -1,0 +1,205 @@
+"""A table end to end on the tiny setting, with a program in the place of lads-run that writes results of its form; what is refused; the numbers."""
+
+import json
+import os
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+import time
+
+import pytest
+import synthetic
+from test_training import setting_for
+
+from lads_exporter import config, dataset
+from lads_exporter.config import UserError
+from lads_exporter.tables import definition, jobs, render, run
+
+# Writes what lads-run would: every episode of `lads.onnx` succeeds, of others one in four.
+PROGRAM = """#!{python}
+import hashlib, json, sys
+options = dict(zip(sys.argv[1::2], sys.argv[2::2]))
+episodes, data = int(options["--episodes"]), open(options["--model"], "rb").read()
+full = 0.25 if not options["--model"].endswith("lads.onnx") or "--uniform" in sys.argv else 1.0
+split = {{"episodes": 4 * episodes, "n_rate": 4 * full, "n_rate_standard_error": 0.5, "k_rate": [full] * 4, "full_success": full,
+         "full_success_count": int(4 * episodes * full), "full_success_interval": [0, 1], "un_instructed": 0}}
+found = {{"bundle_sha256": hashlib.sha256(data).hexdigest(), "seed": int(options["--seed"]), "noise": options["--noise"],
+         "episodes_per_instruction": episodes, "splits": {{"seen": split, "unseen": split}}}}
+open(options["--json"], "w").write(json.dumps(found))
+"""
+
+TABLE = """
+name = "tiny"
+title = "Tiny"
+measure = "n_rate"
+data = "tiny.safetensors"
+splits = ["seen", "unseen"]
+headings = ["seen", "unseen"]
+[evaluation]
+episodes = 5
+seed = 3
+noise = "none"
+[[track]]
+name = "paper"
+config = "base.toml"
+note = "A note."
+seeds = [0, 1]
+[[system]]
+id = "lads"
+title = "LADS"
+config = "lads.toml"
+published = { seen = [2.25, 0.14] }
+[[system]]
+id = "lang_dt"
+title = "Lang DT"
+config = "lang_dt.toml"
+published = {}
+seeds = { paper = [4] }
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with a table, its configurations, data and program."""
+    beside = config.find("configs/tiny.toml").resolve().parent
+    base = (beside / "tiny.toml").read_text().replace('"tiny.', f'"{beside}/tiny.')
+    for name, steps in {"plans": 40, "low_level": 20, "high_level": 20}.items():
+        now = setting_for("staged").tables[0]["training"][name]
+        shipped = config.read_toml("configs/tiny.toml")["training"][name]["steps"]
+        assert now
+        base = base.replace(f"[training.{name}]\nsteps = {shipped}", f"[training.{name}]\nsteps = {steps}")
+    (tmp_path / "base.toml").write_text(base.replace("kmeans_step = 200", "kmeans_step = 15"))
+    (tmp_path / "lads.toml").write_text('[system]\nkind = "lads"\nregressed = false\n')
+    (tmp_path / "lang_dt.toml").write_text('[system]\nkind = "lang_dt"\n')
+    (tmp_path / "table.toml").write_text(TABLE)
+    synthetic.write(tmp_path / "tiny.safetensors", config.load(tmp_path / "base.toml"), discarded='{"dl": 1}', attempts='{"dl": 4, "ld": 6}')
+    program = tmp_path / "lads-run"
+    program.write_text(PROGRAM.format(python=sys.executable))
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    return tmp_path
+
+
+def play(folder, **changes):
+    os.environ["PYTHONPATH"] = str(config.find("pyproject.toml").resolve().parent) + os.pathsep + os.environ.get("PYTHONPATH", "")
+    places = {"runs": folder / "runs", "lads_run": folder / "lads-run", "models": folder / "models"} | changes
+    return run.run(folder / "table.toml", **places)
+
+
+def test_a_table_from_nothing_again_and_from_its_middle(folder, capsys):
+    assert play(folder, at_once=2)
+    found = json.loads((folder / "models/tables.json").read_text())["tables"]["tiny"]
+    lads, lang_dt = found["tracks"][0]["rows"]
+    assert lads["seeds"] == [0, 1] and lang_dt["seeds"] == [4] and len(set(lads["bundle_sha256"])) == 2
+    assert lads["splits"]["seen"]["n_rate"] == 4.0 and lads["splits"]["seen"]["n_rate_deviation"] == 0.0
+    assert lads["splits"]["seen"]["episodes"] == 40 and lads["splits"]["seen"]["success_interval"][0] == pytest.approx(0.9124, abs=1e-3)
+    assert found["uniform"]["seen"]["success"] == 0.25 and found["expert"]["attempts"] == 10 and found["expert"]["success"] == 0.9
+    page = (folder / "models/TABLES.md").read_text()
+    assert "| LADS | 0, 1 | 2.25 ± 0.14 | 4.00 ± 0.00 (3.31-4.69); all 100 % (91-100) | - |" in page
+    assert "scripted expert" in page and "uniform random actions" in page and "`" + lads["bundle_sha256"][0][:12] + "`" in page
+    assert "about" in capsys.readouterr().out
+
+    # All is kept: nothing is trained or measured again.
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("runs/**/*") if path.is_file()}
+    assert play(folder)
+    assert before == {path: path.stat().st_mtime_ns for path in folder.glob("runs/**/*") if path.is_file()}
+
+    # Without its results and bundle a job exports and measures again: the same bundle.
+    trained = next(folder.glob("runs/tiny/paper/lads-seed0-*"))
+    for path in (trained / "lads.onnx", trained / "lads.results.json"):
+        path.unlink()
+    assert play(folder)
+    assert json.loads((folder / "models/tables.json").read_text())["tables"]["tiny"]["tracks"][0]["rows"][0]["bundle_sha256"] == lads["bundle_sha256"]
+
+    # Results of another protocol and half a checkpoint are named and stay.
+    results = trained / "lads.results.json"
+    other = json.loads(results.read_text()) | {"seed": 8}
+    results.write_text(json.dumps(other))
+    with pytest.raises(UserError, match=r"lads\.results\.json: of another protocol \(seed is 8, not 3\); it stays as it is"):
+        play(folder)
+    assert json.loads(results.read_text()) == other
+    results.unlink()
+    (trained / "summary.json").unlink()
+    half = (trained / "checkpoint.pt").read_bytes()[:5000]
+    (trained / "checkpoint.pt").write_bytes(half)
+    with pytest.raises(UserError, match=r"1 of 3 jobs failed:\n  paper LADS seed 0: .*checkpoint\.pt: half written or damaged"):
+        play(folder)
+    assert (trained / "checkpoint.pt").read_bytes() == half
+    (folder / "models/tables.json").write_text('{"mine": 1}')
+    with pytest.raises(UserError, match="not this exporter's tables"):
+        play(folder)
+
+
+def test_an_interrupted_table_goes_on(folder):
+    command = [sys.executable, "-m", "lads_exporter", "table", folder / "table.toml", "--runs", folder / "runs", "--lads-run", folder / "lads-run", "--models", folder / "models"]
+    source = str(config.find("pyproject.toml").resolve().parent)
+    process = subprocess.Popen([str(part) for part in command], env=os.environ | {"PYTHONPATH": source + os.pathsep + os.environ.get("PYTHONPATH", "")}, stderr=subprocess.PIPE, text=True)
+    while not list(folder.glob("runs/tiny/paper/lads-seed0-*/log.txt")):
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    assert process.wait() == 130 and "the same command goes on" in process.stderr.read()
+    assert not (folder / "models/tables.json").exists()
+    assert play(folder)
+    assert len(list(folder.glob("runs/tiny/paper/*"))) == 3
+
+
+def place_of(folder):
+    data = folder / "tiny.safetensors"
+    return jobs.Place(folder / "runs", data, dataset.sha256(data), folder / "lads-run")
+
+
+def test_a_job_is_its_inputs(folder):
+    place, table = place_of(folder), definition.load(folder / "table.toml")
+    first = jobs.all_jobs(table, place)[0].folder
+    assert jobs.all_jobs(definition.load(folder / "table.toml"), place)[0].folder == first
+    (folder / "base.toml").write_text((folder / "base.toml").read_text().replace("clip = 1.0", "clip = 2.0"))
+    assert jobs.all_jobs(definition.load(folder / "table.toml"), place)[0].folder != first
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('config = "lang_dt.toml"', 'config = "none.toml"'), r"system 'lang_dt' in track 'paper': no such file: .*none\.toml"),
+        (("seeds = { paper = [4] }", "seeds = { fast = [4] }"), "system 'lang_dt': unknown track 'fast'; known: paper"),
+        (("seeds = { paper = [4] }", 'weights = "dt"'), "system 'lang_dt': weights = 'dt': unknown system; known: lads, lang_dt"),
+        (("published = {}", "published = { third = [1.0] }"), "the paper has no split 'third'"),
+        (('id = "lang_dt"', 'id = "lads"'), "system 'lads' stands twice"),
+        (('measure = "n_rate"', 'measure = "rate"'), "measure = 'rate': must be one of success, n_rate"),
+        (("seeds = [0, 1]", "seeds = [0, -1]"), "seeds of 'paper': must be lists of whole numbers from 0 on"),
+        (("[[track]]", "[track]"), r"tracks are a list of tables, \[\[track\]\]"),
+        (("episodes = 5", "episode = 5"), "unknown key 'episode'; key 'episodes' is missing"),
+    ],
+)
+def test_a_bad_table_is_refused_before_anything_runs(folder, change, message):
+    (folder / "table.toml").write_text(TABLE.replace(*change))
+    with pytest.raises(UserError, match=message):
+        play(folder)
+    assert not (folder / "runs").exists()
+
+
+def test_an_unknown_kind_of_system_is_named(folder):
+    (folder / "lang_dt.toml").write_text('[system]\nkind = "dt"\n')
+    with pytest.raises(UserError, match=r"system 'lang_dt' in track 'paper': .*kind = 'dt': unknown system; known: lads, vae, cluster, lang_dt, lisa"):
+        play(folder)
+
+
+def test_what_is_missing_is_named_with_its_remedy(folder):
+    shutil.move(folder / "tiny.safetensors", folder / "elsewhere")
+    with pytest.raises(UserError, match=r"no dataset at .*make collect ENV=tiny\); no program at .*cargo build --release -p lads-sim"):
+        play(folder, lads_run=folder / "none")
+
+
+def test_wilson_interval():
+    """Against published values: 0 of 10, 5 of 10, 81 of 263 (Newcombe 1998, method 3)."""
+    assert render.wilson(0, 10) == pytest.approx([0.0, 0.2775], abs=1e-4)
+    assert render.wilson(5, 10) == pytest.approx([0.2366, 0.7634], abs=1e-4)
+    assert render.wilson(81, 263) == pytest.approx([0.2553, 0.3662], abs=1e-4)
+
+
+def test_the_tables_that_ship_are_sound():
+    for name in ("kitchen", "lorel"):
+        table = definition.load(f"tables/{name}.toml")
+        assert [track.name for track in table.tracks] == ["shipping", "paper"]
+        assert {row.id for row in table.systems} >= {"lads", "lang_dt", "lisa", "vae", "cluster"}

@@ -1,0 +1,278 @@
+//! How the numbers of an image are stored, and on what evidence: `lads.storage` in a bundle's metadata.
+//!
+//! Fewer bits make a control step faster and can make a policy another one. `lads-run tune` finds the smallest that keep it and writes
+//! them, with what it saw, into the bundle, where [`compile`](crate::compile) finds them. What can fail: text that is no such record, a
+//! format that does not exist, a part that the bundle does not have.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use lads_image::op::{CacheFormat, WeightFormat};
+use prost::Message as _;
+use serde::{Deserialize, Serialize};
+
+use crate::bundle::Bundle;
+use crate::error::BundleError;
+use crate::onnx::{StringStringEntryProto, fields};
+
+/// The metadata key.
+const KEY: &str = "lads.storage";
+
+/// The version of the record that is read and written.
+const VERSION: u32 = 1;
+
+/// The number of a `ModelProto`'s field that holds its metadata.
+const METADATA_FIELD: u64 = 14;
+
+/// How the weights of dense layers and the KV caches of an image are stored; 32-bit floats where nothing else is said.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(into = "Names", try_from = "Names")]
+pub struct Storage {
+    /// The weights of all dense layers that `parts` does not name.
+    pub weights: WeightFormat,
+    /// Exceptions: the name of an entry graph, for example `low_level/act`, or of one ONNX node in it, which comes first.
+    pub parts: BTreeMap<String, WeightFormat>,
+    /// The KV caches.
+    pub cache: CacheFormat,
+}
+
+impl Storage {
+    /// All weights in one format, the caches with 32 bits.
+    pub fn of_weights(weights: WeightFormat) -> Self {
+        Self {
+            weights,
+            ..Self::default()
+        }
+    }
+
+    /// The same with an exception.
+    #[must_use]
+    pub fn with_part(mut self, part: &str, weights: WeightFormat) -> Self {
+        self.parts.insert(part.to_owned(), weights);
+        self
+    }
+
+    /// The same with other caches.
+    #[must_use]
+    pub fn with_cache(mut self, cache: CacheFormat) -> Self {
+        self.cache = cache;
+        self
+    }
+
+    /// Whether nothing is stored with fewer bits than it was computed with.
+    pub fn is_exact(&self) -> bool {
+        let mut weights = self.parts.values().chain([&self.weights]);
+        weights.all(|&format| format == WeightFormat::F32) && self.cache == CacheFormat::F32
+    }
+
+    /// How the weights of the layer that was made from `node` of `entry` are stored.
+    pub fn of(&self, entry: &str, node: &str) -> WeightFormat {
+        let part = self.parts.get(node).or_else(|| self.parts.get(entry));
+        part.copied().unwrap_or(self.weights)
+    }
+}
+
+/// For example `f16 weights (low_level/act f32) and an f16 cache`.
+impl fmt::Display for Storage {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} weights", self.weights.name())?;
+        let parts = self.parts.iter();
+        let others = parts.filter(|&(_, &format)| format != self.weights);
+        let others: Vec<_> = others
+            .map(|(part, format)| format!("{part} {}", format.name()))
+            .collect();
+        if !others.is_empty() {
+            write!(f, " ({})", others.join(", "))?;
+        }
+        if self.cache != CacheFormat::F32 {
+            write!(f, " and an {} cache", self.cache.name())?;
+        }
+        Ok(())
+    }
+}
+
+/// What a person says of formats; what is left out is as the bundle was tuned, and with 32 bits where it was not.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Formats {
+    /// Of all weights.
+    pub weights: Option<WeightFormat>,
+    /// Of the weights of what is in the action and does not only select an index, if otherwise.
+    pub low_level: Option<WeightFormat>,
+    /// Of the KV caches.
+    pub cache: Option<CacheFormat>,
+}
+
+impl Formats {
+    /// What that is in this bundle; `None` if nothing was said.
+    pub fn storage(self, bundle: &Bundle) -> Option<Storage> {
+        if self == Self::default() {
+            return None;
+        }
+        let tuned = || bundle.tuned().map(|tuned| tuned.storage.clone());
+        let mut storage = match self.weights {
+            Some(weights) => Storage::of_weights(weights),
+            None => tuned().unwrap_or_default(),
+        };
+        if let Some(weights) = self.low_level {
+            for entry in bundle.acting_entries() {
+                let inside = format!("{entry}/");
+                storage.parts.retain(|part, _| !part.starts_with(&inside));
+                storage.parts.insert(entry, weights);
+            }
+        }
+        if let Some(cache) = self.cache {
+            storage.cache = cache;
+        }
+        Some(storage)
+    }
+}
+
+/// What was seen when a policy answered recorded questions with such numbers, beside itself with 32 bits.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Evidence {
+    /// SHA-256 of the file with the questions, hexadecimal.
+    pub reference_sha256: String,
+    /// Episodes replayed.
+    pub episodes: usize,
+    /// Control steps in them.
+    pub steps: usize,
+    /// Decisions in them; every one selected the same index.
+    pub decisions: usize,
+    /// The smallest lead of a selected index over the second best, with 32 bits, in logits; infinite, and left out, without decisions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub smallest_margin: Option<f64>,
+    /// Largest difference of a logit, up to a constant added to all of a decision's.
+    pub largest_logit_error: f64,
+    /// Share of the decisions whose margin is more than `margin_factor` times that difference.
+    pub clear_share: f64,
+    /// The factor.
+    pub margin_factor: f64,
+    /// Largest difference of an action's element, in the action's units.
+    pub largest_action_error: f64,
+    /// What it may be.
+    pub action_tolerance: f64,
+}
+
+/// The record in a bundle.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Tuned {
+    version: u32,
+    /// How the numbers are stored.
+    pub storage: Storage,
+    /// Why that is enough.
+    pub evidence: Evidence,
+}
+
+impl Tuned {
+    /// A record of this version.
+    pub fn new(storage: Storage, evidence: Evidence) -> Self {
+        Self {
+            version: VERSION,
+            storage,
+            evidence,
+        }
+    }
+
+    /// The record of a bundle, whose metadata is given by key; `None` for one that has none.
+    pub(crate) fn find<'m>(
+        property: impl Fn(&str) -> Option<&'m str>,
+    ) -> Result<Option<Self>, BundleError> {
+        let Some(text) = property(KEY) else {
+            return Ok(None);
+        };
+        let refused = |problem: String| BundleError::Storage {
+            problem: problem.into(),
+        };
+        let tuned: Self = serde_json::from_str(text).map_err(|error| refused(error.to_string()))?;
+        if tuned.version != VERSION {
+            let found = tuned.version;
+            return Err(refused(format!(
+                "it has version {found}, this program reads version {VERSION}"
+            )));
+        }
+        Ok(Some(tuned))
+    }
+
+    /// A bundle's file with this record instead of the one that it may have; all other bytes stay what they are.
+    pub fn written_into(&self, bundle: &[u8]) -> Result<Vec<u8>, BundleError> {
+        let mut written = without_record(bundle)?;
+        let pair = StringStringEntryProto {
+            key: KEY.into(),
+            value: serde_json::to_string(self).map_err(|error| BundleError::Storage {
+                problem: error.to_string().into(),
+            })?,
+        };
+        prost::encoding::message::encode(METADATA_FIELD as u32, &pair, &mut written);
+        Ok(written)
+    }
+}
+
+/// A bundle's file as it was before it was tuned.
+pub(crate) fn without_record(bundle: &[u8]) -> Result<Vec<u8>, BundleError> {
+    let mut rest = Vec::with_capacity(bundle.len() + 1024);
+    for field in fields(bundle)? {
+        let is_record = field.number == METADATA_FIELD
+            && StringStringEntryProto::decode(field.value).is_ok_and(|pair| pair.key == KEY);
+        if !is_record {
+            rest.extend_from_slice(field.whole);
+        }
+    }
+    Ok(rest)
+}
+
+/// Formats by their names, as the record has them.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Names {
+    weights: String,
+    #[serde(default)]
+    parts: BTreeMap<String, String>,
+    cache: String,
+}
+
+impl From<Storage> for Names {
+    fn from(storage: Storage) -> Self {
+        let parts = storage.parts.into_iter();
+        Self {
+            weights: storage.weights.name().into(),
+            parts: parts
+                .map(|(part, format)| (part, format.name().into()))
+                .collect(),
+            cache: storage.cache.name().into(),
+        }
+    }
+}
+
+impl TryFrom<Names> for Storage {
+    type Error = String;
+
+    fn try_from(names: Names) -> Result<Self, String> {
+        let weights = |name: &str| named(name, WeightFormat::ALL, WeightFormat::name);
+        let parts = names.parts.into_iter();
+        Ok(Self {
+            weights: weights(&names.weights)?,
+            parts: parts
+                .map(|(part, name)| Ok((part, weights(&name)?)))
+                .collect::<Result<_, String>>()?,
+            cache: named(&names.cache, CacheFormat::ALL, CacheFormat::name)?,
+        })
+    }
+}
+
+/// The format of that name; else the names that there are.
+pub fn named<T: Copy, const N: usize>(
+    name: &str,
+    known: [T; N],
+    name_of: fn(T) -> &'static str,
+) -> Result<T, String> {
+    let found = known.into_iter().find(|&format| name_of(format) == name);
+    found.ok_or_else(|| {
+        let known = known.map(name_of).join(", ");
+        format!("there is no format `{name}`; known are {known}")
+    })
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,112 @@
+"""Control steps into a file: MCAP, which Foxglove opens and `lads-run replay` computes again."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from . import _lads
+
+
+class Recorder:
+    """A controller that keeps what it does, for a policy that observes one vector; used in its place.
+
+    `reset` and `instruct` begin a new episode, `end` says how the last one came out. Nothing is written before `close`, so that no step waits
+    for a disk; as a context manager it is closed at the end, and an exception leaves no file. A step costs a copy of what goes in and out.
+    """
+
+    def __init__(
+        self,
+        controller: _lads.Controller,
+        path: str | os.PathLike[str],
+        *,
+        seed: int = 0,
+        noise: str = "",
+        notes: Mapping[str, str] | None = None,
+    ) -> None:
+        self.controller = controller
+        self.path = os.fspath(path)
+        self._head = (seed, noise, dict(notes or {}))
+        self._episodes: list[dict[str, Any]] = []
+        self._steps: list[dict[str, Any]] = []
+        # What cannot be recorded is refused before the first step.
+        _lads.write_log(controller.policy, os.devnull, *self._head, [])
+
+    @property
+    def policy(self) -> _lads.Policy:
+        """The policy at work."""
+        return self.controller.policy
+
+    def step(self, observation: Any, out: np.ndarray | None = None) -> tuple[np.ndarray, _lads.StepReport]:
+        """The controller's `step`, kept."""
+        start = time.perf_counter_ns()
+        action, report = self.controller.step(observation, out)
+        spent = time.perf_counter_ns() - start
+        selected = report.selected
+        seen = next(iter(observation.values())) if isinstance(observation, dict) else observation
+        self._steps.append(
+            {
+                "observations": np.array(seen).ravel(),
+                "actions": np.array(action),
+                "executed": np.array(action),
+                "plans": selected and selected.index,
+                "decided": bool(selected and selected.fresh),
+                "margins": selected and selected.margin,
+                "scores": self.controller.scores if selected and selected.fresh else [],
+                "controller_ns": spent,
+            }
+        )
+        return action, report
+
+    def executed(self, action: np.ndarray) -> None:
+        """The controller's `executed`, kept."""
+        self.controller.executed(action)
+        self._steps[-1]["executed"] = np.array(action)
+
+    def reset(self) -> None:
+        """Ends the episode, and starts a new one of the same instruction."""
+        self.controller.reset()
+        self.end()
+
+    def instruct(self, instruction: Any) -> None:
+        """Ends the episode, and follows an instruction from the next step on."""
+        self.end()
+        self.controller.instruct(instruction)
+
+    def end(self, success: bool = False, completions: Sequence[tuple[str, int]] = ()) -> None:
+        """Ends the episode: whether it was a success, and sub-tasks with the first step, from 1, after which they were done."""
+        if not self._steps:
+            return
+        told = self.controller._instruction
+        sample, noise, _ = self.controller._settings
+        columns = {key: [step[key] for step in self._steps] for key in self._steps[0]}
+        for key in ("observations", "actions", "executed"):
+            columns[key] = np.stack(columns[key])
+        self._episodes.append(
+            {
+                **columns,
+                "instruction": told if isinstance(told, str) else None,
+                "words": None if told is None or isinstance(told, str) else np.ravel(told).tolist(),
+                "sample": sample,
+                "noise": noise,
+                "success": bool(success),
+                "completions": [(str(name), int(step)) for name, step in completions],
+            }
+        )
+        self._steps = []
+
+    def close(self) -> None:
+        """Ends the episode and writes the file."""
+        self.end()
+        _lads.write_log(self.policy, self.path, *self._head, self._episodes)
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, error: object, *_: object) -> None:
+        if error is None:
+            self.close()

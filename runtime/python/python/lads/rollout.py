@@ -1,0 +1,150 @@
+"""One episode of any environment of Gymnasium's API, and the ways to describe one: seeds, options, success, sub-tasks.
+
+Nothing here imports gymnasium: an environment is what has `reset(seed=, options=)` and `step(action)`. What can fail: an environment whose
+`info` says nothing about what is asked of it (`EvaluationError`).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .errors import EvaluationError, InputError
+
+SUCCESS = ("is_success", "success")
+COMPLETED = "episode_task_completions"
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What happened in one episode."""
+
+    steps: int
+    """Control steps executed."""
+    total_reward: float
+    """Sum of the rewards."""
+    terminated: bool
+    truncated: bool
+    """Whether the environment, or `max_steps`, ended it before it was over."""
+    info: Mapping
+    """What the last step said."""
+    completions: tuple[tuple[str, int], ...]
+    """Sub-tasks with the first step, from 1, after which they were done, in order of time."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How episodes are begun, ended and judged."""
+
+    options: object = None
+    """For `reset`: a dictionary, or a callable of the episode's number."""
+    max_steps: int | None = None
+    success: object = None
+    """A key of the last `info`, or a callable of the `Rollout`."""
+    sub_tasks: tuple[str, ...] = ()
+    completed: object = None
+    """A key of `info`, or a callable of it, for the names of the sub-tasks that are done."""
+    keys: tuple = field(default=SUCCESS, repr=False)
+
+    def reset_options(self, episode):
+        """What `reset` is given."""
+        return self.options(episode) if callable(self.options) else self.options
+
+    def done(self, info):
+        """Names of the sub-tasks that are done, of those that are asked for."""
+        if not self.sub_tasks:
+            return []
+        if callable(self.completed):
+            names = self.completed(info)
+        else:
+            key = self.completed or COMPLETED
+            if key not in info:
+                raise EvaluationError(f"the environment's info has no {key!r}; give completed=, a key or a callable that names the sub-tasks that are done")
+            names = info[key]
+        done = set(names)
+        return [name for name in self.sub_tasks if name in done]
+
+    def judge(self, rollout):
+        """Whether an episode was a success; None where nothing says so."""
+        if callable(self.success):
+            return bool(self.success(rollout))
+        if self.success is not None:
+            if self.success not in rollout.info:
+                raise EvaluationError(f"the last info of an episode has no {self.success!r}; give success=, a key that it has or a callable of the rollout")
+            return bool(rollout.info[self.success])
+        if self.sub_tasks:
+            return len(rollout.completions) == len(self.sub_tasks)
+        return next((bool(rollout.info[key]) for key in self.keys if key in rollout.info), None)
+
+
+def episode_seed(seed, episode):
+    """The seed of an episode, of 32 bits: the same whatever other episodes are run, and in whichever process."""
+    return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
+
+
+def play(environment, act, rules, seed, episode, watch=None):
+    """Runs one episode by `act(observation) -> action` -> Rollout. `watch(observation)` is called with every observation, the last one too.
+
+    `act` may return None to give up: the episode is over.
+    """
+    observation, info = environment.reset(seed=episode_seed(seed, episode), options=rules.reset_options(episode))
+    steps, total, terminated, truncated = 0, 0.0, False, False
+    completions = dict.fromkeys(rules.done(info), 0) if _says(rules, info) else {}
+    while not (terminated or truncated):
+        if watch:
+            watch(observation)
+        action = act(observation)
+        if action is None:
+            break
+        observation, reward, terminated, truncated, info = environment.step(action)
+        steps += 1
+        total += float(reward)
+        for name in rules.done(info):
+            completions.setdefault(name, steps)
+        truncated = truncated or steps == rules.max_steps
+    if watch:
+        watch(observation)
+    return Rollout(steps, total, bool(terminated), bool(truncated), info, tuple(completions.items()))
+
+
+def _says(rules, info):
+    """Whether the info of a reset says anything about sub-tasks; that of most environments does not."""
+    return callable(rules.completed) or (rules.completed or COMPLETED) in info
+
+
+def convert(observation, channels):
+    """An environment's observation as a controller takes it: arrays of each channel's dtype, one or a dictionary by name."""
+    if isinstance(observation, Mapping):
+        missing = [channel.name for channel in channels if channel.name not in observation]
+        if missing:
+            names = ", ".join(map(repr, missing))
+            raise InputError(f"the environment's observation has no {names}, it has {', '.join(map(repr, observation))}; give observation=, a callable that makes what the policy takes")
+        arrays = {channel.name: _cast(observation[channel.name], channel) for channel in channels}
+        return arrays if len(channels) > 1 else arrays[channels[0].name]
+    if len(channels) > 1:
+        names = ", ".join(repr(channel.name) for channel in channels)
+        raise InputError(f"the policy observes {names}, the environment gives one {type(observation).__name__}; give observation=, a callable that makes a dictionary")
+    return _cast(observation, channels[0])
+
+
+def _cast(value, channel):
+    array = np.asarray(value)
+    if channel.dtype.kind == "f" and array.dtype.kind in "fiub":
+        return np.ascontiguousarray(array, channel.dtype)
+    if not np.can_cast(array.dtype, channel.dtype, "same_kind") or array.dtype.kind == "f":
+        raise InputError(f"channel {channel.name!r}: the environment gives {array.dtype}, the policy takes {channel.dtype}; give observation=, a callable that converts it")
+    cast = np.ascontiguousarray(array, channel.dtype)
+    if not np.array_equal(cast, array):
+        raise InputError(f"channel {channel.name!r}: a value of the environment does not fit into {channel.dtype}; give observation=, a callable that converts it")
+    return cast
+
+
+def command(action, space):
+    """A policy's action, float32 [n], as the environment's action space takes it."""
+    if space is None or not hasattr(space, "shape") or not hasattr(space, "dtype"):
+        return action
+    if np.dtype(space.dtype).kind != "f":
+        raise EvaluationError(f"the environment takes {space}, the policy gives {len(action)} floats; give action=, a callable that turns one into the other")
+    if int(np.prod(space.shape)) != len(action):
+        raise EvaluationError(f"the environment takes actions of shape {space.shape}, the policy gives {len(action)} elements; give action=, a callable that turns one into the other")
+    return action.reshape(space.shape).astype(space.dtype, copy=False)

@@ -1,0 +1,464 @@
+//! A controller for Python: one step after another, in memory that was allocated once.
+//!
+//! What is given is copied in while the interpreter is held, the step runs without it, and what comes out is copied again: other threads may
+//! do with their arrays what they like. Two threads in one controller at once are refused, not queued: a control loop that
+//! waits for another is a mistake.
+
+use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
+
+use lads_core::{Data, Decision, Instruction, Isa, Noise};
+use numpy::{PyArray1, PyArrayMethods};
+use pyo3::prelude::*;
+use pyo3::types::PyString;
+
+use crate::arrays::{self, Staged};
+use crate::cell::{Checked, Working};
+use crate::errors::{self, BusyError, ClosedError, InstructionError, StepError, WorkspaceError};
+use crate::policy::Policy;
+use crate::process::Process;
+use crate::report::StepReport;
+
+/// How a controller was made, besides its instruction.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Settings {
+    /// Seed of sampling.
+    pub sample: Option<u64>,
+    /// Seed of the noise.
+    pub noise: Option<u64>,
+    /// Whether it runs on the kernels that every processor has.
+    pub portable: bool,
+}
+
+impl Settings {
+    /// A fresh controller with these settings.
+    pub fn working(self, policy: &Arc<Checked>) -> PyResult<Working> {
+        let isa = if self.portable {
+            Isa::portable()
+        } else {
+            Isa::detect()
+        };
+        let mut working =
+            Working::of(policy, isa).map_err(|error| WorkspaceError::new_err(error.to_string()))?;
+        working.with(|controller| {
+            if let Some(seed) = self.sample {
+                controller.set_decision(lads_cli::sampling(policy.view(), seed));
+            }
+            if let Some(seed) = self.noise {
+                controller.set_noise(Noise::Seeded { seed });
+            }
+        });
+        Ok(working)
+    }
+}
+
+/// What a policy is told.
+pub enum Told {
+    /// Number of a known instruction.
+    Known(u32),
+    /// Word embeddings.
+    Words(Vec<f32>),
+}
+
+impl Told {
+    /// The id or the text of a known instruction, or an array of word embeddings [words, dim].
+    pub fn of(policy: &Checked, given: &Bound<'_, PyAny>) -> PyResult<Self> {
+        let contract = policy.view().contract();
+        if let Ok(text) = given.cast::<PyString>() {
+            let found = policy.opened().instruction(&text.to_cow()?);
+            return match found {
+                Ok(id) => Ok(Self::Known(id)),
+                Err(error) => Err(InstructionError::new_err(error.to_string())),
+            };
+        }
+        let (shape, words) = arrays::values(given, "instruction", 2).map_err(|error| {
+            let text = error.value(given.py()).to_string();
+            InstructionError::new_err(format!(
+                "{text}; or give the id or the text of a known instruction"
+            ))
+        })?;
+        if contract.instruction_channel().is_some() && shape[1] != contract.word_dim() {
+            return Err(InstructionError::new_err(format!(
+                "the words have {} elements each, the contract says {}; use the encoder that policy.contract.language names",
+                shape[1],
+                contract.word_dim()
+            )));
+        }
+        Ok(Self::Words(words))
+    }
+
+    /// As the controller takes it.
+    pub fn as_instruction(&self) -> Instruction<'_> {
+        match self {
+            Self::Known(id) => Instruction::Id(*id),
+            Self::Words(words) => Instruction::Words(words),
+        }
+    }
+}
+
+/// What works, and the room for what goes in and out.
+struct Inner {
+    working: Working,
+    staged: Vec<Staged>,
+    given: Vec<bool>,
+    /// How many of the staged channels have to be given.
+    needed: usize,
+    action: Vec<f32>,
+    told: Option<Told>,
+}
+
+/// A policy at work: one observation in, one action out, once every control period.
+///
+/// It belongs to one thread at a time and to the process that made it. Made by Policy.controller.
+#[pyclass(frozen, module = "lads")]
+pub struct Controller {
+    policy: Py<Policy>,
+    checked: Arc<Checked>,
+    settings: Settings,
+    process: Process,
+    inner: Mutex<Option<Inner>>,
+}
+
+impl Controller {
+    /// A fresh one without an instruction.
+    pub fn of(policy: &Bound<'_, Policy>, settings: Settings) -> PyResult<Self> {
+        let checked = Arc::clone(policy.get().checked());
+        let view = checked.view();
+        let staged = arrays::stage(view.contract(), view.noise_len());
+        let inner = Inner {
+            working: settings.working(&checked)?,
+            given: vec![false; staged.len()],
+            needed: view.contract().observations_len(),
+            staged,
+            action: vec![0.0; view.contract().action_len()],
+            told: None,
+        };
+        Ok(Self {
+            policy: policy.clone().unbind(),
+            checked,
+            settings,
+            process: Process::current(),
+            inner: Mutex::new(Some(inner)),
+        })
+    }
+
+    /// Its settings.
+    pub fn settings(&self) -> Settings {
+        self.settings
+    }
+
+    /// The policy at work.
+    pub fn checked(&self) -> &Arc<Checked> {
+        &self.checked
+    }
+
+    /// The rule that picks indices, in words.
+    pub fn rule(&self) -> String {
+        let rule = match self.settings.sample {
+            Some(seed) => lads_cli::sampling(self.checked.view(), seed),
+            None => self.contract().decision(),
+        };
+        match rule {
+            Decision::Argmax => "argmax".into(),
+            Decision::Sample { temperature, .. } => {
+                format!("sampling at temperature {temperature}")
+            }
+        }
+    }
+
+    fn lock(&self) -> PyResult<MutexGuard<'_, Option<Inner>>> {
+        self.process.check("controller")?;
+        match self.inner.try_lock() {
+            Ok(guard) => Ok(guard),
+            Err(TryLockError::WouldBlock) => Err(BusyError::new_err(
+                "the controller is at work in another thread; give each thread one of its own, by policy.controller(...)",
+            )),
+            Err(TryLockError::Poisoned(_)) => Err(StepError::new_err(
+                "the controller failed before; make another by policy.controller(...)",
+            )),
+        }
+    }
+
+    fn work<R>(&self, work: impl FnOnce(&mut Inner) -> PyResult<R>) -> PyResult<R> {
+        let mut guard = self.lock()?;
+        let inner = guard.as_mut().ok_or_else(|| {
+            ClosedError::new_err("the controller is closed; make another by policy.controller(...)")
+        })?;
+        work(inner)
+    }
+
+    fn contract(&self) -> &lads_core::Contract<'_> {
+        self.checked.view().contract()
+    }
+}
+
+#[pymethods]
+impl Controller {
+    /// One control step: the action, float32 [actions], for what is observed, both in the contract's units, and a lads.StepReport.
+    ///
+    /// `observation` is an array of exactly the channel's dtype and shape, contiguous; for a policy with several channels a dictionary of
+    /// arrays by the channels' names, to which the noise channel may be added. With `out`, the action is written there and `out` is
+    /// returned: nothing is allocated. An observation that is refused leaves the controller as it was.
+    #[pyo3(signature = (observation, out=None))]
+    fn step<'py>(
+        &self,
+        py: Python<'py>,
+        observation: &Bound<'py, PyAny>,
+        out: Option<Bound<'py, PyAny>>,
+    ) -> PyResult<(Bound<'py, PyAny>, StepReport)> {
+        self.work(|inner| {
+            arrays::read(
+                observation,
+                &mut inner.staged,
+                inner.needed,
+                &mut inner.given,
+            )?;
+            let mut write = match &out {
+                Some(out) => Some(arrays::writable(out, "action", &[inner.action.len()])?),
+                None => None,
+            };
+            let Inner {
+                working,
+                staged,
+                given,
+                action,
+                ..
+            } = &mut *inner;
+            let report = py.detach(|| {
+                let only = [staged[0].data()];
+                let (all, inputs);
+                inputs = if staged.len() == 1 {
+                    &only[..]
+                } else {
+                    all = arrays::given(staged, given);
+                    &all[..]
+                };
+                working.with(|controller| match *inputs {
+                    [(_, Data::F32(values))] if staged.len() == 1 => {
+                        controller.step(values, action)
+                    }
+                    _ => controller.step_with(inputs, action),
+                })
+            });
+            let report = report.map_err(|error| errors::step(&error, self.contract()))?;
+            let action = match (&mut write, out) {
+                (Some(write), Some(out)) => {
+                    if let Ok(values) = write.as_slice_mut() {
+                        values.copy_from_slice(action);
+                    }
+                    out
+                }
+                _ => PyArray1::from_slice(py, action).into_any(),
+            };
+            Ok((action, report.into()))
+        })
+    }
+
+    /// Follows an instruction from the next step on, as a new episode: the id or the text of a known one, or word embeddings, float32
+    /// [words, dim]. One that is refused changes nothing.
+    pub fn instruct(&self, py: Python<'_>, instruction: &Bound<'_, PyAny>) -> PyResult<()> {
+        self.work(|inner| {
+            let told = Told::of(&self.checked, instruction)?;
+            let working = &mut inner.working;
+            let done = py.detach(|| {
+                working.with(|controller| controller.set_instruction(told.as_instruction()))
+            });
+            done.map_err(|error| errors::instruction(&error))?;
+            inner.told = Some(told);
+            Ok(())
+        })
+    }
+
+    /// Starts a new episode of the same instruction. Sampling and noise go on where they were.
+    fn reset(&self) -> PyResult<()> {
+        self.work(|inner| {
+            inner.working.with(|controller| controller.reset());
+            Ok(())
+        })
+    }
+
+    /// Tells what was really executed since the last step, where that is not the action that it returned: float32 [actions].
+    fn executed(&self, action: &Bound<'_, PyAny>) -> PyResult<()> {
+        self.work(|inner| {
+            let mut done = vec![0.0; inner.action.len()];
+            arrays::copy(action, "action", "executed", &[done.len()], &mut done)?;
+            let told = inner.working.with(|controller| controller.executed(&done));
+            told.map_err(|error| errors::step(&error, self.contract()))
+        })
+    }
+
+    /// The action, float32 [actions], for what is observed and an index that the caller chose; changes nothing in the episode.
+    #[pyo3(signature = (observation, index, out=None))]
+    fn follow<'py>(
+        &self,
+        py: Python<'py>,
+        observation: &Bound<'py, PyAny>,
+        index: u32,
+        out: Option<Bound<'py, PyAny>>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        self.work(|inner| {
+            arrays::read(
+                observation,
+                &mut inner.staged,
+                inner.needed,
+                &mut inner.given,
+            )?;
+            let mut write = match &out {
+                Some(out) => Some(arrays::writable(out, "action", &[inner.action.len()])?),
+                None => None,
+            };
+            let Inner {
+                working,
+                staged,
+                given,
+                action,
+                ..
+            } = &mut *inner;
+            let done = py.detach(|| {
+                let inputs = arrays::given(staged, given);
+                working.with(|controller| controller.follow(&inputs, index, action))
+            });
+            done.map_err(|error| match error {
+                lads_core::FollowError::Input(error) => {
+                    errors::input(lads_host::refused(&error, self.contract()))
+                }
+                other => StepError::new_err(other.to_string()),
+            })?;
+            Ok(match (&mut write, out) {
+                (Some(write), Some(out)) => {
+                    if let Ok(values) = write.as_slice_mut() {
+                        values.copy_from_slice(action);
+                    }
+                    out
+                }
+                _ => PyArray1::from_slice(py, action).into_any(),
+            })
+        })
+    }
+
+    /// Brings code, weights and caches into the processor's caches, for right before the first step or after a pause.
+    fn warm(&self, py: Python<'_>) -> PyResult<()> {
+        self.work(|inner| {
+            let working = &mut inner.working;
+            py.detach(|| working.with(|controller| controller.warm()));
+            Ok(())
+        })
+    }
+
+    /// Gives its memory back; whatever is called afterwards is refused.
+    fn close(&self) -> PyResult<()> {
+        *self.lock()? = None;
+        Ok(())
+    }
+
+    /// Whether it is closed.
+    #[getter]
+    fn closed(&self) -> PyResult<bool> {
+        Ok(self.lock()?.is_none())
+    }
+
+    /// The scores of the last selection, one per index: float32 [indices]; empty for a policy that selects nothing.
+    #[getter]
+    fn scores<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<f32>>> {
+        self.work(|inner| {
+            let scores = |controller: &mut lads_core::Controller<'_, '_>| {
+                PyArray1::from_slice(py, controller.scores())
+            };
+            Ok(inner.working.with(scores))
+        })
+    }
+
+    /// The action of the last step, or what `executed` said: float32 [actions].
+    #[getter]
+    fn last_action<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<f32>>> {
+        self.work(|inner| {
+            let action = |controller: &mut lads_core::Controller<'_, '_>| {
+                PyArray1::from_slice(py, controller.last_action())
+            };
+            Ok(inner.working.with(action))
+        })
+    }
+
+    /// The id of the known instruction that it follows; None for word embeddings or without one.
+    #[getter]
+    fn instruction(&self) -> PyResult<Option<String>> {
+        self.work(|inner| {
+            let Some(Told::Known(id)) = inner.told else {
+                return Ok(None);
+            };
+            let known = self.contract().instruction(id as usize);
+            Ok(known.map(|known| known.id.to_owned()))
+        })
+    }
+
+    /// What `instruct` was given last: the id of a known one, word embeddings, or None.
+    #[getter(_instruction)]
+    fn told<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        if let Some(id) = self.instruction()? {
+            return Ok(Some(PyString::new(py, &id).into_any()));
+        }
+        self.work(|inner| {
+            let Some(Told::Words(words)) = &inner.told else {
+                return Ok(None);
+            };
+            let dim = self.contract().word_dim().max(1);
+            let array = PyArray1::from_slice(py, words).reshape([words.len() / dim, dim])?;
+            Ok(Some(array.into_any()))
+        })
+    }
+
+    /// Whether there is an instruction to follow, or the policy takes none.
+    #[getter]
+    fn instructed(&self) -> PyResult<bool> {
+        self.work(|inner| Ok(inner.working.with(|controller| controller.is_instructed())))
+    }
+
+    /// The rule that picks indices: 'argmax' or 'sample'.
+    #[getter]
+    fn decision(&self) -> PyResult<&'static str> {
+        self.work(|inner| {
+            Ok(inner
+                .working
+                .with(|controller| match controller.decision() {
+                    Decision::Argmax => "argmax",
+                    Decision::Sample { .. } => "sample",
+                }))
+        })
+    }
+
+    /// The instructions of the processor that it runs on: 'portable', 'avx2' or 'avx512'.
+    #[getter]
+    fn isa(&self) -> PyResult<&'static str> {
+        self.work(|inner| Ok(inner.working.with(|controller| controller.isa().name())))
+    }
+
+    /// The policy at work.
+    #[getter]
+    fn policy(&self, py: Python<'_>) -> Py<Policy> {
+        self.policy.clone_ref(py)
+    }
+
+    /// The keyword arguments that Policy.controller was given, without the instruction.
+    #[getter(_settings)]
+    fn keywords(&self) -> (Option<u64>, Option<u64>, bool) {
+        let Settings {
+            sample,
+            noise,
+            portable,
+        } = self.settings;
+        (sample, noise, portable)
+    }
+
+    fn __enter__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    #[pyo3(signature = (*_exception))]
+    fn __exit__(&self, _exception: &Bound<'_, PyAny>) -> PyResult<()> {
+        self.close()
+    }
+
+    fn __repr__(&self) -> String {
+        let policy = self.policy.get().__repr__();
+        format!("<lads.Controller of {policy}>")
+    }
+}

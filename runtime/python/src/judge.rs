@@ -1,0 +1,356 @@
+//! The verdict of a verification: what was rolled out in Python, judged by lads-proof.
+//!
+//! Reference and run come in the form of a reference's file. The compiled policy is asked the reference's questions here, on a fresh
+//! controller. What can fail: rollouts that contradict each other, an instruction that the policy does not know.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use askama::Template as _;
+use lads_core::{Channel, ChannelId, Contract, DType, Data};
+use lads_proof::answers::{Answer, Answers, Replay, Reply};
+use lads_proof::certificate::{Certificate, ReferenceUsed, Setting};
+use lads_proof::contract::Compared;
+use lads_proof::episode::{Completion, Episode};
+use lads_proof::numbering::Numbering;
+use lads_proof::page::Page;
+use lads_proof::pairs::{Episodes, Paired, Traced};
+use lads_proof::physics::Physics;
+use lads_proof::reference::{Reference, Trace};
+use pyo3::prelude::*;
+use serde::Deserialize;
+use serde_json::Value;
+
+use crate::arrays;
+use crate::cell::Working;
+use crate::controller::Controller;
+use crate::errors::{ProofError, instruction as refused_instruction};
+
+/// What Python knows of a verification besides the rollouts.
+#[derive(Deserialize)]
+struct About {
+    /// Id of the environment.
+    environment: String,
+    /// The environment's noise, in words.
+    noise: String,
+    versions: BTreeMap<String, String>,
+    /// The environment's sub-tasks.
+    sub_tasks: Vec<String>,
+    /// Indices of those that each instruction commands.
+    commanded: Vec<Vec<usize>>,
+    /// What the policy says of itself.
+    contract: Value,
+    /// What the reference and the environment say of the same.
+    stated: Value,
+    not_covered: Vec<String>,
+}
+
+/// Judges -> (verdict, certificate as JSON, certificate as HTML).
+///
+/// `reference` and `run` are rollouts in the form of a reference's file; `replayed` has (instruction, episode, states float64 [n, S]) of the
+/// environment under the reference's actions; `about` is JSON.
+#[pyfunction]
+pub fn judge(
+    py: Python<'_>,
+    controller: &Controller,
+    reference: Vec<u8>,
+    run: Vec<u8>,
+    replayed: Vec<(usize, usize, Bound<'_, PyAny>)>,
+    about: &str,
+) -> PyResult<(&'static str, String, String)> {
+    let broken = |error: &dyn std::fmt::Display| ProofError::new_err(error.to_string());
+    let read = |bytes: &[u8], name: &str| {
+        Reference::read(bytes, Path::new(name)).map_err(|error| broken(&error))
+    };
+    let (reference, run) = (read(&reference, "the reference")?, read(&run, "the run")?);
+    let about: About = serde_json::from_str(about).map_err(|error| broken(&error))?;
+    let states = replayed.iter().map(|(instruction, episode, states)| {
+        let (shape, values) = arrays::values::<f64>(states, "states", 2)?;
+        Ok((*instruction, *episode, shape[1], values))
+    });
+    let states = states.collect::<PyResult<Vec<_>>>()?;
+    let physics = environment(&reference, &states);
+    let mut asked = controller.settings().working(controller.checked())?;
+    let view = controller.checked().view();
+    let contract = view.contract();
+    let numbers = known(&reference, controller)?;
+    let replays = py.detach(|| ask(&mut asked, contract, &reference, &numbers))?;
+    let tolerance = view.golden().map(|golden| f64::from(golden.tolerance()));
+    let (answers, numbering) = Answers::judge(&reference, &replays, tolerance);
+    let rollouts = pairs(&reference, &numbering, &run, &about, contract);
+    let (episodes, rules) = (reference.episodes_per_instruction, controller.rule());
+    let setting = Setting {
+        environment: about.environment,
+        bundle_sha256: contract.bundle_sha256().to_owned(),
+        image_sha256: lads_compiler::sha256(view.image()),
+        image_stored: lads_host::stored(view),
+        decision: rules,
+        isa: asked.with(|controller| controller.isa().name().to_owned()),
+        seed: reference.seed,
+        noise: about.noise,
+        episodes_per_instruction: episodes,
+        instructions: reference.instructions.len(),
+        versions: about.versions,
+    };
+    let used = ReferenceUsed {
+        bundle_sha256: reference.bundle_sha256.clone(),
+        same_bundle: false,
+        weights_from: reference.weights_from.clone(),
+        words_from: reference.words_from.clone(),
+        logits_from: None,
+        versions: reference.versions.clone(),
+    };
+    let compared = Compared::with_stated(&about.contract, &about.stated);
+    let certificate = Certificate::new(
+        setting,
+        used,
+        compared,
+        answers,
+        physics,
+        rollouts,
+        about.not_covered,
+    );
+    let json = serde_json::to_string_pretty(&certificate).map_err(|error| broken(&error))?;
+    let page = Page::new(&certificate)
+        .render()
+        .map_err(|error| broken(&error))?;
+    Ok((certificate.verdict.word(), json, page))
+}
+
+/// The numbers of the reference's instructions; `None` for a policy that takes none.
+fn known(reference: &Reference, controller: &Controller) -> PyResult<Vec<Option<u32>>> {
+    let checked = controller.checked();
+    let takes = checked.view().contract().instruction_channel().is_some();
+    let number = |id: &str| {
+        let found = checked.opened().instruction(id);
+        found.map_err(|error| ProofError::new_err(error.to_string()))
+    };
+    let rows = reference.instructions.iter();
+    rows.map(|row| takes.then(|| number(&row.id)).transpose())
+        .collect()
+}
+
+/// The environment alone: its states under the reference's actions.
+fn environment(reference: &Reference, replayed: &[(usize, usize, usize, Vec<f64>)]) -> Physics {
+    let mut physics = Physics::new();
+    for (instruction, episode, len, states) in replayed {
+        let row = reference.instructions.get(*instruction);
+        let recorded = row.and_then(|row| Some((row, row.episodes.get(*episode)?)));
+        let Some((row, Some(trace))) = recorded.map(|(row, it)| (row, it.trace.as_ref())) else {
+            continue;
+        };
+        physics.episodes += 1;
+        let both = states.chunks_exact((*len).max(1));
+        let place = |step: usize, what: String| Answer {
+            instruction: row.id.clone(),
+            episode: *episode,
+            step,
+            what,
+        };
+        for (step, (ours, theirs)) in both
+            .zip(trace.states.chunks_exact((*len).max(1)))
+            .enumerate()
+        {
+            physics.compare(ours, theirs, || place(step, String::new()));
+        }
+        let lens = [states.len(), trace.states.len()].map(|all| all / (*len).max(1));
+        if lens[0] != lens[1] {
+            let what = format!(
+                "the environment ended after {} states, the reference's after {}",
+                lens[0], lens[1]
+            );
+            physics
+                .first_difference
+                .get_or_insert_with(|| place(lens[0], what));
+        }
+    }
+    physics
+}
+
+/// The policy alone: its answers to what the reference was asked, with the reference's actions executed.
+fn ask(
+    controller: &mut Working,
+    contract: &Contract<'_>,
+    reference: &Reference,
+    numbers: &[Option<u32>],
+) -> PyResult<Vec<Replay>> {
+    let channels: Vec<_> = contract.observations().collect();
+    let mut replays = vec![];
+    for (index, (row, number)) in reference.instructions.iter().zip(numbers).enumerate() {
+        for (episode, recorded) in row.episodes.iter().enumerate() {
+            let Some(trace) = &recorded.trace else {
+                continue;
+            };
+            let begun = controller.with(|controller| {
+                if let Some(number) = number {
+                    return controller.set_instruction(lads_core::Instruction::Id(*number));
+                }
+                controller.reset();
+                Ok(())
+            });
+            begun.map_err(|error| refused_instruction(&error))?;
+            // A reference that says nothing about indices is a black box: only its actions can be compared.
+            let decides = !recorded.plans.is_empty();
+            let mut replay = replay(controller, contract, &channels, trace, decides);
+            (replay.instruction, replay.episode) = (index, episode);
+            replays.push(replay);
+        }
+    }
+    Ok(replays)
+}
+
+/// Replays one episode; a refusal ends it.
+fn replay(
+    controller: &mut Working,
+    contract: &Contract<'_>,
+    channels: &[Channel<'_>],
+    trace: &Trace,
+    decides: bool,
+) -> Replay {
+    let mut replay = Replay::default();
+    let seen_len: usize = channels.iter().map(Channel::len).sum();
+    let mut action = vec![0.0; contract.action_len()];
+    let observations = trace.observations.chunks_exact(seen_len);
+    for (seen, done) in observations.zip(trace.actions.chunks_exact(action.len())) {
+        let given = Given::split(channels, seen);
+        let inputs = given.inputs();
+        let answered = controller.with(|controller| {
+            let report = controller.step_with(&inputs, &mut action)?;
+            let selected = report.selected.filter(|_| decides);
+            let decided = selected.is_some_and(|selected| selected.fresh);
+            let scores = if decided { controller.scores() } else { &[] };
+            let reply = Reply {
+                decided,
+                plan: selected.map(|selected| selected.index),
+                logits: scores.to_vec(),
+                action: action.clone(),
+            };
+            controller.executed(done)?;
+            Ok(reply)
+        });
+        match answered {
+            Ok(reply) => replay.replies.push(reply),
+            Err(error) => {
+                let error: lads_core::StepError = error;
+                let why = match &error {
+                    lads_core::StepError::Input(error) => lads_host::refused(error, contract),
+                    other => other.to_string(),
+                };
+                replay.refused = Some(format!("the policy refuses: {why}"));
+                break;
+            }
+        }
+    }
+    replay
+}
+
+/// The values of all channels, which a trace holds as one row of floats.
+struct Given<'t> {
+    parts: Vec<(ChannelId, &'t [f32], Part)>,
+}
+
+enum Part {
+    F32,
+    U8(Vec<u8>),
+    I32(Vec<i32>),
+}
+
+impl<'t> Given<'t> {
+    fn split(channels: &[Channel<'_>], seen: &'t [f32]) -> Self {
+        let mut rest = seen;
+        let parts = channels.iter().map(|channel| {
+            let (own, behind) = rest.split_at(channel.len());
+            rest = behind;
+            let part = match channel.dtype() {
+                DType::F32 => Part::F32,
+                DType::U8 => Part::U8(own.iter().map(|&value| value as u8).collect()),
+                DType::I32 => Part::I32(own.iter().map(|&value| value as i32).collect()),
+            };
+            (channel.id(), own, part)
+        });
+        Self {
+            parts: parts.collect(),
+        }
+    }
+
+    fn inputs(&self) -> Vec<(ChannelId, Data<'_>)> {
+        let parts = self.parts.iter();
+        parts
+            .map(|(id, floats, part)| {
+                let data = match part {
+                    Part::F32 => Data::F32(floats),
+                    Part::U8(values) => Data::U8(values),
+                    Part::I32(values) => Data::I32(values),
+                };
+                (*id, data)
+            })
+            .collect()
+    }
+}
+
+/// Both together: the run's episodes beside the reference's.
+fn pairs(
+    reference: &Reference,
+    numbering: &Numbering,
+    run: &Reference,
+    about: &About,
+    contract: &Contract<'_>,
+) -> Paired {
+    let sub_tasks: Vec<_> = about.sub_tasks.iter().map(String::as_str).collect();
+    let ours: Vec<Vec<Episode>> = run
+        .instructions
+        .iter()
+        .map(|row| {
+            let episodes = row.episodes.iter();
+            episodes
+                .map(|episode| Episode {
+                    steps: episode.steps,
+                    success: episode.success,
+                    completions: episode
+                        .completions
+                        .iter()
+                        .filter_map(|done| {
+                            let sub_task = sub_tasks.iter().position(|it| *it == done.sub_task)?;
+                            Some(Completion {
+                                sub_task,
+                                step: done.step,
+                            })
+                        })
+                        .collect(),
+                    plans: episode.plans.clone(),
+                    final_state: episode.final_state.clone(),
+                })
+                .collect()
+        })
+        .collect();
+    let lens = [
+        contract.observations().map(|channel| channel.len()).sum(),
+        contract.action_len(),
+    ];
+    let episodes = ours.iter().zip(&about.commanded).enumerate();
+    let episodes = episodes.map(|(instruction, (episodes, commanded))| Episodes {
+        instruction,
+        commanded,
+        episodes,
+    });
+    let traces = run
+        .instructions
+        .iter()
+        .enumerate()
+        .flat_map(|(instruction, row)| {
+            let traced = row.episodes.iter().enumerate();
+            traced.filter_map(move |(episode, recorded)| {
+                let trace = recorded.trace.as_ref()?;
+                let seen = trace.observations.chunks_exact(lens[0]);
+                Some(Traced {
+                    instruction,
+                    episode,
+                    steps: seen
+                        .zip(trace.actions.chunks_exact(lens[1]))
+                        .map(|(seen, done)| [seen, done])
+                        .collect(),
+                })
+            })
+        });
+    Paired::new((reference, numbering), &sub_tasks, episodes, traces, lens)
+}

@@ -1,0 +1,312 @@
+//! Opening policies, and what can be asked of one that was opened.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use lads_compiler::{Bundle, CacheFormat, Formats, Options, WeightFormat};
+use lads_core::{Data, Isa};
+use lads_host::Opened;
+use numpy::{PyArray1, PyArrayDyn, PyArrayMethods};
+use pyo3::prelude::*;
+use pyo3::sync::PyOnceLock;
+use pyo3::types::{PyBytes, PyDict, PyTuple};
+
+use crate::arrays;
+use crate::cell::{Checked, Working};
+use crate::controller::{Controller, Settings};
+use crate::errors::{OpenError, SelfTestError, WorkspaceError, opening};
+
+/// A policy that was read and checked. It never changes and may be used by any number of threads.
+#[pyclass(frozen, module = "lads")]
+pub struct Policy {
+    path: PathBuf,
+    checked: Arc<Checked>,
+    notes: Vec<String>,
+    contract: PyOnceLock<Py<PyAny>>,
+}
+
+/// Opens a policy, a bundle (.onnx), which is compiled on the way, or a compiled image (.lads).
+///
+/// `weights` and `low_level` are 'f32', 'f16', 'bf16', 'int16' or 'int8', `cache` is 'f32' or 'f16'; what is left out is as the bundle
+/// was tuned (`lads-run tune`), and 'f32' where it was not. Fewer bits have to pass the gate: the golden episode replays with the same indices and with actions inside `tolerance` (in the action's units).
+#[pyfunction]
+#[pyo3(signature = (path, *, weights=None, low_level=None, cache=None, tolerance=None, force=false))]
+pub fn open(
+    py: Python<'_>,
+    path: PathBuf,
+    weights: Option<&str>,
+    low_level: Option<&str>,
+    cache: Option<&str>,
+    tolerance: Option<f32>,
+    force: bool,
+) -> PyResult<Policy> {
+    if tolerance.is_some_and(|tolerance| !(tolerance.is_finite() && tolerance > 0.0)) {
+        return Err(OpenError::new_err(
+            "tolerance: it has to be a positive number; give the largest difference of an action that is accepted",
+        ));
+    }
+    let weight = |what, name: Option<&str>| {
+        let found = name.map(|name| format(what, name, WeightFormat::ALL, WeightFormat::name));
+        found.transpose()
+    };
+    let caches = |name| format("cache", name, CacheFormat::ALL, CacheFormat::name);
+    let formats = Formats {
+        weights: weight("weights", weights)?,
+        low_level: weight("low_level", low_level)?,
+        cache: cache.map(caches).transpose()?,
+    };
+    let (options, opened) = py.detach(|| {
+        // What is no bundle is refused below, with what it is instead.
+        let bundle = Bundle::open(&path).ok();
+        let options = Options {
+            storage: bundle.and_then(|bundle| formats.storage(&bundle)),
+            tolerance,
+            force,
+        };
+        let opened = lads_host::open_with(&path, &options);
+        (options, opened)
+    });
+    let opened = opened.map_err(|error| opening(&error))?;
+    let asked = formats != Formats::default() || options != Options::default();
+    if asked && !opened.is_bundle() {
+        return Err(OpenError::new_err(format!(
+            "{}: it is a compiled image already; give the bundle (.onnx)",
+            path.display()
+        )));
+    }
+    Ok(Policy::of(path, opened))
+}
+
+/// Opens a policy from the bytes of its image, such as Policy.image; `path` names it in messages. This is what unpickling calls.
+#[pyfunction]
+pub fn from_image(py: Python<'_>, image: &[u8], path: PathBuf) -> PyResult<Policy> {
+    let opened = py.detach(|| lads_host::from_bytes(image));
+    let opened = opened.map_err(|error| {
+        opening(&lads_host::OpenError {
+            path: Some(path.clone()),
+            ..error
+        })
+    })?;
+    Ok(Policy::of(path, opened))
+}
+
+/// The format with this name.
+fn format<T: Copy, const N: usize>(
+    what: &str,
+    name: &str,
+    known: [T; N],
+    name_of: fn(T) -> &'static str,
+) -> PyResult<T> {
+    let found = known.into_iter().find(|&format| name_of(format) == name);
+    found.ok_or_else(|| {
+        OpenError::new_err(format!(
+            "{what} '{name}': no such format; known are {}",
+            known.map(name_of).join(", ")
+        ))
+    })
+}
+
+impl Policy {
+    /// What was read from a file, or made of it.
+    pub fn of(path: PathBuf, opened: Opened) -> Self {
+        Self {
+            path,
+            checked: Checked::of(opened),
+            notes: vec![],
+            contract: PyOnceLock::new(),
+        }
+    }
+
+    /// The same with what is worth saying about how it came to be.
+    pub fn with_notes(self, notes: Vec<String>) -> Self {
+        Self { notes, ..self }
+    }
+
+    /// What was checked.
+    pub fn checked(&self) -> &Arc<Checked> {
+        &self.checked
+    }
+
+    /// A fresh controller on the widest instructions.
+    fn working(&self) -> PyResult<Working> {
+        Working::of(&self.checked, Isa::detect())
+            .map_err(|error| WorkspaceError::new_err(error.to_string()))
+    }
+
+    fn report(&self) -> String {
+        lads_cli::inspect_json(&self.path, self.checked.opened()).to_string()
+    }
+}
+
+#[pymethods]
+impl Policy {
+    /// The file that it was read from.
+    #[getter]
+    fn path(&self) -> String {
+        self.path.display().to_string()
+    }
+
+    /// The compiled image, what `lads compile` writes: bytes.
+    #[getter]
+    fn image<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
+        PyBytes::new(py, self.checked.opened().image())
+    }
+
+    /// What the policy expects and promises, as a lads.Contract.
+    #[getter]
+    fn contract(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
+        let read = self.contract.get_or_try_init(py, || {
+            let module = py.import("lads.contract")?;
+            let read = module.call_method1("read", (self.report(),))?;
+            Ok::<_, PyErr>(read.unbind())
+        })?;
+        Ok(read.clone_ref(py))
+    }
+
+    /// What an import read and found out, a line each: tuple of str; empty for a policy that was opened.
+    #[getter]
+    fn notes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        PyTuple::new(py, &self.notes)
+    }
+
+    /// Everything that `lads inspect --json` prints: channels, schedule, programs, states, sizes in bytes.
+    fn inspect<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        py.import("json")?.call_method1("loads", (self.report(),))
+    }
+
+    /// The recorded episode that the self-test replays, as a lads.Golden; None for a policy without one.
+    #[getter]
+    fn golden<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        let view = self.checked.view();
+        let Some(golden) = view.golden() else {
+            return Ok(None);
+        };
+        let contract = view.contract();
+        let steps = golden.len();
+        let observations = PyDict::new(py);
+        for (place, channel) in contract.observations().enumerate() {
+            let mut shape = arrays::shape(&channel);
+            shape.insert(0, steps);
+            let rows: Vec<_> = golden.steps().collect();
+            let all = rows
+                .iter()
+                .filter_map(|step| step.observations().get(place));
+            let (mut floats, mut bytes, mut integers) = (vec![], vec![], vec![]);
+            for (_, data) in all {
+                match data {
+                    Data::F32(values) => floats.extend_from_slice(values),
+                    Data::U8(values) => bytes.extend_from_slice(values),
+                    Data::I32(values) => integers.extend_from_slice(values),
+                }
+            }
+            let array = match channel.dtype() {
+                lads_core::DType::F32 => shaped(py, &floats, &shape)?.into_any(),
+                lads_core::DType::U8 => shaped(py, &bytes, &shape)?.into_any(),
+                lads_core::DType::I32 => shaped(py, &integers, &shape)?.into_any(),
+            };
+            observations.set_item(channel.name(), array)?;
+        }
+        let selected: Vec<_> = golden.steps().filter_map(|step| step.selected).collect();
+        let noise: Vec<_> = golden
+            .steps()
+            .flat_map(|step| step.noise.to_vec())
+            .collect();
+        let actions: Vec<_> = golden
+            .steps()
+            .flat_map(|step| step.action.to_vec())
+            .collect();
+        let instruction = golden
+            .instruction()
+            .and_then(|id| contract.instruction(id as usize))
+            .map(|known| known.id);
+        let fields = PyDict::new(py);
+        fields.set_item("instruction", instruction)?;
+        fields.set_item("observations", observations)?;
+        fields.set_item("noise", shaped(py, &noise, &[steps, view.noise_len()])?)?;
+        let some = (!selected.is_empty()).then(|| PyArray1::from_slice(py, &selected));
+        fields.set_item("selected", some)?;
+        let len = contract.action_len();
+        fields.set_item("actions", shaped(py, &actions, &[steps, len])?)?;
+        fields.set_item("tolerance", golden.tolerance())?;
+        let class = py.import("lads.contract")?.getattr("Golden")?;
+        class.call((), Some(&fields)).map(Some)
+    }
+
+    /// Replays the golden episode on this machine and compares the indices in force and the actions -> lads.SelfTest.
+    fn self_test<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let view = self.checked.view();
+        let path = self.path.display();
+        let Some(golden) = view.golden() else {
+            return Err(SelfTestError::new_err(format!(
+                "{path}: it carries no golden episode, so nothing can be tested; export the bundle with one"
+            )));
+        };
+        let mut working = self.working()?;
+        let test = py.detach(|| working.with(|controller| controller.self_test()));
+        let test = test.map_err(|error| {
+            SelfTestError::new_err(format!(
+                "{path}: the self-test failed: {error}; do not run it on this machine; export and compile it again"
+            ))
+        })?;
+        let class = py.import("lads.contract")?.getattr("SelfTest")?;
+        class.call1((
+            test.steps,
+            f64::from(test.largest_error),
+            f64::from(golden.tolerance()),
+            format!("{:08x}", test.digest),
+        ))
+    }
+
+    /// A fresh controller with memory of its own.
+    ///
+    /// `instruction` is the id or the text of a known one, or word embeddings float32 [words, dim]; None for a policy that takes none, or to
+    /// give it later. `sample` is a seed: indices are sampled instead of following the contract's rule. `noise` is a seed:
+    /// standard normals for the noise channel instead of the contract's rule. `portable` runs on the kernels that every processor has, with
+    /// the same bits.
+    #[pyo3(signature = (instruction=None, *, sample=None, noise=None, portable=false))]
+    fn controller(
+        slf: &Bound<'_, Self>,
+        instruction: Option<Bound<'_, PyAny>>,
+        sample: Option<u64>,
+        noise: Option<u64>,
+        portable: bool,
+    ) -> PyResult<Controller> {
+        let settings = Settings {
+            sample,
+            noise,
+            portable,
+        };
+        let controller = Controller::of(slf, settings)?;
+        if let Some(instruction) = instruction {
+            controller.instruct(slf.py(), &instruction)?;
+        }
+        Ok(controller)
+    }
+
+    fn __reduce__<'py>(slf: &Bound<'py, Self>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
+        let py = slf.py();
+        let from_image = py.import("lads._lads")?.getattr("from_image")?;
+        let this = slf.get();
+        let arguments = (this.image(py), this.path()).into_pyobject(py)?;
+        Ok((from_image, arguments.into_any()))
+    }
+
+    pub fn __repr__(&self) -> String {
+        let contract = self.checked.view().contract();
+        format!(
+            "<lads.Policy '{}': {}, {}>",
+            self.path.display(),
+            contract.family(),
+            contract.environment_id()
+        )
+    }
+}
+
+/// Values as an array of this shape.
+fn shaped<'py, T: numpy::Element + Copy>(
+    py: Python<'py>,
+    values: &[T],
+    shape: &[usize],
+) -> PyResult<Bound<'py, PyArrayDyn<T>>> {
+    PyArray1::from_slice(py, values).reshape(shape)
+}

@@ -1,0 +1,45 @@
+//! Which process a controller belongs to: a copy that a fork made is refused.
+//!
+//! `lads/__init__.py` has `os.register_at_fork` call [`forked`] in every child, so that asking costs no system call. A fork that Python does
+//! not make is not seen.
+
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use pyo3::prelude::*;
+
+use crate::errors::ForkError;
+
+/// How many forks lie between the first process and this one.
+static GENERATION: AtomicU32 = AtomicU32::new(0);
+
+/// Called in the child of every fork.
+#[pyfunction]
+pub fn forked() {
+    GENERATION.fetch_add(1, Ordering::Relaxed);
+}
+
+/// The process in which something was made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Process(u32);
+
+impl Process {
+    /// This one.
+    pub fn current() -> Self {
+        Self(GENERATION.load(Ordering::Relaxed))
+    }
+
+    /// Whether it is this one.
+    pub fn is_current(self) -> bool {
+        self == Self::current()
+    }
+
+    /// Refuses what was made before a fork.
+    pub fn check(self, what: &str) -> PyResult<()> {
+        if self.is_current() {
+            return Ok(());
+        }
+        Err(ForkError::new_err(format!(
+            "the {what} was made before this process was forked, and belongs to the other one; make one here, by policy.controller(...)"
+        )))
+    }
+}

@@ -1,0 +1,31 @@
+//! Success rates and their intervals, by lads-proof.
+
+use lads_proof::metrics::{self, Outcome, Score};
+use pyo3::prelude::*;
+
+use crate::errors::ProofError;
+
+/// The Wilson score interval at 95 % of `successes` out of `trials` -> (low, high).
+#[pyfunction]
+pub fn wilson(successes: usize, trials: usize) -> PyResult<(f64, f64)> {
+    if successes > trials {
+        return Err(ProofError::new_err(format!(
+            "{successes} successes out of {trials} trials; give no more successes than trials"
+        )));
+    }
+    let interval = metrics::wilson(successes, trials);
+    Ok((interval.0, interval.1))
+}
+
+/// The score of episodes, each as (commanded sub-tasks completed, others completed, success) -> JSON: N-rate, K-rates, full success,
+/// their intervals.
+#[pyfunction]
+pub fn score(outcomes: Vec<(usize, usize, bool)>) -> PyResult<String> {
+    let outcomes = outcomes.into_iter();
+    let score = Score::of(outcomes.map(|(completed, un_instructed, success)| Outcome {
+        completed,
+        un_instructed,
+        success,
+    }));
+    serde_json::to_string(&score).map_err(|error| ProofError::new_err(error.to_string()))
+}

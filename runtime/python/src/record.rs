@@ -1,0 +1,207 @@
+//! Recordings: episodes that Python has kept, written as an MCAP file by lads-record.
+//!
+//! The file is there whole or not at all. What can fail: a policy whose observation is not one vector of floats, arrays that contradict each
+//! other, the disk.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use lads_core::{Channel, DType};
+use lads_proof::episode::{Completion, Episode};
+use lads_record::trace::{Step, Trace};
+use lads_record::{Flight, Log, Origin};
+use pyo3::prelude::*;
+
+use crate::arrays;
+use crate::errors::RecordError;
+use crate::policy::Policy;
+
+/// One episode; arrays have a row per control step.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+pub struct Recorded<'py> {
+    instruction: Option<String>,
+    words: Option<Vec<f32>>,
+    sample: Option<u64>,
+    noise: Option<u64>,
+    observations: Bound<'py, PyAny>,
+    actions: Bound<'py, PyAny>,
+    executed: Bound<'py, PyAny>,
+    plans: Vec<Option<u32>>,
+    decided: Vec<bool>,
+    margins: Vec<Option<f32>>,
+    scores: Vec<Vec<f32>>,
+    controller_ns: Vec<u64>,
+    success: bool,
+    completions: Vec<(String, usize)>,
+}
+
+/// Writes episodes to an MCAP file. `noise` is the environment's, in words; `notes` is whatever else is worth knowing.
+#[pyfunction]
+pub fn write_log(
+    py: Python<'_>,
+    policy: &Policy,
+    path: PathBuf,
+    seed: u64,
+    noise: String,
+    notes: BTreeMap<String, String>,
+    episodes: Vec<Recorded<'_>>,
+) -> PyResult<()> {
+    let contract = policy.checked().view().contract();
+    let channels: Vec<_> = contract.observations().collect();
+    let [observation] = &channels[..] else {
+        let names: Vec<_> = channels.iter().map(Channel::name).collect();
+        return Err(RecordError::new_err(format!(
+            "the policy observes `{}`; a recording holds one channel of floats",
+            names.join("`, `")
+        )));
+    };
+    if observation.dtype() != DType::F32 {
+        return Err(RecordError::new_err(format!(
+            "channel `{}` has no floats; a recording holds one channel of floats",
+            observation.name()
+        )));
+    }
+    let origin = Origin {
+        bundle_sha256: contract.bundle_sha256().to_owned(),
+        environment: contract.environment_id().to_owned(),
+        environment_version: contract.environment_version().to_owned(),
+        seed,
+        noise,
+        control_period_s: f64::from(contract.control_period_s()),
+        period: period(&episodes),
+        observation_names: names(observation),
+        action_names: names(&contract.action()),
+        notes,
+    };
+    let flights = episodes
+        .into_iter()
+        .enumerate()
+        .map(|(number, episode)| flight(policy, number as u32, episode));
+    let log = Log {
+        origin,
+        flights: flights.collect::<PyResult<_>>()?,
+    };
+    let written = py.detach(|| -> Result<(), String> {
+        let mut draft = lads_host::output::draft(&path).map_err(|error| error.to_string())?;
+        lads_record::write(&log, &mut draft).map_err(|error| error.to_string())?;
+        draft.commit().map_err(|error| error.to_string())
+    });
+    written.map_err(|error| {
+        RecordError::new_err(format!(
+            "{}: it cannot be written ({error}); name a file in an existing, writable folder",
+            path.display()
+        ))
+    })
+}
+
+/// Names of a channel's elements.
+fn names(channel: &Channel<'_>) -> Vec<String> {
+    let named = channel.elements().map(|element| element.name.to_owned());
+    let named: Vec<_> = named.collect();
+    if named.is_empty() {
+        let name = channel.name();
+        return (0..channel.len()).map(|i| format!("{name}{i}")).collect();
+    }
+    named
+}
+
+/// Control steps from one decision to the next, where there are two.
+fn period(episodes: &[Recorded<'_>]) -> Option<usize> {
+    let mut steps = episodes.iter().map(|episode| {
+        let decided = episode.decided.iter().enumerate();
+        let mut at = decided.filter_map(|(step, &decided)| decided.then_some(step));
+        Some(at.next()?.abs_diff(at.next()?))
+    });
+    steps.find_map(|period| period)
+}
+
+fn flight(policy: &Policy, number: u32, episode: Recorded<'_>) -> PyResult<Flight> {
+    let contract = policy.checked().view().contract();
+    let rows = |array: &Bound<'_, PyAny>, name, width: usize| {
+        let (shape, values) = arrays::values::<f32>(array, name, 2)?;
+        if shape[1] != width || shape[0] != episode.plans.len() {
+            return Err(RecordError::new_err(format!(
+                "episode {number}: `{name}` has {} rows of {} elements; give {} of {width}",
+                shape[0],
+                shape[1],
+                episode.plans.len()
+            )));
+        }
+        let rows: Vec<_> = values.chunks_exact(width).map(<[f32]>::to_vec).collect();
+        Ok(rows)
+    };
+    let observations = rows(
+        &episode.observations,
+        "observations",
+        contract.observation_len(),
+    )?;
+    let actions = rows(&episode.actions, "actions", contract.action_len())?;
+    let executed = rows(&episode.executed, "executed", contract.action_len())?;
+    let steps = episode.plans.len();
+    let lens = [
+        episode.decided.len(),
+        episode.margins.len(),
+        episode.scores.len(),
+        episode.controller_ns.len(),
+    ];
+    if lens.iter().any(|&len| len != steps) {
+        return Err(RecordError::new_err(format!(
+            "episode {number}: it has {steps} plans and {lens:?} decisions, margins, scores and times; give as many"
+        )));
+    }
+    let id = episode.instruction.unwrap_or_default();
+    let found = (0..)
+        .zip(contract.instructions())
+        .find(|(_, known)| known.id == id);
+    let (index, text) = found.map_or((0, String::new()), |(index, known)| {
+        (index, known.text.to_owned())
+    });
+    let decisions = episode.plans.iter().zip(&episode.decided);
+    let plans = decisions.filter_map(|(&plan, &decided)| plan.filter(|_| decided));
+    let completions = (0..).zip(&episode.completions);
+    let outcome = Episode {
+        steps,
+        success: episode.success,
+        completions: completions
+            .map(|(sub_task, &(_, step))| Completion { sub_task, step })
+            .collect(),
+        plans: plans.collect(),
+        final_state: vec![],
+    };
+    let all = observations.into_iter().zip(actions).zip(executed);
+    let steps = all
+        .enumerate()
+        .map(|(i, ((observation, action), executed))| Step {
+            observation,
+            action,
+            executed,
+            plan: episode.plans[i],
+            decided: episode.decided[i],
+            // JSON has no infinity.
+            margin: episode.margins[i].filter(|margin| margin.is_finite()),
+            scores: episode.scores[i].clone(),
+            controller_ns: episode.controller_ns[i],
+            gripper: None,
+        });
+    let steps = steps.collect();
+    Ok(Flight {
+        instruction_id: id,
+        instruction_text: text,
+        words: episode.words,
+        completed: episode
+            .completions
+            .into_iter()
+            .map(|(name, _)| name)
+            .collect(),
+        trace: Trace {
+            instruction: index,
+            episode: number,
+            sampling_seed: episode.sample,
+            noise_seed: episode.noise,
+            commanded: false,
+            outcome,
+            steps,
+        },
+    })
+}

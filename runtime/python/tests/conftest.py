@@ -1,0 +1,62 @@
+"""Policies for the tests: the shipped ones, and small random ones of other families, made once by the exporter."""
+
+import faulthandler
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lads
+
+faulthandler.enable()
+
+PROJECT = Path(__file__).parents[3]
+KINDS = ("plain", "recurrent", "stacked", "camera", "skilldiffuser")
+
+
+@pytest.fixture(scope="session")
+def bundles(tmp_path_factory):
+    """Paths of random policies by kind; each kind is made when it is first asked for."""
+    folder = tmp_path_factory.mktemp("bundles")
+
+    class Made(dict):
+        def __missing__(self, kind):
+            path = folder / f"{kind}.onnx"
+            environment = {**os.environ, "PYTHONPATH": str(PROJECT / "exporter")}
+            subprocess.run([sys.executable, "-m", "lads_exporter", "random", "--kind", kind, "-o", path], check=True, env=environment, capture_output=True)
+            self[kind] = path
+            return path
+
+    return Made()
+
+
+@pytest.fixture(scope="session")
+def kitchen():
+    """The small kitchen policy: instructions, plans, a KV cache."""
+    return lads.open(PROJECT / "models/kitchen-small.onnx")
+
+
+@pytest.fixture(scope="session")
+def plain(bundles):
+    """A memoryless policy without instructions."""
+    return lads.open(bundles["plain"])
+
+
+@pytest.fixture
+def seen(plain):
+    """An observation of `plain`, float32 [8]."""
+    return plain.golden.observations["observation"][0].copy()
+
+
+def replay(controller, golden):
+    """The actions for a golden episode's observations and noise."""
+    actions = []
+    for step in range(len(golden.actions)):
+        given = {name: values[step] for name, values in golden.observations.items()}
+        if golden.noise.shape[1]:
+            given["noise"] = golden.noise[step]
+        actions.append(controller.step(given)[0])
+    return np.stack(actions)

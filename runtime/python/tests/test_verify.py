@@ -1,0 +1,214 @@
+"""Faithful exports are EQUIVALENT to the policy in PyTorch, and every fault of an export is DIFFERENT."""
+
+import json
+import sys
+
+import gymnasium
+import numpy as np
+import onnx
+import pytest
+
+import environments
+import lads
+from conftest import PROJECT
+
+sys.path.insert(0, str(PROJECT / "exporter"))
+
+import torch  # noqa: E402
+from lads_exporter import bundle, random_policy  # noqa: E402
+from lads_exporter.kinds import KINDS  # noqa: E402
+from lads_exporter.twin import Twin  # noqa: E402
+
+# PyTorch's threads would only wait for each other.
+torch.set_num_threads(1)
+
+
+class InPyTorch:
+    """A recurrent policy as PyTorch runs it, with its states carried along."""
+
+    def __init__(self, module, limits):
+        self.module, self.limits = module, limits
+
+    def reset(self):
+        self.gru = self.lstm = None
+
+    def __call__(self, observation):
+        module = self.module
+        with torch.no_grad():
+            x = torch.tanh(module.first(module.normalizer(torch.from_numpy(observation[None]))))
+            x, self.gru = module.gru(x, self.gru)
+            x, self.lstm = module.lstm(x, self.lstm)
+            action = module.last(x)[0].numpy()
+        return np.clip(action, *self.limits)
+
+
+class InOnnxRuntime:
+    """A policy with instructions and plans in ONNX Runtime, with what it selects."""
+
+    def __init__(self, model):
+        self.twin = Twin(model)
+
+    def reset(self, instruction):
+        known = [row["id"] for row in self.twin.contract["instructions"]]
+        self.twin.set_instruction(known.index(instruction))
+
+    def __call__(self, observation):
+        action, plan = self.twin.step(observation)
+        return lads.Reply(action, plan, self.twin.logits.copy() if self.twin.fresh else None)
+
+
+def drawn(made):
+    """A policy with random weights, the same ones every time."""
+    torch.manual_seed(0)
+    return made.policy(made.sizes, 0)
+
+
+def exported(kind, tmp_path, spoil=lambda policy: None, change=lambda contract: None):
+    """A policy in PyTorch and, opened, its export; `spoil` is a fault of the networks on the way, `change` one of the contract."""
+    made = KINDS[kind]
+    policy, spoiled = drawn(made), drawn(made)
+    with torch.no_grad():
+        spoil(spoiled)
+    contract = made.contract(made.sizes, 0)
+    change(contract)
+    known = len(contract.get("instructions", []))
+    candidates = ((n % known if known else None, random_policy.channels(contract, made.sizes.steps, n)) for n in range(1, 200))
+    model = bundle.seal(made.build(spoiled, made.sizes), contract, candidates)
+    path = tmp_path / f"{kind}.onnx"
+    onnx.save(model, path)
+    return policy, lads.open(path), model
+
+
+def recurrent(tmp_path, episodes=5, **faults):
+    policy, opened, _ = exported("recurrent", tmp_path, **faults)
+    action = opened.contract.action.elements
+    limits = np.array([[element.min for element in action], [element.max for element in action]], np.float32)
+    return lads.verify(InPyTorch(policy, limits), opened.controller(), environments.Servo, episodes=episodes, traced=5, reference_name="PyTorch")
+
+
+def test_a_faithful_export_is_equivalent(tmp_path):
+    found = recurrent(tmp_path, episodes=70)
+    assert found.verdict == "EQUIVALENT", str(found)
+    data = found.data
+    assert data["policy"]["compared_steps"] == 5 * 40 and data["policy"]["largest_action_difference"] < 1e-5
+    assert data["environment"]["identical_bits"] and data["environment"]["states"] == 5 * 41
+    assert data["rollouts"]["episodes"] == 70 and data["contract"]["fields"] == ["action", "control_period_s", "observation"]
+    assert data["reference"]["weights_from"] == "PyTorch" and data["setting"]["environment"] == "Servo"
+
+
+def wrong_normalizer(policy):
+    policy.normalizer.mean += 0.05 * policy.normalizer.std
+
+
+def swapped_observations(policy):
+    policy.first.weight[:, [0, 1]] = policy.first.weight[:, [1, 0]]
+
+
+def swapped_actions(policy):
+    policy.last.weight[[0, 1]] = policy.last.weight[[1, 0]]
+    policy.last.bias[[0, 1]] = policy.last.bias[[1, 0]]
+
+
+def lost_state(policy):
+    policy.gru.weight_hh_l0.zero_()
+    policy.gru.bias_hh_l0.zero_()
+    policy.lstm.weight_hh_l0.zero_()
+
+
+def half_rate(contract):
+    contract["control_period_s"] *= 2
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        ({"spoil": wrong_normalizer}, "the policy answers otherwise in 5 of 5 replayed episodes"),
+        ({"spoil": swapped_observations}, "the policy answers otherwise in 5 of 5 replayed episodes"),
+        ({"spoil": swapped_actions}, "the policy answers otherwise in 5 of 5 replayed episodes"),
+        ({"spoil": lost_state}, "the policy answers otherwise in 5 of 5 replayed episodes"),
+        ({"change": half_rate}, "the contract differs from the reference's in control_period_s (0.04, the other 0.02)"),
+    ],
+    ids=["normalizer", "observations", "actions", "state", "rate"],
+)
+def test_a_fault_of_the_export_is_different(tmp_path, fault, reason):
+    found = recurrent(tmp_path, **fault)
+    assert found.verdict == "DIFFERENT" and any(reason in row for row in found.reasons), str(found)
+
+
+def test_a_policy_with_plans_is_compared_by_its_logits(tmp_path):
+    _, opened, model = exported("lads", tmp_path)
+    ids = [row.id for row in opened.contract.instructions[:2]]
+    verify = lambda reference: lads.verify(
+        reference,
+        opened.controller(),
+        environments.Servo,
+        instructions=ids,
+        episodes=6,
+        traced=3,
+        sub_tasks=("high", "low"),
+        completed="tasks",
+        success="is_success",
+    )
+    found = verify(InOnnxRuntime(model))
+    assert found.verdict == "INCONCLUSIVE", str(found)
+    policy = found.data["policy"]
+    assert policy["decisions"] == policy["compared_decisions"] == 2 * 3 * 10 and policy["differing_episodes"] == 0
+    assert {row["name"] for row in found.data["rollouts"]["rates"]} == {"high", "low", "full success"}
+    # What gives actions alone is compared by them.
+    whole = InOnnxRuntime(model)
+
+    class ByActions:
+        reset = whole.reset
+
+        def __call__(self, observation):
+            return whole(observation).action
+
+    found = verify(ByActions())
+    assert found.data["policy"]["decisions"] == 0 and found.data["policy"]["differing_episodes"] == 0
+    assert any("indices and their scores" in row for row in found.data["not_covered"])
+
+
+def test_too_few_episodes_are_inconclusive(tmp_path):
+    policy, opened, _ = exported("recurrent", tmp_path)
+    reference = InPyTorch(policy, (-1, np.array([0.9, 0.8, 0.7], np.float32)))
+    found = lads.verify(reference, opened.controller(), environments.Servo, episodes=5)
+    assert found.verdict == "INCONCLUSIVE" and found.data["more_episodes_per_instruction"] > 30
+
+
+def test_an_environment_that_is_not_the_same_twice(tmp_path):
+    policy, opened, _ = exported("recurrent", tmp_path)
+    reference = InPyTorch(policy, (-1, np.array([0.9, 0.8, 0.7], np.float32)))
+
+    class Unseeded(environments.Servo):
+        def reset(self, *, seed=None, options=None):
+            return super().reset(seed=None, options=options)
+
+    found = lads.verify(reference, opened.controller(), Unseeded, episodes=3)
+    assert found.verdict == "DIFFERENT" and any("the environment moves otherwise" in row for row in found.reasons)
+
+
+def test_certificates_are_written(tmp_path):
+    jsonschema = pytest.importorskip("jsonschema")
+    found = recurrent(tmp_path)
+    assert found.verdict == "INCONCLUSIVE"
+    found.write(tmp_path / "certificate.json")
+    found.write(tmp_path / "certificate.html")
+    schema = json.loads((PROJECT / "sim-harness/proof/certificate.schema.json").read_text())
+    jsonschema.validate(json.loads((tmp_path / "certificate.json").read_text()), schema)
+    page = (tmp_path / "certificate.html").read_text()
+    assert "INCONCLUSIVE" in page and "weights from PyTorch" in page and str(found).startswith("INCONCLUSIVE\n- ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "text"),
+    [
+        ({"reference": lambda seen: np.zeros(4)}, lads.errors.ProofError, r"the reference gives an action of shape \(4,\), the contract says \(3,\)"),
+        ({"episodes": 0}, lads.errors.ProofError, "0 episodes of which"),
+        ({"make_env": lambda: gymnasium.make("Pendulum-v1"), "observation": environments.fill, "action": lambda action: action[:1]}, lads.errors.EvaluationError, "says nothing about success; give success="),
+        ({"success": "won"}, lads.errors.EvaluationError, "no 'won'; give success="),
+    ],
+)
+def test_what_cannot_be_compared_is_named(plain, arguments, error, text):
+    given = {"reference": lambda seen: np.zeros(3, np.float32), "make_env": environments.Servo, "episodes": 2, **arguments}
+    with pytest.raises(error, match=text):
+        lads.verify(given.pop("reference"), plain.controller(), given.pop("make_env"), **given)

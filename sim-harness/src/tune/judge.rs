@@ -1,0 +1,299 @@
+//! Does a policy whose numbers have fewer bits still answer as with 32?
+//!
+//! What only helps to select an index must select the same one in every decision, and most decisions must be clear by more than the
+//! logits are off: the questions are a sample, and a decision that was a close call elsewhere may fall out otherwise. What is in the
+//! action must stay inside the contract's tolerance. Nothing here can fail.
+
+use std::fmt;
+
+use lads_compiler::Evidence;
+use lads_proof::answers::{Replay, Reply, largest_up_to_a_constant};
+
+/// A decision is clear if its margin is more than so many times the largest difference of a logit: two logits may be off.
+pub const MARGIN_FACTOR: f64 = 2.0;
+
+/// The share of decisions that have to be clear: of fifty, one may hang on the rounding, if it came to the worst.
+pub const CLEAR_SHARE: f64 = 0.98;
+
+/// Why a candidate is not the same policy.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Loss {
+    /// It does not compile, fails the golden episode or refuses a question.
+    Refused(String),
+    /// Decisions selected another index.
+    Selected {
+        /// How many.
+        changed: usize,
+        /// The largest margin of one of them with 32 bits.
+        margin: f64,
+    },
+    /// Every decision is the same, and too many are close calls.
+    Unclear {
+        /// The share that is clear.
+        share: f64,
+        /// Largest difference of a logit.
+        logit: f64,
+    },
+    /// An action is off.
+    Action {
+        /// By so much at most.
+        difference: f64,
+        /// What is allowed.
+        tolerance: f64,
+    },
+    /// The trajectory encoder sees other plans.
+    Encoded {
+        /// In so many segments.
+        changed: usize,
+    },
+}
+
+impl fmt::Display for Loss {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Refused(why) => f.write_str(why),
+            Self::Selected { changed, margin } => write!(
+                f,
+                "{changed} decisions fall out otherwise, one with a margin of {margin:.1e}"
+            ),
+            Self::Unclear { share, logit } => write!(
+                f,
+                "only {:.1} % of the decisions are clear by {MARGIN_FACTOR} times the logits' {logit:.1e}",
+                100.0 * share
+            ),
+            Self::Action {
+                difference,
+                tolerance,
+            } => write!(
+                f,
+                "an action is off by {difference:.1e}, allowed {tolerance:.1e}"
+            ),
+            Self::Encoded { changed } => {
+                write!(
+                    f,
+                    "the trajectory encoder sees {changed} segments otherwise"
+                )
+            }
+        }
+    }
+}
+
+/// A candidate's answers beside those with 32 bits.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Judged {
+    /// What was measured; of which file is for the caller to say.
+    pub evidence: Evidence,
+    /// Why it is not the same policy; `None` if it is.
+    pub loss: Option<Loss>,
+}
+
+impl Judged {
+    /// A candidate that was not asked at all.
+    pub fn refused(why: String) -> Self {
+        Self {
+            evidence: Evidence {
+                largest_logit_error: f64::INFINITY,
+                largest_action_error: f64::INFINITY,
+                ..Evidence::default()
+            },
+            loss: Some(Loss::Refused(why)),
+        }
+    }
+
+    /// Whether it is the same policy.
+    pub fn is_same(&self) -> bool {
+        self.loss.is_none()
+    }
+}
+
+/// Compares the answers of a candidate with those of the same policy with 32 bits; `tolerance` is that of an action's element.
+pub fn judge(exact: &[Replay], candidate: &[Replay], tolerance: f64) -> Judged {
+    let mut seen = Evidence {
+        episodes: exact.len(),
+        margin_factor: MARGIN_FACTOR,
+        action_tolerance: tolerance,
+        ..Evidence::default()
+    };
+    let mut margins = vec![];
+    let (mut changed, mut largest_changed) = (0, 0.0_f64);
+    let (mut refused, mut encoded) = (None, 0);
+    for (wanted, got) in exact.iter().zip(candidate) {
+        if let Some(why) = &got.refused {
+            refused.get_or_insert_with(|| why.clone());
+        }
+        let segments = wanted.encoded.iter().zip(&got.encoded);
+        encoded += segments
+            .flat_map(|(wanted, got)| wanted.iter().zip(got))
+            .filter(|(wanted, got)| wanted != got)
+            .count();
+        for (wanted, got) in wanted.replies.iter().zip(&got.replies) {
+            seen.steps += 1;
+            let action = largest(&wanted.action, &got.action);
+            seen.largest_action_error = seen.largest_action_error.max(action);
+            if !wanted.decided {
+                continue;
+            }
+            seen.decisions += 1;
+            let margin = margin(wanted);
+            margins.extend(margin);
+            let logits = wanted.logits.iter().zip(&got.logits);
+            let logit = largest_up_to_a_constant(
+                logits.map(|(&wanted, &got)| f64::from(got) - f64::from(wanted)),
+            );
+            seen.largest_logit_error = seen.largest_logit_error.max(logit);
+            if (wanted.plan, true) != (got.plan, got.decided) {
+                changed += 1;
+                largest_changed = largest_changed.max(margin.unwrap_or(f64::INFINITY));
+            }
+        }
+    }
+    let clear = MARGIN_FACTOR * seen.largest_logit_error;
+    let clear = margins.iter().filter(|&&margin| margin > clear).count();
+    seen.clear_share = clear as f64 / margins.len().max(1) as f64;
+    seen.smallest_margin = margins.iter().copied().reduce(f64::min);
+    let loss = if let Some(why) = refused {
+        Some(Loss::Refused(why))
+    } else if changed > 0 {
+        Some(Loss::Selected {
+            changed,
+            margin: largest_changed,
+        })
+    } else if !margins.is_empty() && seen.clear_share < CLEAR_SHARE {
+        Some(Loss::Unclear {
+            share: seen.clear_share,
+            logit: seen.largest_logit_error,
+        })
+    } else if encoded > 0 {
+        Some(Loss::Encoded { changed: encoded })
+    } else if seen.largest_action_error > tolerance {
+        Some(Loss::Action {
+            difference: seen.largest_action_error,
+            tolerance,
+        })
+    } else {
+        None
+    };
+    Judged {
+        evidence: seen,
+        loss,
+    }
+}
+
+/// By how much the best logit leads the second one; `None` of a decision without two.
+fn margin(reply: &Reply) -> Option<f64> {
+    let mut best = [f64::NEG_INFINITY; 2];
+    for &logit in &reply.logits {
+        let logit = f64::from(logit);
+        if logit > best[0] {
+            best = [logit, best[0]];
+        } else {
+            best[1] = best[1].max(logit);
+        }
+    }
+    best[1].is_finite().then(|| best[0] - best[1])
+}
+
+/// The largest difference of an element; infinite where one is no number.
+fn largest(wanted: &[f32], got: &[f32]) -> f64 {
+    wanted.iter().zip(got).fold(0.0, |largest, (a, b)| {
+        let difference = f64::from((a - b).abs());
+        if difference.is_nan() {
+            f64::INFINITY
+        } else {
+            largest.max(difference)
+        }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn reply(plan: u32, logits: &[f32], action: f32) -> Reply {
+        Reply {
+            decided: !logits.is_empty(),
+            plan: Some(plan),
+            logits: logits.to_vec(),
+            action: vec![action],
+        }
+    }
+
+    fn replay(replies: Vec<Reply>) -> Vec<Replay> {
+        vec![Replay {
+            replies,
+            ..Replay::default()
+        }]
+    }
+
+    fn exact() -> Vec<Replay> {
+        replay(vec![
+            reply(1, &[0.0, 2.0, 1.0], 0.5),
+            reply(1, &[], 0.5),
+            reply(2, &[0.0, 0.0, 0.5], 0.25),
+        ])
+    }
+
+    fn altered(change: impl Fn(&mut Vec<Reply>)) -> Judged {
+        let mut other = exact();
+        change(&mut other[0].replies);
+        judge(&exact(), &other, 1e-3)
+    }
+
+    #[test]
+    fn itself_is_the_same() {
+        let judged = altered(|_| {});
+        assert!(judged.is_same());
+        let seen = judged.evidence;
+        assert_eq!((seen.episodes, seen.steps, seen.decisions), (1, 3, 2));
+        assert_eq!(seen.smallest_margin, Some(0.5));
+        assert_eq!((seen.clear_share, seen.largest_logit_error), (1.0, 0.0));
+    }
+
+    #[test]
+    fn a_constant_on_all_logits_is_no_difference() {
+        let judged = altered(|replies| replies[0].logits = vec![3.0, 5.0, 4.0]);
+        assert!(judged.is_same());
+        assert!(judged.evidence.largest_logit_error < 1e-12);
+    }
+
+    #[test]
+    fn another_index_is_a_loss_with_its_margin() {
+        let judged = altered(|replies| replies[2].plan = Some(0));
+        let wanted = Loss::Selected {
+            changed: 1,
+            margin: 0.5,
+        };
+        assert_eq!(judged.loss, Some(wanted));
+    }
+
+    #[test]
+    fn close_calls_are_a_loss() {
+        // Off by 0.3: a margin of 0.5 is within twice that, one of 1 is not.
+        let judged = altered(|replies| replies[0].logits = vec![-0.3, 2.3, 1.0]);
+        let Some(Loss::Unclear { share, logit }) = judged.loss else {
+            panic!("{judged:?}");
+        };
+        assert!((share - 0.5).abs() < 1e-9 && (logit - 0.3).abs() < 1e-6);
+    }
+
+    #[test]
+    fn actions_keep_the_tolerance() {
+        assert!(altered(|replies| replies[1].action = vec![0.5005]).is_same());
+        for off in [0.502, f32::NAN] {
+            let judged = altered(|replies| replies[1].action = vec![off]);
+            assert!(matches!(judged.loss, Some(Loss::Action { .. })), "{off}");
+        }
+    }
+
+    #[test]
+    fn what_the_trajectory_encoder_sees_counts() {
+        let with = |plans: &[u32]| {
+            let mut replays = exact();
+            replays[0].encoded = Some(plans.to_vec());
+            replays
+        };
+        assert!(judge(&with(&[1, 2]), &with(&[1, 2]), 1e-3).is_same());
+        let judged = judge(&with(&[1, 2]), &with(&[1, 3]), 1e-3);
+        assert_eq!(judged.loss, Some(Loss::Encoded { changed: 1 }));
+    }
+}

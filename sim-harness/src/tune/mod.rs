@@ -1,0 +1,142 @@
+//! The smallest image that keeps every plan: formats for weights and caches, chosen by what a policy answers with them.
+//!
+//! The policy answers the recorded questions of a reference (open loop, as in [`verify::policy`](crate::verify::policy)) once with 32 bits
+//! and once with each candidate's; [`judge`] compares the two, [`search`] tries candidates from the smallest up. The golden episode alone
+//! is no evidence: a policy may replay it with the same bits and decide otherwise elsewhere. What can fail: a bundle that does not compile
+//! even with 32 bits, memory; it can be told to stop.
+
+mod groups;
+pub mod judge;
+pub mod search;
+
+use std::sync::atomic::AtomicBool;
+
+use lads_compiler::{Bundle, CompileError, Image, Options, Storage};
+use lads_core::{Isa, Policy};
+use lads_proof::answers::{ACTION_TOLERANCE, Replay};
+use lads_proof::reference::Reference;
+
+use crate::evaluate::{Assignment, EvaluationError};
+use crate::verify::policy;
+use groups::Groups;
+use judge::{Judged, judge};
+use search::{Found, Parts, search};
+
+/// Why a bundle cannot be tuned.
+#[derive(Debug, thiserror::Error)]
+pub enum TuneError {
+    /// It does not compile with 32 bits.
+    #[error(transparent)]
+    Compile(#[from] CompileError),
+    /// The questions cannot be asked, or an interrupt came.
+    #[error(transparent)]
+    Asking(#[from] EvaluationError),
+    /// The policy with 32 bits refuses a question: the reference is of something else.
+    #[error(
+        "with 32 bits the policy refuses a step of the reference: {0}; make the reference again"
+    )]
+    Refused(String),
+}
+
+/// What is asked, and of whom.
+#[derive(Debug, Clone, Copy)]
+pub struct Tuning<'t> {
+    /// The bundle.
+    pub bundle: &'t Bundle,
+    /// The questions: its traced episodes.
+    pub reference: &'t Reference,
+    /// The instructions whose episodes are asked about.
+    pub assignments: &'t [Assignment],
+    /// The instructions that the kernels run on; the answers have the same bits on all.
+    pub isa: Isa,
+}
+
+/// What came of it.
+#[derive(Debug)]
+pub struct Tuned {
+    /// The smallest formats that keep every plan, and what was seen with them.
+    pub found: Found,
+    /// What the image has with 32 bits, and with those.
+    pub images: [Image; 2],
+}
+
+impl Tuning<'_> {
+    /// Looks for the smallest formats. `tried` is told of each candidate before it is asked.
+    pub fn run(
+        &self,
+        stop: &AtomicBool,
+        tried: &mut dyn FnMut(&Storage),
+    ) -> Result<Tuned, TuneError> {
+        let exact = self.compile(&Storage::default())?;
+        let wanted = self.ask(&exact, stop)?;
+        if let Some(why) = wanted.iter().find_map(|replay| replay.refused.clone()) {
+            return Err(TuneError::Refused(why));
+        }
+        let tolerance = f64::from(self.bundle.golden().tolerance).min(ACTION_TOLERANCE);
+        let found = search(&self.parts(&exact)?, &mut |storage| {
+            tried(storage);
+            match self.compile(storage) {
+                Ok(image) => Ok(judge(&wanted, &self.ask(&image, stop)?, tolerance)),
+                Err(CompileError::Gate { error, .. }) => Ok(Judged::refused(format!(
+                    "the golden episode does not replay: {error}"
+                ))),
+                Err(error) => Ok(Judged::refused(error.to_string())),
+            }
+        });
+        let found: Found = found.map_err(TuneError::Asking)?;
+        let image = self.compile(&found.storage)?;
+        Ok(Tuned {
+            found,
+            images: [exact, image],
+        })
+    }
+
+    /// What may be stored otherwise. Entries that read the same weights, as those do that read one token each of one network, are one
+    /// part: stored in two formats, the weights would be there twice.
+    fn parts(&self, exact: &Image) -> Result<Parts, CompileError> {
+        let smallest = Options {
+            storage: Some(Storage::of_weights(search::WEIGHTS[0])),
+            force: true,
+            ..Options::default()
+        };
+        // Layers that keep their bits whatever is asked for are no candidates.
+        let smallest = lads_compiler::compile_with(self.bundle, &smallest)?;
+        let mut groups = Groups::default();
+        let programs = exact.report().programs.iter();
+        for (program, small) in programs.zip(&smallest.report().programs) {
+            for (layer, small) in program.layers.iter().zip(&small.layers) {
+                if layer.format != small.format {
+                    groups.add(&program.entry, layer);
+                }
+            }
+        }
+        Ok(Parts {
+            groups: groups.sorted(),
+            has_cache: exact.report().cache_len > 0,
+        })
+    }
+
+    fn compile(&self, storage: &Storage) -> Result<Image, CompileError> {
+        let options = Options {
+            storage: Some(storage.clone()),
+            ..Options::default()
+        };
+        lads_compiler::compile_with(self.bundle, &options)
+    }
+
+    fn ask(&self, image: &Image, stop: &AtomicBool) -> Result<Vec<Replay>, EvaluationError> {
+        let policy = Policy::new_checked(image.as_bytes());
+        let policy =
+            policy.unwrap_or_else(|error| unreachable!("the compiler checked it: {error}"));
+        let traced = self.reference.traced_episodes;
+        policy::ask(
+            &policy,
+            self.isa,
+            self.reference,
+            self.assignments,
+            traced,
+            stop,
+            &|| {},
+        )
+    }
+}

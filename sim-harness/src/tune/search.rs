@@ -1,0 +1,263 @@
+//! Candidates from the smallest up: group by group of entries, the largest first, then layer by layer, then the caches.
+//!
+//! Every candidate is asked with what was accepted before it in place, so that the last one that was accepted is the result, as it was
+//! seen. The same parts and the same answers give the same result. What can fail: the trial itself.
+
+use std::collections::BTreeSet;
+
+use lads_compiler::{CacheFormat, Storage, WeightFormat};
+
+use super::judge::Judged;
+
+/// Formats of weights with fewer bits than 32, the smallest first; of two of one size the faster first.
+pub(super) const WEIGHTS: [WeightFormat; 3] =
+    [WeightFormat::Int8, WeightFormat::Int16, WeightFormat::F16];
+
+/// Entry graphs that read the same weights.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Group {
+    /// Their names.
+    pub entries: BTreeSet<String>,
+    /// Their layers.
+    pub layers: Vec<Layer>,
+}
+
+/// A matrix, and the ONNX nodes that read it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Layer {
+    /// Names of the nodes.
+    pub nodes: BTreeSet<String>,
+    /// Number of weights.
+    pub weights: usize,
+}
+
+impl Group {
+    /// Number of weights.
+    pub fn weights(&self) -> usize {
+        self.layers.iter().map(|layer| layer.weights).sum()
+    }
+
+    /// The names of its entries.
+    pub fn name(&self) -> String {
+        let names: Vec<_> = self.entries.iter().map(String::as_str).collect();
+        names.join(", ")
+    }
+}
+
+/// What of an image may be stored otherwise.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Parts {
+    /// The groups, the largest first.
+    pub groups: Vec<Group>,
+    /// Whether there are KV caches or rings.
+    pub has_cache: bool,
+}
+
+/// What was decided about a part.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Choice {
+    /// Names of the entry graphs, or `cache`.
+    pub part: String,
+    /// The formats in it.
+    pub stored: String,
+    /// Smaller ones that are not the same policy, each with the reason.
+    pub refused: Vec<(String, String)>,
+}
+
+/// The end of a search.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Found {
+    /// The smallest formats that keep every plan.
+    pub storage: Storage,
+    /// What was seen with them.
+    pub judged: Judged,
+    /// Part by part.
+    pub choices: Vec<Choice>,
+}
+
+/// Looks for the smallest formats; `trial` asks one candidate.
+pub fn search<E>(
+    parts: &Parts,
+    trial: &mut dyn FnMut(&Storage) -> Result<Judged, E>,
+) -> Result<Found, E> {
+    let mut found = Found {
+        judged: trial(&Storage::default())?,
+        storage: Storage::default(),
+        choices: vec![],
+    };
+    for group in &parts.groups {
+        let mut refused = vec![];
+        let mut accepted = WeightFormat::F32;
+        for format in WEIGHTS {
+            let candidate = with(&found.storage, &group.entries, format);
+            let judged = trial(&candidate)?;
+            if let Some(loss) = &judged.loss {
+                refused.push((format.name().to_owned(), loss.to_string()));
+                continue;
+            }
+            accepted = format;
+            found.storage = candidate;
+            found.judged = judged;
+            break;
+        }
+        let mut stored = accepted.name().to_owned();
+        if accepted != WEIGHTS[0] {
+            let smaller = layers(group, &mut found, trial)?;
+            if smaller > 0 {
+                let format = WEIGHTS[0].name();
+                stored = format!(
+                    "{stored}, {smaller} of {} layers {format}",
+                    group.layers.len()
+                );
+            }
+        }
+        found.choices.push(Choice {
+            part: group.name(),
+            stored,
+            refused,
+        });
+    }
+    if parts.has_cache {
+        let candidate = found.storage.clone().with_cache(CacheFormat::F16);
+        let judged = trial(&candidate)?;
+        let (mut stored, mut refused) = (CacheFormat::F32, vec![]);
+        if let Some(loss) = &judged.loss {
+            refused.push((CacheFormat::F16.name().to_owned(), loss.to_string()));
+        } else {
+            stored = CacheFormat::F16;
+            found.storage = candidate;
+            found.judged = judged;
+        }
+        found.choices.push(Choice {
+            part: "cache".to_owned(),
+            stored: stored.name().to_owned(),
+            refused,
+        });
+    }
+    Ok(found)
+}
+
+/// The same with another format of these parts.
+fn with(storage: &Storage, parts: &BTreeSet<String>, format: WeightFormat) -> Storage {
+    let storage = storage.clone();
+    parts
+        .iter()
+        .fold(storage, |storage, part| storage.with_part(part, format))
+}
+
+/// Gives single layers of a group the smallest format, the one that moves the answers least for its size first; the number of those.
+fn layers<E>(
+    group: &Group,
+    found: &mut Found,
+    trial: &mut dyn FnMut(&Storage) -> Result<Judged, E>,
+) -> Result<usize, E> {
+    if group.layers.len() < 2 {
+        return Ok(0);
+    }
+    let mut alone = vec![];
+    for layer in &group.layers {
+        let judged = trial(&with(&found.storage, &layer.nodes, WEIGHTS[0]))?;
+        if judged.is_same() {
+            let seen = judged.evidence;
+            let moved = seen.largest_logit_error.max(seen.largest_action_error);
+            alone.push((layer, moved / layer.weights.max(1) as f64));
+        }
+    }
+    alone.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let mut taken = 0;
+    for (layer, _) in alone {
+        let candidate = with(&found.storage, &layer.nodes, WEIGHTS[0]);
+        let judged = trial(&candidate)?;
+        if judged.is_same() {
+            found.storage = candidate;
+            found.judged = judged;
+            taken += 1;
+        }
+    }
+    Ok(taken)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::convert::Infallible;
+
+    use super::super::judge::Loss;
+    use super::*;
+
+    fn parts() -> Parts {
+        let group = |entries: &[&str], layers: &[&[&str]]| Group {
+            entries: entries.iter().map(|&name| name.to_owned()).collect(),
+            layers: layers
+                .iter()
+                .map(|nodes| Layer {
+                    nodes: nodes.iter().map(|&name| name.to_owned()).collect(),
+                    weights: 10,
+                })
+                .collect(),
+        };
+        Parts {
+            groups: vec![
+                group(&["choose", "hear"], &[&["a", "e"], &["b"], &["c"]]),
+                group(&["act"], &[&["d"]]),
+            ],
+            has_cache: true,
+        }
+    }
+
+    /// A policy that is the same while `is_same` says so.
+    fn searched(is_same: impl Fn(&Storage) -> bool) -> (Found, usize) {
+        let mut trials = 0;
+        let found = search(&parts(), &mut |storage| {
+            trials += 1;
+            let loss = Loss::Encoded { changed: 1 };
+            Ok::<_, Infallible>(Judged {
+                loss: (!is_same(storage)).then_some(loss),
+                ..Judged::default()
+            })
+        });
+        (found.unwrap_or_else(|never| match never {}), trials)
+    }
+
+    #[test]
+    fn what_may_be_small_is() {
+        let (found, trials) = searched(|_| true);
+        let all = Storage::default()
+            .with_part("choose", WeightFormat::Int8)
+            .with_part("hear", WeightFormat::Int8)
+            .with_part("act", WeightFormat::Int8)
+            .with_cache(CacheFormat::F16);
+        assert_eq!(found.storage, all);
+        assert_eq!(trials, 4);
+        let stored: Vec<_> = found.choices.iter().map(|choice| &*choice.stored).collect();
+        assert_eq!(stored, ["int8", "int8", "f16"]);
+    }
+
+    #[test]
+    fn the_layer_that_is_the_reason_keeps_its_bits() {
+        let int8 = |storage: &Storage, node| storage.of("choose", node) == WeightFormat::Int8;
+        let (found, _) =
+            searched(|storage| !int8(storage, "b") && storage.of("act", "d") == WeightFormat::F32);
+        let wanted = Storage::default()
+            .with_part("choose", WeightFormat::Int16)
+            .with_part("hear", WeightFormat::Int16)
+            .with_part("e", WeightFormat::Int8)
+            .with_part("a", WeightFormat::Int8)
+            .with_part("c", WeightFormat::Int8)
+            .with_cache(CacheFormat::F16);
+        assert_eq!(found.storage, wanted);
+        assert_eq!(found.choices[0].stored, "int16, 2 of 3 layers int8");
+        assert_eq!(found.choices[1].stored, "f32");
+        let refused: Vec<_> = found.choices[1]
+            .refused
+            .iter()
+            .map(|(name, _)| &**name)
+            .collect();
+        assert_eq!(refused, ["int8", "int16", "f16"]);
+    }
+
+    #[test]
+    fn what_must_not_change_does_not() {
+        let (found, _) = searched(Storage::is_exact);
+        assert!(found.storage.is_exact() && found.judged.is_same());
+    }
+}
