@@ -203,7 +203,7 @@ fn sweep<S: Simd, W: Integer, const P: usize, const R: usize>(
     let x = rows.each_ref().map(|row| row.pairs.as_chunks::<PAIRS>().0);
     let mut sums = [[simd.splat(0.0); P]; R];
     for (l, w) in w
-        .chunks_exact(PAIRS * blocks)
+        .chunks_exact((PAIRS * blocks).max(1))
         .take(PART / 2 / PAIRS)
         .enumerate()
     {
@@ -259,7 +259,7 @@ pub(crate) fn by_pairs<'w, S: Simd, W: Integer + 'w, const P: usize, const R: us
         for (chain, integers) in integers.iter_mut().take(S::CHAINS).enumerate() {
             let pair = round * S::CHAINS + chain;
             // SAFETY: `pair` is below `PAIRS`, which is how many a group has: rounds times chains are no more.
-            let x = x.map(|x| simd.splat_pair(unsafe { *x.get_unchecked(pair) }));
+            let x = x.map(|x| simd.splat_pair(unsafe { x.get_unchecked(pair) }));
             for p in 0..P {
                 let w = W::load(simd, w(pair, p));
                 for (integers, &x) in integers.iter_mut().zip(&x) {

@@ -52,7 +52,7 @@ pub(crate) trait Simd: Copy {
     /// Sixteen brain floats, [`stored::from_bf16`].
     fn load_bf16(self, from: &[u16; LANES]) -> Self::V;
     /// The same two integers in every lane.
-    fn splat_pair(self, pair: [i16; 2]) -> Self::Pairs;
+    fn splat_pair(self, pair: &[i16; 2]) -> Self::Pairs;
     /// Sixteen pairs of memory.
     fn load_i16(self, from: &[i16; 2 * LANES]) -> Self::Pairs;
     /// Sixteen pairs of memory, widened from 8-bit integers.
@@ -211,9 +211,9 @@ impl Simd for Portable {
     }
 
     #[inline(always)]
-    fn splat_pair(self, pair: [i16; 2]) -> Self::Pairs {
+    fn splat_pair(self, pair: &[i16; 2]) -> Self::Pairs {
         let mut pairs = [0; 2 * LANES];
-        pairs.as_chunks_mut().0.fill(pair);
+        pairs.as_chunks_mut().0.fill(*pair);
         pairs
     }
 

@@ -15,9 +15,8 @@ use core::arch::aarch64::{
     vdupq_n_s32, vget_high_s8, vget_high_s16, vget_high_u16, vget_low_s8, vget_low_s16,
     vget_low_u16, vld1q_f32, vld1q_s8, vld1q_s16, vld1q_u16, vmaxq_s32, vmaxvq_s32, vmlal_s16,
     vmovl_s8, vmovl_u16, vmovn_s16, vmovn_s32, vmulq_f32, vpaddq_s32, vreinterpretq_f32_u32,
-    vreinterpretq_s8_s16, vreinterpretq_s16_s8, vreinterpretq_s16_s32, vreinterpretq_s32_f32,
-    vrshrn_n_s16, vshlq_n_s8, vshlq_n_s32, vshlq_n_u32, vshrq_n_s8, vst1q_f32, vst1q_s16,
-    vst1q_u16, vzip1q_s16, vzip2q_s16,
+    vreinterpretq_s8_s16, vreinterpretq_s16_s8, vreinterpretq_s32_f32, vrshrn_n_s16, vshlq_n_s8,
+    vshlq_n_s32, vshlq_n_u32, vshrq_n_s8, vst1q_f32, vst1q_s16, vst1q_u16, vzip1q_s16, vzip2q_s16,
 };
 use core::arch::asm;
 
@@ -153,10 +152,19 @@ impl<const DOT: bool> Simd for Neon<DOT> {
     }
 
     #[inline(always)]
-    fn splat_pair(self, [low, high]: [i16; 2]) -> Self::Pairs {
-        let joined = i32::from(low.cast_unsigned()) | i32::from(high) << 16;
-        // SAFETY: NEON is part of the target.
-        [unsafe { vreinterpretq_s16_s32(vdupq_n_s32(joined)) }; 4]
+    fn splat_pair(self, pair: &[i16; 2]) -> Self::Pairs {
+        let pairs: int16x8_t;
+        // By name, because compilers load both integers apart and put them together again.
+        // SAFETY: NEON is part of the target; four bytes are read, which a pair is, wherever they lie.
+        unsafe {
+            asm!(
+                "ld1r {{{pairs:v}.4s}}, [{pair}]",
+                pairs = lateout(vreg) pairs,
+                pair = in(reg) pair,
+                options(pure, readonly, nostack, preserves_flags),
+            );
+        }
+        [pairs; 4]
     }
 
     #[inline(always)]
