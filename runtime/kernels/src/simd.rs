@@ -52,6 +52,10 @@ pub(crate) trait Simd: Copy {
     /// Sixteen brain floats, [`stored::from_bf16`].
     fn load_bf16(self, from: &[u16; LANES]) -> Self::V;
     /// The same two integers in every lane.
+    #[expect(
+        clippy::trivially_copy_pass_by_ref,
+        reason = "where it lies, it can be read into every lane at once"
+    )]
     fn splat_pair(self, pair: &[i16; 2]) -> Self::Pairs;
     /// Sixteen pairs of memory.
     fn load_i16(self, from: &[i16; 2 * LANES]) -> Self::Pairs;
