@@ -1,5 +1,5 @@
-//! The self-test of the small kitchen policy on aarch64 and Cortex-M under qemu, where tools and targets are there; what is missing is
-//! named.
+//! The self-test of the small kitchen policy on aarch64 and Cortex-M under qemu, and the kernels' own tests on aarch64, where tools and
+//! targets are there; what is missing is named.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -44,4 +44,19 @@ fn other_targets_give_the_same_bits() {
         let said = format!("self-test passed, actions {:08x}", passed.digest);
         assert!(text.contains(&said), "{said}: {text}");
     }
+}
+
+#[test]
+fn kernels_equal_their_twins_on_aarch64() {
+    let output = Command::new(project_path("runtime/kernels/targets.sh"))
+        .output()
+        .expect("the script runs");
+    let text = String::from_utf8_lossy(&output.stdout);
+    println!("{text}");
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{text}{errors}");
+    assert!(
+        text.contains("skipped: ") || text.matches("test result: ok").count() == 10,
+        "{text}"
+    );
 }

@@ -28,7 +28,7 @@ pub struct Request {
     #[arg(long, value_name = "FILE")]
     emit_rust: Option<PathBuf>,
     /// How the weights are stored: auto, as the bundle was tuned (`lads-run tune`), and f32 where it was not; f32; int16 or
-    /// int8, with which the inputs of a layer are rounded too, and which are faster than f32 on x86-64; f16 or bf16, which are
+    /// int8, with which the inputs of a layer are rounded too, and which are faster than f32 on x86-64 and aarch64; f16 or bf16, which are
     /// decoded. Fewer bits than 32 have to pass a gate: the golden episode replays with the same plans, and with actions inside
     /// the tolerance
     #[arg(long, value_name = "FORMAT", default_value = "auto", value_parser = auto_or(weight_format))]

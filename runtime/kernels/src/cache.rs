@@ -192,7 +192,7 @@ impl Append<'_> {
         }
         for (row, x) in (self.first..).zip(self.k.chunks(self.k_stride.max(1))) {
             let block_of_keys = keys
-                .chunks_exact_mut(width.saturating_mul(LANES))
+                .chunks_exact_mut(width.saturating_mul(LANES).max(1))
                 .nth(row / LANES);
             let (lines, _) = block_of_keys.unwrap_or(&mut []).as_chunks_mut::<LANES>();
             for (lines, x) in lines.chunks_mut(LANES).zip(x.chunks(LANES)) {

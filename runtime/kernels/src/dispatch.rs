@@ -3,6 +3,8 @@
 //! ```text
 //! Isa::run(kernel):  AVX-512 → avx512(kernel)    the same inlined `Kernel::run`, with the vectors of `simd`
 //!                    AVX2    → avx2(kernel)
+//!                    dot product of bytes → dot(kernel)
+//!                    NEON    → kernel.run(Plain)
 //!                    else    → kernel.run(Portable)
 //! ```
 //!
@@ -35,6 +37,12 @@ enum Level {
     /// AVX-512 F, BW, DQ, VL and VNNI, and the above: Cascade Lake, Zen 4 and later.
     #[cfg(target_arch = "x86_64")]
     Avx512,
+    /// NEON, which the target has in any case, by name.
+    #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+    Neon,
+    /// NEON with the dot product of bytes: Cortex-A55, A75 and later.
+    #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+    Dot,
 }
 
 impl Isa {
@@ -47,7 +55,12 @@ impl Isa {
     pub fn detect() -> Self {
         #[cfg(target_arch = "x86_64")]
         return Self(x86_64::widest());
-        #[cfg(not(target_arch = "x86_64"))]
+        #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+        return Self(aarch64::widest());
+        #[cfg(not(any(
+            target_arch = "x86_64",
+            all(target_arch = "aarch64", target_feature = "neon")
+        )))]
         return Self::portable();
     }
 
@@ -60,13 +73,17 @@ impl Isa {
             Level::Avx2,
             #[cfg(target_arch = "x86_64")]
             Level::Avx512,
+            #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+            Level::Neon,
+            #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+            Level::Dot,
         ]
         .into_iter()
         .map(Self)
         .filter(move |isa| *isa <= widest)
     }
 
-    /// Its name: `portable`, `avx2` or `avx512`.
+    /// Its name: `portable`; on x86-64 also `avx2` and `avx512`, on aarch64 `neon` and `dotprod`.
     pub const fn name(self) -> &'static str {
         match self.0 {
             Level::Portable => "portable",
@@ -74,6 +91,10 @@ impl Isa {
             Level::Avx2 => "avx2",
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => "avx512",
+            #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+            Level::Neon => "neon",
+            #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+            Level::Dot => "dotprod",
         }
     }
 
@@ -90,6 +111,11 @@ impl Isa {
             // SAFETY: `Isa`'s constructors make this level only where `x86_64::widest` found AVX2, F16C and all five
             // parts of AVX-512 in CPU and operating system.
             Level::Avx512 => unsafe { x86_64::avx512(kernel) },
+            #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+            Level::Neon => kernel.run(crate::simd::aarch64::Plain::new()),
+            #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+            // SAFETY: `Isa`'s constructors make this level only where `aarch64::widest` found the dot product.
+            Level::Dot => unsafe { aarch64::dot(kernel) },
         }
     }
 }
@@ -105,7 +131,7 @@ pub(crate) trait Kernel {
     /// Whether AVX-512 runs it on half as wide vectors: where conversions take the time, which wide ones do not shorten.
     #[cfg_attr(
         not(target_arch = "x86_64"),
-        expect(dead_code, reason = "only AVX-512 asks")
+        allow(dead_code, reason = "only AVX-512 asks")
     )]
     const NARROW: bool = false;
 
@@ -174,6 +200,47 @@ mod x86_64 {
     }
 }
 
+#[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+mod aarch64 {
+    use super::{Kernel, Level};
+    use crate::simd::aarch64::Dot;
+
+    /// # Safety
+    /// The CPU has FEAT_DotProd.
+    #[target_feature(enable = "dotprod")]
+    pub unsafe fn dot(kernel: impl Kernel) {
+        // SAFETY: the caller's promise is this constructor's.
+        kernel.run(unsafe { Dot::new() });
+    }
+
+    pub fn widest() -> Level {
+        if has_dot_product() {
+            Level::Dot
+        } else {
+            Level::Neon
+        }
+    }
+
+    /// What the operating system says. The CPU's own registers are for the operating system alone, so elsewhere the build has to say it
+    /// (`-C target-feature=+dotprod`, as Apple's targets do).
+    fn has_dot_product() -> bool {
+        #[cfg(any(target_os = "linux", target_os = "android"))]
+        let said = {
+            use core::ffi::c_ulong;
+            // In every C library of Linux, which programs with Rust's standard library and those in C have.
+            unsafe extern "C" {
+                safe fn getauxval(kind: c_ulong) -> c_ulong;
+            }
+            const AT_HWCAP: c_ulong = 16;
+            const HWCAP_ASIMDDP: c_ulong = 1 << 20;
+            getauxval(AT_HWCAP) & HWCAP_ASIMDDP != 0
+        };
+        #[cfg(not(any(target_os = "linux", target_os = "android")))]
+        let said = false;
+        said || cfg!(target_feature = "dotprod")
+    }
+}
+
 #[cfg(test)]
 mod tests {
     extern crate std;
@@ -204,6 +271,15 @@ mod tests {
             (true, _) => "avx2",
             _ => "portable",
         };
+        assert_eq!(Isa::detect().name(), expected);
+    }
+
+    /// The standard library's detection is another implementation of the same question.
+    #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+    #[test]
+    fn detection_agrees_with_the_standard_library() {
+        let dot = std::arch::is_aarch64_feature_detected!("dotprod");
+        let expected = if dot { "dotprod" } else { "neon" };
         assert_eq!(Isa::detect().name(), expected);
     }
 }

@@ -28,7 +28,7 @@ use crate::simd::{Portable, Simd, prefetch_ahead};
 pub(crate) const PART: usize = 256;
 
 /// Pairs of inputs whose products are added before they become floats: `2 * PAIRS * 16383 * 8191 < 2^31`.
-const PAIRS: usize = 8;
+pub(crate) const PAIRS: usize = 8;
 
 /// Largest magnitude of an input as an integer.
 const LARGEST: f32 = 8191.0;
@@ -36,10 +36,26 @@ const LARGEST: f32 = 8191.0;
 /// Two inputs.
 type Pair = [i16; 2];
 
+/// Inputs whose products are added before they become floats.
+pub(crate) type Group = [Pair; PAIRS];
+
 /// How integer weights are stored.
 pub(crate) trait Integer: Copy {
     /// Two weights of each of sixteen outputs, as 16-bit integers.
     fn load<S: Simd>(simd: S, from: &[Self; 2 * LANES]) -> S::Pairs;
+
+    /// The sums of a group of inputs, as [`Simd::group_of_bytes`].
+    #[inline(always)]
+    fn group<'w, S: Simd, const P: usize, const R: usize>(
+        simd: S,
+        w: impl Fn(usize, usize) -> &'w [Self; 2 * LANES],
+        x: [&Group; R],
+    ) -> [[S::V; P]; R]
+    where
+        Self: 'w,
+    {
+        by_pairs(simd, w, x)
+    }
 }
 
 impl Integer for i16 {
@@ -53,6 +69,15 @@ impl Integer for i8 {
     #[inline(always)]
     fn load<S: Simd>(simd: S, from: &[Self; 2 * LANES]) -> S::Pairs {
         simd.load_i8(from)
+    }
+
+    #[inline(always)]
+    fn group<'w, S: Simd, const P: usize, const R: usize>(
+        simd: S,
+        w: impl Fn(usize, usize) -> &'w [Self; 2 * LANES],
+        x: [&Group; R],
+    ) -> [[S::V; P]; R] {
+        simd.group_of_bytes(w, x)
     }
 }
 
@@ -162,10 +187,6 @@ fn one_row<W: Integer>(
 /// Adds the sums of parts `i` of `R` rows with `P` blocks, from block `at` on, of a panel of `blocks`; returns `P`.
 #[inline(always)]
 #[expect(
-    clippy::indexing_slicing,
-    reason = "arrays whose length is a constant, as is every index"
-)]
-#[expect(
     unsafe_code,
     reason = "the sums stay in registers only without a branch in the loop, and compilers keep some of the bounds checks"
 )]
@@ -180,47 +201,24 @@ fn sweep<S: Simd, W: Integer, const P: usize, const R: usize>(
         return P;
     }
     let x = rows.each_ref().map(|row| row.pairs.as_chunks::<PAIRS>().0);
-    const { assert!(S::CHAINS == 1 || S::CHAINS == 2, "one sum, or two") };
-    // Not unrolled: that would double the code for nothing.
-    let rounds = black_box(PAIRS / S::CHAINS);
     let mut sums = [[simd.splat(0.0); P]; R];
     for (l, w) in w
-        .chunks_exact(PAIRS * blocks)
+        .chunks_exact((PAIRS * blocks).max(1))
         .take(PART / 2 / PAIRS)
         .enumerate()
     {
-        let mut integers = [[[simd.zeros(); P]; R]; 2];
-        for round in 0..rounds {
-            for (chain, integers) in integers.iter_mut().take(S::CHAINS).enumerate() {
-                let pair = round * S::CHAINS + chain;
-                // SAFETY: `l` is below the number of groups in a part, which is how many `x[r]` has, and `pair` below `PAIRS`,
-                // which is how many pairs a group has: rounds times chains are no more.
-                let x =
-                    x.map(|x| simd.splat_pair(unsafe { *x.get_unchecked(l).get_unchecked(pair) }));
-                for p in 0..P {
-                    // SAFETY: `w` has `PAIRS * blocks` elements, `pair < PAIRS`, `at + P <= blocks`, as compared above, and
-                    // `p < P`.
-                    let w = unsafe { w.get_unchecked(pair * blocks + at + p) };
-                    prefetch_ahead(p, w);
-                    let w = W::load(simd, w);
-                    for (integers, &x) in integers.iter_mut().zip(&x) {
-                        integers[p] = simd.add_products(integers[p], w, x);
-                    }
-                }
-            }
-        }
-        let [mut integers, others] = integers;
-        // Sums of integers are exact, so chains change no bits.
-        if S::CHAINS == 2 {
-            for (integers, others) in integers.iter_mut().zip(others) {
-                for (integers, others) in integers.iter_mut().zip(others) {
-                    *integers = simd.add_integers(*integers, others);
-                }
-            }
-        }
-        for (sums, integers) in sums.iter_mut().zip(integers) {
-            for (sum, integers) in sums.iter_mut().zip(integers) {
-                *sum = simd.add(*sum, simd.floats(integers));
+        // SAFETY: `l` is below the number of groups in a part, which is how many `x[r]` has.
+        let x = x.map(|x| unsafe { x.get_unchecked(l) });
+        let w = |pair: usize, p: usize| {
+            // SAFETY: `w` has `PAIRS * blocks` elements, `pair < PAIRS`, `at + P <= blocks`, as compared above, and `p < P`.
+            let w = unsafe { w.get_unchecked(pair * blocks + at + p) };
+            prefetch_ahead(p, w);
+            w
+        };
+        let groups = W::group::<S, P, R>(simd, w, x);
+        for (sums, groups) in sums.iter_mut().zip(groups) {
+            for (sum, group) in sums.iter_mut().zip(groups) {
+                *sum = simd.add(*sum, group);
             }
         }
     }
@@ -236,4 +234,54 @@ fn sweep<S: Simd, W: Integer, const P: usize, const R: usize>(
         }
     }
     P
+}
+
+/// The sums of a group, pair by pair.
+#[inline(always)]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "arrays whose length is a constant, as is every index"
+)]
+#[expect(
+    unsafe_code,
+    reason = "the sums stay in registers only without a branch in the loop, and compilers keep some of the bounds checks"
+)]
+pub(crate) fn by_pairs<'w, S: Simd, W: Integer + 'w, const P: usize, const R: usize>(
+    simd: S,
+    w: impl Fn(usize, usize) -> &'w [W; 2 * LANES],
+    x: [&Group; R],
+) -> [[S::V; P]; R] {
+    const { assert!(S::CHAINS == 1 || S::CHAINS == 2, "one sum, or two") };
+    // Not unrolled: that would double the code for nothing.
+    let rounds = black_box(PAIRS / S::CHAINS);
+    let mut integers = [[[simd.zeros(); P]; R]; 2];
+    for round in 0..rounds {
+        for (chain, integers) in integers.iter_mut().take(S::CHAINS).enumerate() {
+            let pair = round * S::CHAINS + chain;
+            // SAFETY: `pair` is below `PAIRS`, which is how many a group has: rounds times chains are no more.
+            let x = x.map(|x| simd.splat_pair(unsafe { x.get_unchecked(pair) }));
+            for p in 0..P {
+                let w = W::load(simd, w(pair, p));
+                for (integers, &x) in integers.iter_mut().zip(&x) {
+                    integers[p] = simd.add_products(integers[p], w, x);
+                }
+            }
+        }
+    }
+    let [mut integers, others] = integers;
+    // Sums of integers are exact, so chains change no bits.
+    if S::CHAINS == 2 {
+        for (integers, others) in integers.iter_mut().zip(others) {
+            for (integers, others) in integers.iter_mut().zip(others) {
+                *integers = simd.add_integers(*integers, others);
+            }
+        }
+    }
+    let mut sums = [[simd.splat(0.0); P]; R];
+    for (sums, integers) in sums.iter_mut().zip(integers) {
+        for (sum, integers) in sums.iter_mut().zip(integers) {
+            *sum = simd.floats(integers);
+        }
+    }
+    sums
 }

@@ -149,7 +149,7 @@ def main(folder, episodes=60):
     (folder / "robot.toml").write_text(ROBOT)
     imported = lads.import_onnx(folder / "policy.onnx", folder / "robot.toml", output=folder / "policy.lads.onnx")
     print("\n".join(imported.notes))
-    certificate = lads.verify(Trained(policy), imported.controller(), Leg, episodes=episodes, reference_name="Isaac Lab's managers")
+    certificate = lads.verify(Trained(policy), imported.controller(), Leg, episodes=episodes, reference_name="Isaac Lab managers")
     certificate.write(folder / "certificate.html")
     return certificate
 

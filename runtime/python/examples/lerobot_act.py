@@ -170,7 +170,7 @@ def main(folder, episodes=60):
         action = chunk[0, 0] * statistics[f"{ACTION}.std"] + statistics[f"{ACTION}.mean"]
         return action.clip(-2, 2).numpy()
 
-    certificate = lads.verify(trained, imported.controller(), Reach, episodes=episodes, reference_name="LeRobot's loop")
+    certificate = lads.verify(trained, imported.controller(), Reach, episodes=episodes, reference_name="LeRobot loop")
     certificate.write(folder / "certificate.html")
     return certificate
 

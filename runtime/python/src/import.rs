@@ -96,9 +96,9 @@ pub fn import_onnx(
     Ok(Policy::of(path, opened).with_notes(notes))
 }
 
-/// The form that import_onnx wants as its `robot_toml`: all that the files say, and all that nobody has said yet with what it means -> TOML.
+/// The form that `import_onnx` wants as its `robot_toml`: all that the files say, and all that nobody has said yet with what it means -> TOML.
 ///
-/// `policy`, `robot_toml` (a form that is not yet complete) and `beside` are those of import_onnx.
+/// `policy`, `robot_toml` (a form that is not yet complete) and `beside` are those of `import_onnx`.
 #[pyfunction]
 #[pyo3(signature = (policy, robot_toml=None, *, beside=None))]
 pub fn template(

@@ -4,9 +4,13 @@ import importlib.util
 import sys
 
 import pytest
+import torch
 
 import lads
 from conftest import PROJECT
+
+# PyTorch's threads would only wait for each other.
+torch.set_num_threads(1)
 
 FOLDER = PROJECT / "runtime/python/examples"
 

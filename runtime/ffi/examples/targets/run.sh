@@ -70,7 +70,15 @@ if have aarch64-linux-gnu-gcc qemu-aarch64 && toolchain aarch64-unknown-linux-gn
     archive aarch64-unknown-linux-gnu aarch64-linux-gnu-
     # shellcheck disable=SC2086
     aarch64-linux-gnu-gcc -static $flags "$here/selftest.c" "$image" "$archive" -o "$work/aarch64"
-    same aarch64 "$(qemu-aarch64 "$work/aarch64")"
+    for cpu in max cortex-a53; do
+        same "aarch64 $cpu" "$(qemu-aarch64 -cpu "$cpu" "$work/aarch64")"
+    done
+fi
+if have arm-linux-gnueabihf-gcc qemu-arm && toolchain armv7-unknown-linux-gnueabihf; then
+    archive armv7-unknown-linux-gnueabihf arm-linux-gnueabihf-
+    # shellcheck disable=SC2086
+    arm-linux-gnueabihf-gcc -static $flags "$here/selftest.c" "$image" "$archive" -lm -o "$work/armv7"
+    same armv7 "$(qemu-arm "$work/armv7")"
 fi
 if have arm-none-eabi-gcc qemu-system-arm && toolchain thumbv7em-none-eabihf; then
     archive thumbv7em-none-eabihf arm-none-eabi-

@@ -75,7 +75,7 @@ int run(void) {
     return 0;
 }
 
-#if !defined(__arm__)
+#if __STDC_HOSTED__
 #include <stdio.h>
 void say(const char *text) { fputs(text, stdout); }
 int main(void) { return run(); }

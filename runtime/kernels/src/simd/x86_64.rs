@@ -161,9 +161,9 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
     }
 
     #[inline(always)]
-    fn splat_pair(self, pair: [i16; 2]) -> Self::Pairs {
+    fn splat_pair(self, pair: &[i16; 2]) -> Self::Pairs {
         // SAFETY: whoever made `self` has AVX2.
-        [unsafe { _mm256_set1_epi32(joined(pair)) }; 2]
+        [unsafe { _mm256_set1_epi32(joined(*pair)) }; 2]
     }
 
     #[inline(always)]
@@ -343,9 +343,9 @@ impl Simd for Avx512 {
     }
 
     #[inline(always)]
-    fn splat_pair(self, pair: [i16; 2]) -> Self::Pairs {
+    fn splat_pair(self, pair: &[i16; 2]) -> Self::Pairs {
         // SAFETY: whoever made `self` has AVX-512.
-        unsafe { _mm512_set1_epi32(joined(pair)) }
+        unsafe { _mm512_set1_epi32(joined(*pair)) }
     }
 
     #[inline(always)]
