@@ -11,12 +11,13 @@
 
 use core::arch::aarch64::{
     float32x4_t, int8x16_t, int16x8_t, int32x4_t, uint16x4_t, uint16x8_t, vaddq_f32, vaddq_s32,
-    vandq_s32, vbslq_f32, vcltzq_f32, vcombine_s8, vcombine_s16, vcvtq_f32_s32, vdupq_n_f32,
-    vdupq_n_s32, vget_high_s8, vget_high_s16, vget_high_u16, vget_low_s8, vget_low_s16,
-    vget_low_u16, vld1q_f32, vld1q_s8, vld1q_s16, vld1q_u16, vmaxq_s32, vmaxvq_s32, vmlal_s16,
-    vmovl_s8, vmovl_u16, vmovn_s16, vmovn_s32, vmulq_f32, vpaddq_s32, vreinterpretq_f32_u32,
-    vreinterpretq_s8_s16, vreinterpretq_s16_s8, vreinterpretq_s32_f32, vrshrn_n_s16, vshlq_n_s8,
-    vshlq_n_s32, vshlq_n_u32, vshrq_n_s8, vst1q_f32, vst1q_s16, vst1q_u16, vzip1q_s16, vzip2q_s16,
+    vandq_s32, vbslq_f32, vcltq_f32, vcltzq_f32, vcombine_s8, vcombine_s16, vcvtq_f32_s32,
+    vdupq_n_f32, vdupq_n_s32, vget_high_s8, vget_high_s16, vget_high_u16, vget_low_s8,
+    vget_low_s16, vget_low_u16, vld1q_f32, vld1q_s8, vld1q_s16, vld1q_u16, vmaxq_s32, vmaxvq_s32,
+    vmlal_s16, vmovl_s8, vmovl_u16, vmovn_s16, vmovn_s32, vmulq_f32, vpaddq_s32,
+    vreinterpretq_f32_u32, vreinterpretq_s8_s16, vreinterpretq_s16_s8, vreinterpretq_s32_f32,
+    vrshrn_n_s16, vshlq_n_s8, vshlq_n_s32, vshlq_n_u32, vshrq_n_s8, vst1q_f32, vst1q_s16,
+    vst1q_u16, vzip1q_s16, vzip2q_s16,
 };
 use core::arch::asm;
 
@@ -57,6 +58,8 @@ impl<const DOT: bool> Simd for Neon<DOT> {
 
     const SUMS: usize = 4;
     const CHAINS: usize = 1;
+    const PIXELS: usize = 6;
+    const PANELS: usize = 1;
 
     #[inline(always)]
     fn splat(self, x: f32) -> Self::V {
@@ -101,6 +104,14 @@ impl<const DOT: bool> Simd for Neon<DOT> {
         // SAFETY: NEON is part of the target.
         both(x, other, |x, other| unsafe {
             vbslq_f32(vcltzq_f32(x), other, x)
+        })
+    }
+
+    #[inline(always)]
+    fn at_most(self, x: Self::V, bound: Self::V) -> Self::V {
+        // SAFETY: NEON is part of the target.
+        both(x, bound, |x, bound| unsafe {
+            vbslq_f32(vcltq_f32(bound, x), bound, x)
         })
     }
 
