@@ -5,7 +5,8 @@
 
 use lads_core::{Channel, ChannelId, Contract, DType, Data};
 use numpy::{
-    Element, PyArrayDyn, PyArrayMethods, PyReadwriteArrayDyn, PyUntypedArray, PyUntypedArrayMethods,
+    Element, PyArray1, PyArrayDyn, PyArrayMethods, PyReadwriteArrayDyn, PyUntypedArray,
+    PyUntypedArrayMethods,
 };
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -182,8 +183,38 @@ pub fn copy<T: Element + Copy>(
     Ok(())
 }
 
+/// Where an answer goes: into an array that the caller gave, or into a new one.
+pub struct Target<'py> {
+    shape: Vec<usize>,
+    given: Option<(Bound<'py, PyAny>, PyReadwriteArrayDyn<'py, f32>)>,
+}
+
+impl<'py> Target<'py> {
+    /// Checks what was given for `out`; from then on nothing else writes it.
+    pub fn of(out: Option<Bound<'py, PyAny>>, name: &str, shape: &[usize]) -> PyResult<Self> {
+        let given = out.map(|out| Ok::<_, PyErr>((out.clone(), writable(&out, name, shape)?)));
+        Ok(Self {
+            shape: shape.to_vec(),
+            given: given.transpose()?,
+        })
+    }
+
+    /// Puts the values there, which are as many as the shape says.
+    pub fn put(self, py: Python<'py>, values: &[f32]) -> PyResult<Bound<'py, PyAny>> {
+        let Some((out, mut write)) = self.given else {
+            let made = PyArray1::from_slice(py, values);
+            return Ok(made.reshape(self.shape)?.into_any());
+        };
+        write
+            .as_slice_mut()
+            .map_err(|_| InputError::new_err(unaligned()))?
+            .copy_from_slice(values);
+        Ok(out)
+    }
+}
+
 /// An array of this type and shape that may be written.
-pub fn writable<'py>(
+fn writable<'py>(
     given: &Bound<'py, PyAny>,
     name: &str,
     shape: &[usize],

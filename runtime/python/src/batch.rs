@@ -8,12 +8,12 @@ use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
 use std::thread;
 
 use lads_core::{ChannelId, Data, StepError as CoreStepError};
-use numpy::{PyArray1, PyArrayMethods};
+use numpy::PyArray1;
 use pyo3::prelude::*;
 use pyo3::types::{PyList, PyTuple};
 use rayon::prelude::*;
 
-use crate::arrays::{self, Staged};
+use crate::arrays::{self, Staged, Target};
 use crate::cell::{Checked, Working};
 use crate::controller::{Settings, Told};
 use crate::errors::{self, BusyError, ClosedError, InputError, StepError, WorkspaceError};
@@ -182,10 +182,7 @@ impl Controllers {
             let (count, len) = (self.count, self.contract().action_len());
             let needed = inner.staged.len();
             arrays::read(observations, &mut inner.staged, needed, &mut inner.given)?;
-            let mut write = match &out {
-                Some(out) => Some(arrays::writable(out, "actions", &[count, len])?),
-                None => None,
-            };
+            let target = Target::of(out, "actions", &[count, len])?;
             let Inner {
                 rows,
                 staged,
@@ -239,18 +236,7 @@ impl Controllers {
                 );
                 return Err(PyErr::from_type(error.get_type(py), text));
             }
-            let actions = match (&mut write, out) {
-                (Some(write), Some(out)) => {
-                    if let Ok(values) = write.as_slice_mut() {
-                        values.copy_from_slice(actions);
-                    }
-                    out
-                }
-                _ => PyArray1::from_slice(py, actions)
-                    .reshape([count, len])?
-                    .into_any(),
-            };
-            Ok((actions, report(py, rows)?))
+            Ok((target.put(py, actions)?, report(py, rows)?))
         })
     }
 

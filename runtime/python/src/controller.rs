@@ -11,7 +11,7 @@ use numpy::{PyArray1, PyArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyString;
 
-use crate::arrays::{self, Staged};
+use crate::arrays::{self, Staged, Target};
 use crate::cell::{Checked, Working};
 use crate::errors::{self, BusyError, ClosedError, InstructionError, StepError, WorkspaceError};
 use crate::policy::Policy;
@@ -104,6 +104,13 @@ struct Inner {
     needed: usize,
     action: Vec<f32>,
     told: Option<Told>,
+}
+
+impl Inner {
+    /// Takes in what is given for the channels.
+    fn read(&mut self, observation: &Bound<'_, PyAny>) -> PyResult<()> {
+        arrays::read(observation, &mut self.staged, self.needed, &mut self.given)
+    }
 }
 
 /// A policy at work: one observation in, one action out, once every control period.
@@ -206,16 +213,8 @@ impl Controller {
         out: Option<Bound<'py, PyAny>>,
     ) -> PyResult<(Bound<'py, PyAny>, StepReport)> {
         self.work(|inner| {
-            arrays::read(
-                observation,
-                &mut inner.staged,
-                inner.needed,
-                &mut inner.given,
-            )?;
-            let mut write = match &out {
-                Some(out) => Some(arrays::writable(out, "action", &[inner.action.len()])?),
-                None => None,
-            };
+            inner.read(observation)?;
+            let target = Target::of(out, "action", &[inner.action.len()])?;
             let Inner {
                 working,
                 staged,
@@ -240,16 +239,7 @@ impl Controller {
                 })
             });
             let report = report.map_err(|error| errors::step(&error, self.contract()))?;
-            let action = match (&mut write, out) {
-                (Some(write), Some(out)) => {
-                    if let Ok(values) = write.as_slice_mut() {
-                        values.copy_from_slice(action);
-                    }
-                    out
-                }
-                _ => PyArray1::from_slice(py, action).into_any(),
-            };
-            Ok((action, report.into()))
+            Ok((target.put(py, action)?, report.into()))
         })
     }
 
@@ -296,16 +286,8 @@ impl Controller {
         out: Option<Bound<'py, PyAny>>,
     ) -> PyResult<Bound<'py, PyAny>> {
         self.work(|inner| {
-            arrays::read(
-                observation,
-                &mut inner.staged,
-                inner.needed,
-                &mut inner.given,
-            )?;
-            let mut write = match &out {
-                Some(out) => Some(arrays::writable(out, "action", &[inner.action.len()])?),
-                None => None,
-            };
+            inner.read(observation)?;
+            let target = Target::of(out, "action", &[inner.action.len()])?;
             let Inner {
                 working,
                 staged,
@@ -323,15 +305,7 @@ impl Controller {
                 }
                 other => StepError::new_err(other.to_string()),
             })?;
-            Ok(match (&mut write, out) {
-                (Some(write), Some(out)) => {
-                    if let Ok(values) = write.as_slice_mut() {
-                        values.copy_from_slice(action);
-                    }
-                    out
-                }
-                _ => PyArray1::from_slice(py, action).into_any(),
-            })
+            target.put(py, action)
         })
     }
 

@@ -224,6 +224,7 @@ fn replay(
                 plan: selected.map(|selected| selected.index),
                 logits: scores.to_vec(),
                 action: action.clone(),
+                ..Reply::default()
             };
             controller.executed(done)?;
             Ok(reply)

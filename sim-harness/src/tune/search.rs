@@ -29,6 +29,8 @@ pub struct Layer {
     pub nodes: BTreeSet<String>,
     /// Number of weights.
     pub weights: usize,
+    /// Whether integers store it; one that weighs its inputs very differently keeps its floats.
+    pub takes_integers: bool,
 }
 
 impl Group {
@@ -49,7 +51,7 @@ impl Group {
 pub struct Parts {
     /// The groups, the largest first.
     pub groups: Vec<Group>,
-    /// Whether there are KV caches or rings.
+    /// Whether there are KV caches.
     pub has_cache: bool,
 }
 
@@ -75,13 +77,14 @@ pub struct Found {
     pub choices: Vec<Choice>,
 }
 
-/// Looks for the smallest formats; `trial` asks one candidate.
+/// Looks for the smallest formats; `exact` is what was seen with 32 bits, `trial` asks one candidate.
 pub fn search<E>(
     parts: &Parts,
+    exact: Judged,
     trial: &mut dyn FnMut(&Storage) -> Result<Judged, E>,
 ) -> Result<Found, E> {
     let mut found = Found {
-        judged: trial(&Storage::default())?,
+        judged: exact,
         storage: Storage::default(),
         choices: vec![],
     };
@@ -151,11 +154,9 @@ fn layers<E>(
     found: &mut Found,
     trial: &mut dyn FnMut(&Storage) -> Result<Judged, E>,
 ) -> Result<usize, E> {
-    if group.layers.len() < 2 {
-        return Ok(0);
-    }
     let mut alone = vec![];
-    for layer in &group.layers {
+    let layers = group.layers.iter().filter(|layer| layer.takes_integers);
+    for layer in layers {
         let judged = trial(&with(&found.storage, &layer.nodes, WEIGHTS[0]))?;
         if judged.is_same() {
             let seen = judged.evidence;
@@ -192,6 +193,7 @@ mod tests {
                 .map(|nodes| Layer {
                     nodes: nodes.iter().map(|&name| name.to_owned()).collect(),
                     weights: 10,
+                    takes_integers: nodes[0] != "d",
                 })
                 .collect(),
         };
@@ -207,7 +209,7 @@ mod tests {
     /// A policy that is the same while `is_same` says so.
     fn searched(is_same: impl Fn(&Storage) -> bool) -> (Found, usize) {
         let mut trials = 0;
-        let found = search(&parts(), &mut |storage| {
+        let found = search(&parts(), Judged::default(), &mut |storage| {
             trials += 1;
             let loss = Loss::Encoded { changed: 1 };
             Ok::<_, Infallible>(Judged {
@@ -227,7 +229,7 @@ mod tests {
             .with_part("act", WeightFormat::Int8)
             .with_cache(CacheFormat::F16);
         assert_eq!(found.storage, all);
-        assert_eq!(trials, 4);
+        assert_eq!(trials, 3);
         let stored: Vec<_> = found.choices.iter().map(|choice| &*choice.stored).collect();
         assert_eq!(stored, ["int8", "int8", "f16"]);
     }
