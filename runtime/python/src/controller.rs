@@ -173,7 +173,7 @@ impl Controller {
     }
 
     fn lock(&self) -> PyResult<MutexGuard<'_, Option<Inner>>> {
-        self.process.check("controller")?;
+        self.process.check("controller", "policy.controller(...)")?;
         match self.inner.try_lock() {
             Ok(guard) => Ok(guard),
             Err(TryLockError::WouldBlock) => Err(BusyError::new_err(
@@ -204,7 +204,8 @@ impl Controller {
     ///
     /// `observation` is an array of exactly the channel's dtype and shape, contiguous; for a policy with several channels a dictionary of
     /// arrays by the channels' names, to which the noise channel may be added. With `out`, the action is written there and `out` is
-    /// returned: nothing is allocated. An observation that is refused leaves the controller as it was.
+    /// returned; for a policy of one channel nothing is allocated then but the report. An observation that is refused leaves the controller
+    /// as it was.
     #[pyo3(signature = (observation, out=None))]
     fn step<'py>(
         &self,
