@@ -109,12 +109,11 @@ impl Formats {
         if self == Self::default() {
             return Ok(None);
         }
-        let mut storage = match self.weights {
-            Some(weights) => Storage::of_weights(weights),
-            None => {
-                let tuned = bundle.tuned()?.map(|tuned| tuned.storage.clone());
-                tuned.unwrap_or_default()
-            }
+        let mut storage = if let Some(weights) = self.weights {
+            Storage::of_weights(weights)
+        } else {
+            let tuned = bundle.tuned()?.map(|tuned| tuned.storage.clone());
+            tuned.unwrap_or_default()
         };
         if let Some(weights) = self.low_level {
             for entry in bundle.acting_entries() {
@@ -186,14 +185,14 @@ impl Tuned {
     pub(crate) fn find<'m>(
         property: impl Fn(&str) -> Option<&'m str>,
     ) -> Result<Option<Self>, String> {
-        let Some(text) = property(KEY) else {
-            return Ok(None);
-        };
         /// What all versions have.
         #[derive(Deserialize)]
         struct Head {
             version: u32,
         }
+        let Some(text) = property(KEY) else {
+            return Ok(None);
+        };
         let head: Head = serde_json::from_str(text).map_err(|error| error.to_string())?;
         if head.version != VERSION {
             let found = head.version;
