@@ -50,7 +50,7 @@ DOT = {"Cortex-A76", "Cortex-A78"}
 
 # Where such a core is found, and its clock [GHz].
 BOARDS = {
-    "Cortex-A53": ("Raspberry Pi 3, Zero 2 W", 1.2),
+    "Cortex-A53": ("Raspberry Pi 3", 1.2),
     "Cortex-A72": ("Raspberry Pi 4", 1.8),
     "Cortex-A76": ("Raspberry Pi 5", 2.4),
     "Cortex-A78": ("Jetson Orin Nano", 1.5),
@@ -83,11 +83,13 @@ def save(key: str, value: dict) -> None:
 def steps(images: dict[str, Path]) -> None:
     """Instructions of a control step: target, kernel, image."""
     found: dict[str, dict] = {}
+    skipped = []
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         run("cc", "-O2", "-shared", "-fPIC", HERE / "count.c", "-o", work / "count.so")
         for target, (prefix, kernels) in TARGETS.items():
             if missing(f"{prefix}gcc", *{command[0] for command in kernels.values()}):
+                skipped.append(target)
                 continue
             tools = {"LD": "ld", "OBJCOPY": "objcopy", "AR": "ar", "NM": "nm"}
             env = os.environ | {name: prefix + tool for name, tool in tools.items()}
@@ -109,7 +111,15 @@ def steps(images: dict[str, Path]) -> None:
     for name, bits in actions.items():
         if len(bits) > 1:
             sys.exit(f"measure.py: {name}: the bits of the actions differ: {found}")
-    save("steps", found)
+    for target, kernels in found.items():
+        for kernel in set(kernels) - {"portable"}:
+            same = [name for name in images if kernels[kernel][name]["instructions"] == kernels["portable"][name]["instructions"]]
+            if same and "portable" in kernels:
+                sys.exit(f"measure.py: {target}: {kernel} takes as many instructions as portable with {', '.join(same)}: it did not run")
+    known = json.loads(RESULTS.read_text()).get("steps", {}) if RESULTS.is_file() else {}
+    save("steps", known | found)
+    if skipped:
+        sys.exit(f"measure.py: kept what was known of {', '.join(skipped)}")
 
 
 def image_of(source: Path) -> tuple[str, int]:

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use lads_compiler::{Bundle, CacheFormat, Storage, WeightFormat};
+use lads_compiler::{Bundle, CacheFormat, Evidence, Storage, Tuned, WeightFormat};
 
 /// A file of the project, by its path from the root.
 fn project_file(path: &str) -> PathBuf {
@@ -54,8 +54,17 @@ fn every_plan_is_kept_and_the_bundle_says_so() {
     }
     assert_eq!(printed[0], printed[1]);
     assert_eq!(fs::read(&model).unwrap(), fs::read(&other).unwrap());
+    // A record that nobody can follow is replaced.
+    let stray = Storage::default().with_part("low_level/dance", WeightFormat::Int8);
+    let stray = Tuned::new(stray, Evidence::default()).written_into(&fs::read(&other).unwrap());
+    fs::write(&model, stray.unwrap()).unwrap();
+    assert!(lads_host::open(&model).is_err());
+    let output = tune(&model, &reference);
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{errors}");
+    assert_eq!(fs::read(&model).unwrap(), fs::read(&other).unwrap());
     let bundle = Bundle::open(&model).unwrap();
-    let tuned = bundle.tuned().unwrap();
+    let tuned = bundle.tuned().unwrap().unwrap();
     let wanted = Storage::default()
         .with_part("high_level/instruct", WeightFormat::Int16)
         .with_part("high_level/start", WeightFormat::Int16)
@@ -69,8 +78,20 @@ fn every_plan_is_kept_and_the_bundle_says_so() {
     }
     let seen = &tuned.evidence;
     assert!(seen.decisions > 600 && seen.episodes == 202 && seen.reference_sha256.len() == 64);
+    assert!(seen.segments > 0);
     assert_eq!(seen.largest_action_error, 0.0);
-    assert!(seen.smallest_margin > Some(0.0) && seen.clear_share > 0.98);
+    assert!(seen.smallest_margin > Some(0.0) && seen.clear_share > 0.99);
+    // A certificate finds no difference in what the policy answers.
+    let verified = Command::new(env!("CARGO_BIN_EXE_lads-run"))
+        .args(["verify", "--episodes", "1", "--model"])
+        .arg(&model)
+        .args(reference)
+        .output();
+    let verified = String::from_utf8(verified.unwrap().stdout).unwrap();
+    assert!(
+        verified.contains("0 of 202 replayed episodes differ"),
+        "{verified}"
+    );
     let exact = lads_compiler::compile_with(&bundle, &lads_compiler::Options::exact()).unwrap();
     let image = lads_compiler::compile(&bundle).unwrap();
     assert!(image.as_bytes().len() * 10 < exact.as_bytes().len() * 6);

@@ -156,9 +156,8 @@ fn damaged(kind: &str) {
     let dense = (0..whole.len()).filter(|&at| !sparse(at)).count();
     // Odd, so that every byte of a word has its turn.
     let every = dense.div_ceil(MOST) | 1;
-    let step = |at: usize| if sparse(at) { SPARSE } else { every };
     for len in (HEADER_WORDS * 4..whole.len()).step_by(4) {
-        if !len.is_multiple_of(4 * step(len)) {
+        if sparse(len) && !len.is_multiple_of(4 * SPARSE) {
             continue;
         }
         let mut bytes = whole[..len].to_vec();
@@ -168,7 +167,8 @@ fn damaged(kind: &str) {
     }
     let mut flipped = 0;
     for at in 0..whole.len() {
-        if !at.is_multiple_of(step(at)) {
+        let step = if sparse(at) { SPARSE } else { every };
+        if !at.is_multiple_of(step) {
             continue;
         }
         let mut bytes = whole.to_vec();

@@ -20,7 +20,7 @@ class Shape:
 
     inputs: int = 16  # elements of a row, of the option and of the embedded level
     width: int = 8
-    multiples: tuple = (1, 2)
+    multiples: tuple = (1, 2, 4)
     groups: int = 4
     rows: int = 8
     levels: int = 20

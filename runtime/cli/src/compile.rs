@@ -37,7 +37,7 @@ pub struct Request {
     /// of a plan keep their bits, and all that fewer bits elsewhere can do is to choose another plan
     #[arg(long, value_name = "FORMAT", value_parser = weight_format)]
     low_level: Option<WeightFormat>,
-    /// How the KV cache is stored: auto, with the weights; f32; or f16 in half the memory. It has to pass the same gate
+    /// How the KV cache is stored: auto, as the bundle was tuned where nothing is said of the weights, else f32; f32; or f16 in half the memory. It has to pass the same gate
     #[arg(long, value_name = "FORMAT", default_value = "auto", value_parser = auto_or(cache_format))]
     cache: Choice<CacheFormat>,
     /// Largest difference of an action that the gate, and later the image's self-test, accept, in the action's units; the
@@ -58,8 +58,12 @@ pub fn compile(request: Request) -> Result<(), Refusal> {
         low_level: request.low_level,
         cache: request.cache.0,
     };
+    let storage = bundle.as_ref().map(|bundle| formats.storage(bundle));
+    let storage = storage
+        .transpose()
+        .map_err(|error| Refusal::with_remedy_inside(request.model.display(), error))?;
     let options = Options {
-        storage: bundle.as_ref().and_then(|bundle| formats.storage(bundle)),
+        storage: storage.flatten(),
         tolerance: request.tolerance,
         force: request.force,
     };
@@ -115,9 +119,10 @@ pub fn compile(request: Request) -> Result<(), Refusal> {
     let Some(bundle) = bundle else {
         return Ok(());
     };
-    let storage = options.storage(&bundle);
+    // What does not read was refused above.
+    let storage = options.storage(&bundle).unwrap_or_default();
     if storage.is_exact() || force {
-        return if options.storage.is_none() && bundle.tuned().is_none() {
+        return if options.storage.is_none() && matches!(bundle.tuned(), Ok(None)) {
             print("f32 weights: the bundle is not tuned to fewer bits; `lads-run tune` does it\n")
         } else {
             Ok(())

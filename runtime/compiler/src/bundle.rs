@@ -6,12 +6,14 @@
 use std::path::Path;
 
 use bytes::Bytes;
+use lads_image::records::Event;
 use prost::Message;
 
 use crate::contract::Contract;
 use crate::digest;
 use crate::entries;
 use crate::error::BundleError;
+use crate::family::{Blueprint, Entry};
 use crate::golden::Golden;
 use crate::onnx::{self, GraphProto, ModelProto};
 use crate::storage::{Tuned, without_record};
@@ -24,7 +26,8 @@ const NEAREST: usize = 3;
 pub struct Bundle {
     contract: Contract,
     golden: Golden,
-    tuned: Option<Tuned>,
+    /// How numbers are to be stored; or what is wrong with the record, which matters only to those who follow it.
+    tuned: Result<Option<Tuned>, String>,
     sha256: String,
     untuned_sha256: String,
     bytes: usize,
@@ -72,11 +75,11 @@ impl Bundle {
             problem: "missing from the model's metadata".into(),
         })?;
         let golden = Golden::parse(golden, &contract)?;
-        let tuned = Tuned::find(property)?;
+        let tuned = Tuned::find(property);
         let sha256 = digest::sha256(bytes);
         let untuned_sha256 = match tuned {
-            Some(_) => digest::sha256(&without_record(bytes)?),
-            None => sha256.clone(),
+            Ok(None) => sha256.clone(),
+            _ => digest::sha256(&without_record(bytes)?),
         };
         let graph = model.graph.as_ref().ok_or_else(|| BundleError::NotOnnx {
             problem: "it has no graph".into(),
@@ -104,16 +107,34 @@ impl Bundle {
         &self.golden
     }
 
-    /// How an image's numbers are to be stored, and on what evidence; `None` until the bundle is tuned.
-    pub fn tuned(&self) -> Option<&Tuned> {
-        self.tuned.as_ref()
+    /// How an image's numbers are to be stored, and on what evidence; `None` until the bundle is tuned. What can fail: the record.
+    pub fn tuned(&self) -> Result<Option<&Tuned>, BundleError> {
+        let tuned = self.tuned.as_ref().map(Option::as_ref);
+        tuned.map_err(|problem| BundleError::Storage {
+            problem: problem.as_str().into(),
+        })
     }
 
     /// Names of the entry graphs whose outputs reach the action, not only the choice of an index.
     pub fn acting_entries(&self) -> Vec<String> {
+        self.entries_that(|_, entry| entry.acts)
+    }
+
+    /// Names of the entry graphs that nothing but the trajectory encoder calls.
+    pub fn encoding_entries(&self) -> Vec<String> {
+        self.entries_that(|blueprint, entry| {
+            let mut events = blueprint.events_of(&entry.name).peekable();
+            events.peek().is_some() && events.all(|event| event == Event::Encode)
+        })
+    }
+
+    fn entries_that(&self, is: impl Fn(&Blueprint, &Entry) -> bool) -> Vec<String> {
         let blueprint = self.contract.family.kind().blueprint(&self.contract);
-        let acting = blueprint.entries.iter().filter(|entry| entry.acts);
-        let mut names: Vec<_> = acting
+        let found = blueprint
+            .entries
+            .iter()
+            .filter(|entry| is(&blueprint, entry));
+        let mut names: Vec<_> = found
             .filter_map(|entry| entry.graph().map(str::to_owned))
             .collect();
         names.dedup();

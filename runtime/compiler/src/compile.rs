@@ -7,7 +7,7 @@ use lads_image::op::{CacheFormat, WeightSpan};
 
 use crate::bundle::Bundle;
 use crate::entries::{self, LOOKUP_INSTRUCTION, Signature};
-use crate::error::CompileError;
+use crate::error::{BundleError, CompileError};
 use crate::family::{Blueprint, Entry, Keep, Origin};
 use crate::fuse::{Fused, fuse};
 use crate::graph::Dim;
@@ -49,10 +49,13 @@ impl Options {
         }
     }
 
-    /// How the numbers of this bundle's image are stored.
-    pub fn storage(&self, bundle: &Bundle) -> Storage {
-        let tuned = || bundle.tuned().map(|tuned| tuned.storage.clone());
-        self.storage.clone().or_else(tuned).unwrap_or_default()
+    /// How the numbers of this bundle's image are stored. What can fail: the bundle's record, where nothing else is said.
+    pub fn storage(&self, bundle: &Bundle) -> Result<Storage, BundleError> {
+        if let Some(storage) = &self.storage {
+            return Ok(storage.clone());
+        }
+        let tuned = bundle.tuned()?.map(|tuned| tuned.storage.clone());
+        Ok(tuned.unwrap_or_default())
     }
 }
 
@@ -65,7 +68,7 @@ pub fn compile(bundle: &Bundle) -> Result<Image, CompileError> {
 /// episode with the same indices, and with actions inside the episode's tolerance.
 pub fn compile_with(bundle: &Bundle, options: &Options) -> Result<Image, CompileError> {
     let contract = bundle.contract();
-    let storage = options.storage(bundle);
+    let storage = options.storage(bundle).map_err(CompileError::Bundle)?;
     let blueprint = contract.family.kind().blueprint(contract);
     let signatures =
         entries::signatures(bundle.graph(), contract, &blueprint).map_err(CompileError::Bundle)?;

@@ -1,6 +1,6 @@
 //! A plain policy computed in double precision, straight from its graph: what a compiled policy is compared with.
 //!
-//! Nothing is fused, planned or rounded to 32 bits: of the compiler only the reading of ONNX and the folding of constants are shared with
+//! Nothing is fused or planned, and nothing but folded constants is rounded to 32 bits: of the compiler only the reading of ONNX and the folding of constants are shared with
 //! what is compared. What can fail: the bytes are no bundle of the family `plain`, or a value has another shape than the
 //! contract says.
 

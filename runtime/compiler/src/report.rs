@@ -42,7 +42,7 @@ pub struct CompileReport {
     pub programs: Vec<ProgramReport>,
     /// Bytes of weights, tables and word embeddings, each content once.
     pub weight_bytes: usize,
-    /// 4-byte words of state that rings and KV caches take.
+    /// 4-byte words of state that KV caches take.
     pub cache_len: usize,
 }
 
@@ -74,7 +74,7 @@ impl fmt::Display for CompileReport {
         }
         write!(
             f,
-            "weights {} bytes, rings and KV caches {} bytes",
+            "weights {} bytes, KV caches {} bytes",
             self.weight_bytes,
             self.cache_len * 4
         )

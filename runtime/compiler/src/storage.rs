@@ -91,7 +91,8 @@ impl fmt::Display for Storage {
     }
 }
 
-/// What a person says of formats; what is left out is as the bundle was tuned, and with 32 bits where it was not.
+/// What a person says of formats. Whoever names `weights` sets all aside that the bundle was tuned to; else what is left out is as it was
+/// tuned, and with 32 bits where it was not.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Formats {
     /// Of all weights.
@@ -104,17 +105,19 @@ pub struct Formats {
 
 impl Formats {
     /// What that is in this bundle; `None` if nothing was said.
-    pub fn storage(self, bundle: &Bundle) -> Option<Storage> {
+    pub fn storage(self, bundle: &Bundle) -> Result<Option<Storage>, BundleError> {
         if self == Self::default() {
-            return None;
+            return Ok(None);
         }
-        let tuned = || bundle.tuned().map(|tuned| tuned.storage.clone());
-        let mut storage = match self.weights {
-            Some(weights) => Storage::of_weights(weights),
-            None => tuned().unwrap_or_default(),
+        let mut storage = if let Some(weights) = self.weights {
+            Storage::of_weights(weights)
+        } else {
+            let tuned = bundle.tuned()?.map(|tuned| tuned.storage.clone());
+            tuned.unwrap_or_default()
         };
         if let Some(weights) = self.low_level {
             for entry in bundle.acting_entries() {
+                // The names of an entry's nodes begin with its own.
                 let inside = format!("{entry}/");
                 storage.parts.retain(|part, _| !part.starts_with(&inside));
                 storage.parts.insert(entry, weights);
@@ -123,7 +126,7 @@ impl Formats {
         if let Some(cache) = self.cache {
             storage.cache = cache;
         }
-        Some(storage)
+        Ok(Some(storage))
     }
 }
 
@@ -139,12 +142,14 @@ pub struct Evidence {
     pub steps: usize,
     /// Decisions in them; every one selected the same index.
     pub decisions: usize,
-    /// The smallest lead of a selected index over the second best, with 32 bits, in logits; infinite, and left out, without decisions.
+    /// The smallest lead of a selected index over the second best, with 32 bits, in logits; left out where no decision has two logits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub smallest_margin: Option<f64>,
     /// Largest difference of a logit, up to a constant added to all of a decision's.
     pub largest_logit_error: f64,
-    /// Share of the decisions whose margin is more than `margin_factor` times that difference.
+    /// Segments of them that the trajectory encoder saw; it saw the same plan in every one.
+    pub segments: usize,
+    /// Share of the decisions with two logits or more whose margin is more than `margin_factor` times that difference.
     pub clear_share: f64,
     /// The factor.
     pub margin_factor: f64,
@@ -175,24 +180,29 @@ impl Tuned {
         }
     }
 
-    /// The record of a bundle, whose metadata is given by key; `None` for one that has none.
+    /// The record of a bundle, whose metadata is given by key; `None` for one that has none, and what is wrong with one that does not
+    /// read.
     pub(crate) fn find<'m>(
         property: impl Fn(&str) -> Option<&'m str>,
-    ) -> Result<Option<Self>, BundleError> {
+    ) -> Result<Option<Self>, String> {
+        /// What all versions have.
+        #[derive(Deserialize)]
+        struct Head {
+            version: u32,
+        }
         let Some(text) = property(KEY) else {
             return Ok(None);
         };
-        let refused = |problem: String| BundleError::Storage {
-            problem: problem.into(),
-        };
-        let tuned: Self = serde_json::from_str(text).map_err(|error| refused(error.to_string()))?;
-        if tuned.version != VERSION {
-            let found = tuned.version;
-            return Err(refused(format!(
+        let head: Head = serde_json::from_str(text).map_err(|error| error.to_string())?;
+        if head.version != VERSION {
+            let found = head.version;
+            return Err(format!(
                 "it has version {found}, this program reads version {VERSION}"
-            )));
+            ));
         }
-        Ok(Some(tuned))
+        serde_json::from_str(text)
+            .map(Some)
+            .map_err(|error| error.to_string())
     }
 
     /// A bundle's file with this record instead of the one that it may have; all other bytes stay what they are.

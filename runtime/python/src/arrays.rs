@@ -5,7 +5,8 @@
 
 use lads_core::{Channel, ChannelId, Contract, DType, Data};
 use numpy::{
-    Element, PyArrayDyn, PyArrayMethods, PyReadwriteArrayDyn, PyUntypedArray, PyUntypedArrayMethods,
+    Element, PyArray1, PyArrayDyn, PyArrayMethods, PyReadwriteArrayDyn, PyUntypedArray,
+    PyUntypedArrayMethods,
 };
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -71,15 +72,11 @@ impl Staged {
 
     /// All values.
     pub fn data(&self) -> (ChannelId, Data<'_>) {
-        self.rows(0, 1)
+        self.row(0, 1)
     }
 
     /// The values of row `i` of `count` rows.
     pub fn row(&self, i: usize, count: usize) -> (ChannelId, Data<'_>) {
-        self.rows(i, count)
-    }
-
-    fn rows(&self, i: usize, count: usize) -> (ChannelId, Data<'_>) {
         fn part<T>(values: &[T], i: usize, count: usize) -> &[T] {
             let len = values.len() / count;
             &values[i * len..(i + 1) * len]
@@ -172,18 +169,60 @@ pub fn copy<T: Element + Copy>(
     shape: &[usize],
     into: &mut [T],
 ) -> PyResult<()> {
+    read_with(given, what, name, shape, |values| {
+        into.copy_from_slice(values);
+    })
+}
+
+/// The values of an array of exactly this type and shape, for as long as `work` takes.
+fn read_with<T: Element, R>(
+    given: &Bound<'_, PyAny>,
+    what: &str,
+    name: &str,
+    shape: &[usize],
+    work: impl FnOnce(&[T]) -> R,
+) -> PyResult<R> {
     let array = checked::<T>(given, what, name, shape)?;
     let refused = |why: String| InputError::new_err(format!("{what} `{name}`: {why}"));
     let read = array
         .try_readonly()
         .map_err(|_| refused("the array is being written by other code; give a copy".into()))?;
     let values = read.as_slice().map_err(|_| refused(unaligned()))?;
-    into.copy_from_slice(values);
-    Ok(())
+    Ok(work(values))
+}
+
+/// Where an answer goes: into an array that the caller gave, or into a new one.
+pub struct Target<'py> {
+    shape: Vec<usize>,
+    given: Option<(Bound<'py, PyAny>, PyReadwriteArrayDyn<'py, f32>)>,
+}
+
+impl<'py> Target<'py> {
+    /// Checks what was given for `out`; from then on nothing else writes it.
+    pub fn of(out: Option<Bound<'py, PyAny>>, name: &str, shape: &[usize]) -> PyResult<Self> {
+        let given = out.map(|out| Ok::<_, PyErr>((out.clone(), writable(&out, name, shape)?)));
+        Ok(Self {
+            shape: shape.to_vec(),
+            given: given.transpose()?,
+        })
+    }
+
+    /// Puts the values there, which are as many as the shape says.
+    pub fn put(self, py: Python<'py>, values: &[f32]) -> PyResult<Bound<'py, PyAny>> {
+        let Some((out, mut write)) = self.given else {
+            let made = PyArray1::from_slice(py, values);
+            return Ok(made.reshape(self.shape)?.into_any());
+        };
+        write
+            .as_slice_mut()
+            .map_err(|_| InputError::new_err(unaligned()))?
+            .copy_from_slice(values);
+        Ok(out)
+    }
 }
 
 /// An array of this type and shape that may be written.
-pub fn writable<'py>(
+fn writable<'py>(
     given: &Bound<'py, PyAny>,
     name: &str,
     shape: &[usize],
@@ -218,12 +257,8 @@ pub fn values<T: Element + Copy>(
             tuple(&shape)
         )));
     }
-    let mut values = Vec::new();
-    let array = checked::<T>(given, "array", name, &shape)?;
-    let read = array.try_readonly();
-    let read = read.map_err(|error| InputError::new_err(error.to_string()))?;
-    let all = read.as_slice();
-    values.extend_from_slice(all.map_err(|_| InputError::new_err(unaligned()))?);
+    // Copied from what is known to be there: a shape alone, such as that of a broadcast array, may be larger than the memory.
+    let values = read_with(given, "array", name, &shape, <[T]>::to_vec)?;
     Ok((shape, values))
 }
 

@@ -4,16 +4,16 @@
 //! batch's own, started once.
 
 use std::num::NonZero;
-use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 use std::thread;
 
 use lads_core::{ChannelId, Data, StepError as CoreStepError};
-use numpy::{PyArray1, PyArrayMethods};
+use numpy::PyArray1;
 use pyo3::prelude::*;
 use pyo3::types::{PyList, PyTuple};
 use rayon::prelude::*;
 
-use crate::arrays::{self, Staged};
+use crate::arrays::{self, Staged, Target};
 use crate::cell::{Checked, Working};
 use crate::controller::{Settings, Told};
 use crate::errors::{self, BusyError, ClosedError, InputError, StepError, WorkspaceError};
@@ -28,6 +28,8 @@ struct Row {
 }
 
 struct Inner {
+    /// Not dropped in a forked child, which has none of its threads.
+    pool: rayon::ThreadPool,
     rows: Vec<Row>,
     staged: Vec<Staged>,
     given: Vec<bool>,
@@ -41,22 +43,28 @@ pub struct Controllers {
     checked: Arc<Checked>,
     process: Process,
     count: usize,
-    /// Not dropped in a forked child, which has none of its threads.
-    pool: Option<rayon::ThreadPool>,
+    threads: usize,
     inner: Mutex<Option<Inner>>,
 }
 
 impl Drop for Controllers {
     fn drop(&mut self) {
-        if !self.process.is_current() {
-            std::mem::forget(self.pool.take());
+        if self.process.is_current() {
+            return;
+        }
+        let inner = self.inner.get_mut().unwrap_or_else(PoisonError::into_inner);
+        if let Some(Inner { pool, .. }) = inner.take() {
+            std::mem::forget(pool);
         }
     }
 }
 
 impl Controllers {
     fn lock(&self) -> PyResult<MutexGuard<'_, Option<Inner>>> {
-        self.process.check("batch of controllers")?;
+        self.process.check(
+            "batch of controllers",
+            "lads.vector.Controllers(policy, ...)",
+        )?;
         match self.inner.try_lock() {
             Ok(guard) => Ok(guard),
             Err(TryLockError::WouldBlock) => Err(BusyError::new_err(
@@ -137,12 +145,6 @@ impl Controllers {
         let staged: Vec<_> = staged
             .map(|channel| Staged::batch(&channel, count))
             .collect();
-        let inner = Inner {
-            given: vec![false; staged.len()],
-            staged,
-            actions: vec![0.0; count * contract.action_len()],
-            rows,
-        };
         let all = || thread::available_parallelism().map_or(1, NonZero::get);
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads.unwrap_or_else(all).min(count))
@@ -153,12 +155,20 @@ impl Controllers {
                     "the threads cannot be started ({error}); ask for fewer"
                 ))
             })?;
+        let threads = pool.current_num_threads();
+        let inner = Inner {
+            pool,
+            given: vec![false; staged.len()],
+            staged,
+            actions: vec![0.0; count * contract.action_len()],
+            rows,
+        };
         let batch = Self {
             policy: policy.clone().unbind(),
             checked,
             process: Process::current(),
             count,
-            pool: Some(pool),
+            threads,
             inner: Mutex::new(Some(inner)),
         };
         if let Some(instruction) = instruction {
@@ -182,11 +192,9 @@ impl Controllers {
             let (count, len) = (self.count, self.contract().action_len());
             let needed = inner.staged.len();
             arrays::read(observations, &mut inner.staged, needed, &mut inner.given)?;
-            let mut write = match &out {
-                Some(out) => Some(arrays::writable(out, "actions", &[count, len])?),
-                None => None,
-            };
+            let target = Target::of(out, "actions", &[count, len])?;
             let Inner {
+                pool,
                 rows,
                 staged,
                 actions,
@@ -196,7 +204,6 @@ impl Controllers {
             let inputs = |i: usize| -> Vec<(ChannelId, Data<'_>)> {
                 staged.iter().map(|row| row.row(i, count)).collect()
             };
-            let pool = self.pool.as_ref();
             let refused = py.detach(|| {
                 let refused: Vec<_> = (0..count)
                     .filter_map(|i| Some((i, contract.check_observations(&inputs(i)).err()?)))
@@ -212,9 +219,7 @@ impl Controllers {
                         }
                     };
                     let all = rows.par_iter_mut().zip(actions.par_chunks_mut(len));
-                    if let Some(pool) = pool {
-                        pool.install(|| all.enumerate().for_each(step));
-                    }
+                    pool.install(|| all.enumerate().for_each(step));
                 }
                 refused
             });
@@ -239,18 +244,7 @@ impl Controllers {
                 );
                 return Err(PyErr::from_type(error.get_type(py), text));
             }
-            let actions = match (&mut write, out) {
-                (Some(write), Some(out)) => {
-                    if let Ok(values) = write.as_slice_mut() {
-                        values.copy_from_slice(actions);
-                    }
-                    out
-                }
-                _ => PyArray1::from_slice(py, actions)
-                    .reshape([count, len])?
-                    .into_any(),
-            };
-            Ok((actions, report(py, rows)?))
+            Ok((target.put(py, actions)?, report(py, rows)?))
         })
     }
 
@@ -327,7 +321,7 @@ impl Controllers {
         })
     }
 
-    /// Gives the memory back; whatever is called afterwards is refused.
+    /// Gives memory and threads back; whatever is called afterwards is refused.
     fn close(&self) -> PyResult<()> {
         *self.lock()? = None;
         Ok(())
@@ -342,9 +336,7 @@ impl Controllers {
     /// How many threads there are.
     #[getter]
     fn threads(&self) -> usize {
-        self.pool
-            .as_ref()
-            .map_or(0, rayon::ThreadPool::current_num_threads)
+        self.threads
     }
 
     fn __len__(&self) -> usize {

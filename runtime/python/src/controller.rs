@@ -11,7 +11,7 @@ use numpy::{PyArray1, PyArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyString;
 
-use crate::arrays::{self, Staged};
+use crate::arrays::{self, Staged, Target};
 use crate::cell::{Checked, Working};
 use crate::errors::{self, BusyError, ClosedError, InstructionError, StepError, WorkspaceError};
 use crate::policy::Policy;
@@ -106,6 +106,13 @@ struct Inner {
     told: Option<Told>,
 }
 
+impl Inner {
+    /// Takes in what is given for the channels.
+    fn read(&mut self, observation: &Bound<'_, PyAny>) -> PyResult<()> {
+        arrays::read(observation, &mut self.staged, self.needed, &mut self.given)
+    }
+}
+
 /// A policy at work: one observation in, one action out, once every control period.
 ///
 /// It belongs to one thread at a time and to the process that made it. Made by Policy.controller.
@@ -166,7 +173,7 @@ impl Controller {
     }
 
     fn lock(&self) -> PyResult<MutexGuard<'_, Option<Inner>>> {
-        self.process.check("controller")?;
+        self.process.check("controller", "policy.controller(...)")?;
         match self.inner.try_lock() {
             Ok(guard) => Ok(guard),
             Err(TryLockError::WouldBlock) => Err(BusyError::new_err(
@@ -197,7 +204,8 @@ impl Controller {
     ///
     /// `observation` is an array of exactly the channel's dtype and shape, contiguous; for a policy with several channels a dictionary of
     /// arrays by the channels' names, to which the noise channel may be added. With `out`, the action is written there and `out` is
-    /// returned: nothing is allocated. An observation that is refused leaves the controller as it was.
+    /// returned; for a policy of one channel nothing is allocated then but the report. An observation that is refused leaves the controller
+    /// as it was.
     #[pyo3(signature = (observation, out=None))]
     fn step<'py>(
         &self,
@@ -206,16 +214,8 @@ impl Controller {
         out: Option<Bound<'py, PyAny>>,
     ) -> PyResult<(Bound<'py, PyAny>, StepReport)> {
         self.work(|inner| {
-            arrays::read(
-                observation,
-                &mut inner.staged,
-                inner.needed,
-                &mut inner.given,
-            )?;
-            let mut write = match &out {
-                Some(out) => Some(arrays::writable(out, "action", &[inner.action.len()])?),
-                None => None,
-            };
+            inner.read(observation)?;
+            let target = Target::of(out, "action", &[inner.action.len()])?;
             let Inner {
                 working,
                 staged,
@@ -240,16 +240,7 @@ impl Controller {
                 })
             });
             let report = report.map_err(|error| errors::step(&error, self.contract()))?;
-            let action = match (&mut write, out) {
-                (Some(write), Some(out)) => {
-                    if let Ok(values) = write.as_slice_mut() {
-                        values.copy_from_slice(action);
-                    }
-                    out
-                }
-                _ => PyArray1::from_slice(py, action).into_any(),
-            };
-            Ok((action, report.into()))
+            Ok((target.put(py, action)?, report.into()))
         })
     }
 
@@ -296,16 +287,8 @@ impl Controller {
         out: Option<Bound<'py, PyAny>>,
     ) -> PyResult<Bound<'py, PyAny>> {
         self.work(|inner| {
-            arrays::read(
-                observation,
-                &mut inner.staged,
-                inner.needed,
-                &mut inner.given,
-            )?;
-            let mut write = match &out {
-                Some(out) => Some(arrays::writable(out, "action", &[inner.action.len()])?),
-                None => None,
-            };
+            inner.read(observation)?;
+            let target = Target::of(out, "action", &[inner.action.len()])?;
             let Inner {
                 working,
                 staged,
@@ -323,15 +306,7 @@ impl Controller {
                 }
                 other => StepError::new_err(other.to_string()),
             })?;
-            Ok(match (&mut write, out) {
-                (Some(write), Some(out)) => {
-                    if let Ok(values) = write.as_slice_mut() {
-                        values.copy_from_slice(action);
-                    }
-                    out
-                }
-                _ => PyArray1::from_slice(py, action).into_any(),
-            })
+            target.put(py, action)
         })
     }
 

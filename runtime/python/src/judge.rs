@@ -38,7 +38,7 @@ struct About {
     sub_tasks: Vec<String>,
     /// Indices of those that each instruction commands.
     commanded: Vec<Vec<usize>>,
-    /// What the policy says of itself.
+    /// What the policy says of itself, in the fields that are stated.
     contract: Value,
     /// What the reference and the environment say of the same.
     stated: Value,
@@ -47,15 +47,15 @@ struct About {
 
 /// Judges -> (verdict, certificate as JSON, certificate as HTML).
 ///
-/// `reference` and `run` are rollouts in the form of a reference's file; `replayed` has (instruction, episode, states float64 [n, S]) of the
-/// environment under the reference's actions; `about` is JSON.
+/// `reference` and `run` are rollouts in the form of a reference's file; `replayed` has (instruction, episode, states float64 [n, S], whether
+/// the environment ended the episode) of the environment under the reference's actions; `about` is JSON.
 #[pyfunction]
 pub fn judge(
     py: Python<'_>,
     controller: &Controller,
     reference: Vec<u8>,
     run: Vec<u8>,
-    replayed: Vec<(usize, usize, Bound<'_, PyAny>)>,
+    replayed: Vec<(usize, usize, Bound<'_, PyAny>, bool)>,
     about: &str,
 ) -> PyResult<(&'static str, String, String)> {
     let broken = |error: &dyn std::fmt::Display| ProofError::new_err(error.to_string());
@@ -64,12 +64,19 @@ pub fn judge(
     };
     let (reference, run) = (read(&reference, "the reference")?, read(&run, "the run")?);
     let about: About = serde_json::from_str(about).map_err(|error| broken(&error))?;
-    let states = replayed.iter().map(|(instruction, episode, states)| {
-        let (shape, values) = arrays::values::<f64>(states, "states", 2)?;
-        Ok((*instruction, *episode, shape[1], values))
-    });
-    let states = states.collect::<PyResult<Vec<_>>>()?;
-    let physics = environment(&reference, &states);
+    let rows = replayed
+        .iter()
+        .map(|(instruction, episode, states, ended)| {
+            let (shape, states) = arrays::values::<f64>(states, "states", 2)?;
+            Ok(Replayed {
+                instruction: *instruction,
+                episode: *episode,
+                len: shape[1].max(1),
+                states,
+                ended: *ended,
+            })
+        });
+    let physics = environment(&reference, &rows.collect::<PyResult<Vec<_>>>()?);
     let mut asked = controller.settings().working(controller.checked())?;
     let view = controller.checked().view();
     let contract = view.contract();
@@ -78,17 +85,16 @@ pub fn judge(
     let tolerance = view.golden().map(|golden| f64::from(golden.tolerance()));
     let (answers, numbering) = Answers::judge(&reference, &replays, tolerance);
     let rollouts = pairs(&reference, &numbering, &run, &about, contract);
-    let (episodes, rules) = (reference.episodes_per_instruction, controller.rule());
     let setting = Setting {
         environment: about.environment,
         bundle_sha256: contract.bundle_sha256().to_owned(),
         image_sha256: lads_compiler::sha256(view.image()),
         image_stored: lads_host::stored(view),
-        decision: rules,
+        decision: controller.rule(),
         isa: asked.with(|controller| controller.isa().name().to_owned()),
         seed: reference.seed,
         noise: about.noise,
-        episodes_per_instruction: episodes,
+        episodes_per_instruction: reference.episodes_per_instruction,
         instructions: reference.instructions.len(),
         versions: about.versions,
     };
@@ -100,7 +106,8 @@ pub fn judge(
         logits_from: None,
         versions: reference.versions.clone(),
     };
-    let compared = Compared::with_stated(&about.contract, &about.stated);
+    let remedy = "give control_period=, or an environment that has its dt";
+    let compared = Compared::with_stated(&about.contract, &about.stated, remedy);
     let certificate = Certificate::new(
         setting,
         used,
@@ -130,39 +137,55 @@ fn known(reference: &Reference, controller: &Controller) -> PyResult<Vec<Option<
         .collect()
 }
 
+/// An episode of the environment under the reference's actions.
+struct Replayed {
+    instruction: usize,
+    episode: usize,
+    /// Elements of a state.
+    len: usize,
+    states: Vec<f64>,
+    /// Whether it was over when the actions were.
+    ended: bool,
+}
+
 /// The environment alone: its states under the reference's actions.
-fn environment(reference: &Reference, replayed: &[(usize, usize, usize, Vec<f64>)]) -> Physics {
+fn environment(reference: &Reference, replayed: &[Replayed]) -> Physics {
     let mut physics = Physics::new();
-    for (instruction, episode, len, states) in replayed {
+    for Replayed {
+        instruction,
+        episode,
+        len,
+        states,
+        ended,
+    } in replayed
+    {
         let row = reference.instructions.get(*instruction);
         let recorded = row.and_then(|row| Some((row, row.episodes.get(*episode)?)));
         let Some((row, Some(trace))) = recorded.map(|(row, it)| (row, it.trace.as_ref())) else {
             continue;
         };
         physics.episodes += 1;
-        let both = states.chunks_exact((*len).max(1));
+        let both = states.chunks_exact(*len);
         let place = |step: usize, what: String| Answer {
             instruction: row.id.clone(),
             episode: *episode,
             step,
             what,
         };
-        for (step, (ours, theirs)) in both
-            .zip(trace.states.chunks_exact((*len).max(1)))
-            .enumerate()
-        {
+        for (step, (ours, theirs)) in both.zip(trace.states.chunks_exact(*len)).enumerate() {
             physics.compare(ours, theirs, || place(step, String::new()));
         }
-        let lens = [states.len(), trace.states.len()].map(|all| all / (*len).max(1));
-        if lens[0] != lens[1] {
-            let what = format!(
-                "the environment ended after {} states, the reference's after {}",
-                lens[0], lens[1]
-            );
-            physics
-                .first_difference
-                .get_or_insert_with(|| place(lens[0], what));
-        }
+        let [ours, theirs] = [states.len(), trace.states.len()].map(|all| all / len);
+        let otherwise = if ours != theirs {
+            format!("the environment ended after {ours} states, the reference's after {theirs}")
+        } else if !ended {
+            format!("the environment goes on after {ours} states, the reference's ended")
+        } else {
+            continue;
+        };
+        physics
+            .first_difference
+            .get_or_insert_with(|| place(ours, otherwise));
     }
     physics
 }
@@ -224,6 +247,7 @@ fn replay(
                 plan: selected.map(|selected| selected.index),
                 logits: scores.to_vec(),
                 action: action.clone(),
+                ..Reply::default()
             };
             controller.executed(done)?;
             Ok(reply)

@@ -24,6 +24,7 @@ mod record;
 mod report;
 
 use std::ffi::OsString;
+use std::path::PathBuf;
 
 use pyo3::prelude::*;
 
@@ -31,6 +32,18 @@ use pyo3::prelude::*;
 #[pyfunction]
 fn command(py: Python<'_>, arguments: Vec<OsString>) -> u8 {
     py.detach(|| lads_cli::command(arguments))
+}
+
+/// Writes a text to a file, which is there whole or not at all.
+#[pyfunction]
+fn write(py: Python<'_>, path: PathBuf, text: &str) -> PyResult<()> {
+    py.detach(|| lads_host::output::write(&path, text.as_bytes()))
+        .map_err(|error| {
+            errors::ProofError::new_err(format!(
+                "{}: it cannot be written ({error}); name a file in an existing, writable folder",
+                path.display()
+            ))
+        })
 }
 
 /// The native half of the package; import `lads` instead.
@@ -49,8 +62,10 @@ fn _lads(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(process::forked, module)?)?;
     module.add_function(wrap_pyfunction!(proof::wilson, module)?)?;
     module.add_function(wrap_pyfunction!(proof::score, module)?)?;
+    module.add_function(wrap_pyfunction!(record::check_log, module)?)?;
     module.add_function(wrap_pyfunction!(record::write_log, module)?)?;
     module.add_function(wrap_pyfunction!(judge::judge, module)?)?;
     module.add_function(wrap_pyfunction!(command, module)?)?;
+    module.add_function(wrap_pyfunction!(write, module)?)?;
     Ok(())
 }

@@ -27,8 +27,10 @@ pub struct Policy {
 
 /// Opens a policy, a bundle (.onnx), which is compiled on the way, or a compiled image (.lads).
 ///
-/// `weights` and `low_level` are 'f32', 'f16', 'bf16', 'int16' or 'int8', `cache` is 'f32' or 'f16'; what is left out is as the bundle
-/// was tuned (`lads-run tune`), and 'f32' where it was not. Fewer bits have to pass the gate: the golden episode replays with the same indices and with actions inside `tolerance` (in the action's units).
+/// `weights` and `low_level` are 'f32', 'f16', 'bf16', 'int16' or 'int8', `cache` is 'f32' or 'f16'. Without `weights`,
+/// what is left out is as the bundle was tuned (`lads-run tune`), and 'f32' where it was not; with it, `low_level` is as `weights` and
+/// `cache` 'f32'. Fewer bits have to pass the gate: the golden episode replays with the same indices and with actions inside `tolerance`
+/// (in the action's units); with `force` they need not.
 #[pyfunction]
 #[pyo3(signature = (path, *, weights=None, low_level=None, cache=None, tolerance=None, force=false))]
 pub fn open(
@@ -55,17 +57,22 @@ pub fn open(
         low_level: weight("low_level", low_level)?,
         cache: cache.map(caches).transpose()?,
     };
-    let (options, opened) = py.detach(|| {
+    let opened = py.detach(|| {
         // What is no bundle is refused below, with what it is instead.
-        let bundle = Bundle::open(&path).ok();
+        let asked = formats != Formats::default();
+        let bundle = asked.then(|| Bundle::open(&path).ok()).flatten();
+        let storage = bundle.map(|bundle| formats.storage(&bundle)).transpose()?;
         let options = Options {
-            storage: bundle.and_then(|bundle| formats.storage(&bundle)),
+            storage: storage.flatten(),
             tolerance,
             force,
         };
         let opened = lads_host::open_with(&path, &options);
-        (options, opened)
+        Ok((options, opened))
     });
+    let (options, opened) = opened.map_err(|error: lads_compiler::BundleError| {
+        OpenError::new_err(format!("{}: {error}", path.display()))
+    })?;
     let opened = opened.map_err(|error| opening(&error))?;
     let asked = formats != Formats::default() || options != Options::default();
     if asked && !opened.is_bundle() {

@@ -33,13 +33,13 @@ impl Process {
         self == Self::current()
     }
 
-    /// Refuses what was made before a fork.
-    pub fn check(self, what: &str) -> PyResult<()> {
+    /// Refuses what was made before a fork; `how` makes one.
+    pub fn check(self, what: &str, how: &str) -> PyResult<()> {
         if self.is_current() {
             return Ok(());
         }
         Err(ForkError::new_err(format!(
-            "the {what} was made before this process was forked, and belongs to the other one; make one here, by policy.controller(...)"
+            "the {what} was made before this process was forked, and belongs to the other one; make one here, by {how}"
         )))
     }
 }

@@ -17,15 +17,21 @@ pub fn wilson(successes: usize, trials: usize) -> PyResult<(f64, f64)> {
     Ok((interval.0, interval.1))
 }
 
-/// The score of episodes, each as (commanded sub-tasks completed, others completed, success) -> JSON: N-rate, K-rates, full success,
-/// their intervals.
+/// The score of episodes, each as (commanded sub-tasks completed, success) -> JSON: N-rate, K-rates, full success, their intervals. What else
+/// was completed is not counted.
 #[pyfunction]
-pub fn score(outcomes: Vec<(usize, usize, bool)>) -> PyResult<String> {
+pub fn score(outcomes: Vec<(usize, bool)>) -> PyResult<String> {
     let outcomes = outcomes.into_iter();
-    let score = Score::of(outcomes.map(|(completed, un_instructed, success)| Outcome {
+    let score = Score::of(outcomes.map(|(completed, success)| Outcome {
         completed,
-        un_instructed,
+        un_instructed: 0,
         success,
     }));
-    serde_json::to_string(&score).map_err(|error| ProofError::new_err(error.to_string()))
+    let mut score =
+        serde_json::to_value(&score).map_err(|error| ProofError::new_err(error.to_string()))?;
+    // Nobody has looked, so that 0 would be a claim.
+    if let Some(fields) = score.as_object_mut() {
+        fields.remove("un_instructed");
+    }
+    Ok(score.to_string())
 }

@@ -36,17 +36,28 @@ pub struct Recorded<'py> {
     completions: Vec<(String, usize)>,
 }
 
-/// Writes episodes to an MCAP file. `noise` is the environment's, in words; `notes` is whatever else is worth knowing.
+/// Refuses before the first step what [`write_log`] would refuse after the last: a policy whose observation is not one vector of floats, a
+/// path that cannot be written.
 #[pyfunction]
-pub fn write_log(
-    py: Python<'_>,
+pub fn check_log(
     policy: &Policy,
     path: PathBuf,
     seed: u64,
     noise: String,
     notes: BTreeMap<String, String>,
-    episodes: Vec<Recorded<'_>>,
 ) -> PyResult<()> {
+    origin(policy, seed, noise, notes)?;
+    lads_host::output::check(&[], &[("log", &path)])
+        .map_err(|error| RecordError::new_err(error.to_string()))
+}
+
+/// Where a log comes from; its period is known once there are episodes.
+fn origin(
+    policy: &Policy,
+    seed: u64,
+    noise: String,
+    notes: BTreeMap<String, String>,
+) -> PyResult<Origin> {
     let contract = policy.checked().view().contract();
     let channels: Vec<_> = contract.observations().collect();
     let [observation] = &channels[..] else {
@@ -62,17 +73,34 @@ pub fn write_log(
             observation.name()
         )));
     }
-    let origin = Origin {
+    Ok(Origin {
         bundle_sha256: contract.bundle_sha256().to_owned(),
         environment: contract.environment_id().to_owned(),
         environment_version: contract.environment_version().to_owned(),
         seed,
         noise,
         control_period_s: f64::from(contract.control_period_s()),
-        period: period(&episodes),
+        period: None,
         observation_names: names(observation),
         action_names: names(&contract.action()),
         notes,
+    })
+}
+
+/// Writes episodes to an MCAP file. `noise` is the environment's, in words; `notes` is whatever else is worth knowing.
+#[pyfunction]
+pub fn write_log(
+    py: Python<'_>,
+    policy: &Policy,
+    path: PathBuf,
+    seed: u64,
+    noise: String,
+    notes: BTreeMap<String, String>,
+    episodes: Vec<Recorded<'_>>,
+) -> PyResult<()> {
+    let origin = Origin {
+        period: period(&episodes),
+        ..origin(policy, seed, noise, notes)?
     };
     let flights = episodes
         .into_iter()

@@ -4,6 +4,8 @@ import faulthandler
 import os
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,8 @@ import lads
 faulthandler.enable()
 
 PROJECT = Path(__file__).parents[3]
+# Also for the other processes that tests start: they inherit the path.
+sys.path.insert(0, str(PROJECT / "exporter"))
 KINDS = ("plain", "recurrent", "stacked", "camera", "skilldiffuser")
 
 
@@ -60,3 +64,28 @@ def replay(controller, golden):
             given["noise"] = golden.noise[step]
         actions.append(controller.step(given)[0])
     return np.stack(actions)
+
+
+def busy(call, threads):
+    """What `call` is refused with while other threads are in it, and how often it was not."""
+    stop, calls, refused = threading.Event(), [], []
+
+    def work():
+        while not stop.is_set():
+            try:
+                call()
+                calls.append(1)
+            except lads.errors.BusyError as error:
+                refused.append(str(error))
+
+    all_ = [threading.Thread(target=work) for _ in range(threads)]
+    for thread in all_:
+        thread.start()
+    deadline = time.monotonic() + 60
+    while not refused and time.monotonic() < deadline:
+        time.sleep(0.01)
+    stop.set()
+    for thread in all_:
+        thread.join()
+    assert refused, "in a minute no two threads met"
+    return refused[0], len(calls)

@@ -1,12 +1,10 @@
 """Environments of the tests, importable by other processes."""
 
-import sys
+import os
 from pathlib import Path
 
 import gymnasium
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[3] / "exporter"))
 
 
 def inside(state):
@@ -41,6 +39,17 @@ class Servo(gymnasium.Env):
         done = self.time == self.STEPS
         info = {"is_success": bool(self.state[:3].sum() > 0), "tasks": ["low"] * bool(self.state[0] < 0) + ["high"] * bool(self.state[1] > 0.1)}
         return self.state.copy(), float(-np.square(self.state).sum()), False, done, info
+
+
+class Closing(Servo):
+    """Leaves a file of its process when it is closed."""
+
+    def __init__(self, folder):
+        super().__init__()
+        self.folder = folder
+
+    def close(self):
+        (Path(self.folder) / f"closed-{os.getpid()}").touch()
 
 
 class Kitchen:

@@ -2,13 +2,12 @@
 
 import os
 import threading
-import time
 
 import numpy as np
 import pytest
 
 import lads
-from conftest import KINDS, replay
+from conftest import KINDS, busy, replay
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -95,6 +94,8 @@ def test_instructions(kitchen):
         ("sing a song", "the policy does not know it; the nearest that it knows"),
         (words[:, :5].copy(), "the words have 5 elements each, the contract says 384"),
         (words[0], "give one of 2 dimensions"),
+        (words[:, ::2], "array `instruction`: the array is not contiguous"),
+        (np.ndarray(words.shape, np.float32, bytearray(words.nbytes + 1), 1), "array `instruction`: the array is not aligned"),
         (words.astype(float), "its dtype is float64"),
         (np.full_like(words, np.nan), "word element 0 is not finite"),
         (np.zeros((99, 384), np.float32), "an instruction of 99 words"),
@@ -203,26 +204,8 @@ def test_use_after_close(plain, seen):
 def test_one_controller_and_two_threads(kitchen):
     seen = kitchen.golden.observations["observation"][0]
     controller = kitchen.controller(kitchen.golden.instruction)
-    stop, steps, refused = threading.Event(), [], []
-
-    def work():
-        while not stop.is_set():
-            try:
-                controller.step(seen)
-                steps.append(1)
-            except lads.errors.BusyError as error:
-                refused.append(str(error))
-
-    threads = [threading.Thread(target=work) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    deadline = time.monotonic() + 60
-    while not refused and time.monotonic() < deadline:
-        time.sleep(0.01)
-    stop.set()
-    for thread in threads:
-        thread.join()
-    assert refused and "at work in another thread" in refused[0] and steps
+    refused, steps = busy(lambda: controller.step(seen), 4)
+    assert "the controller is at work in another thread" in refused and steps
     controller.reset()
     assert controller.step(seen)[1].timestep == 0, "it still works"
 
@@ -261,13 +244,14 @@ def test_a_fork_in_the_middle(kitchen):
             fresh = kitchen.controller(kitchen.golden.instruction)
             same = np.array_equal(fresh.step(seen)[0], action)
             del batch
-            os.write(write, f"{len(said)} {same} {said[0]}".encode())
+            os.write(write, f"{len(said)} {same} {said[0]}; {said[2]}".encode())
         finally:
             os._exit(0)
     os.close(write)
     said = b"".join(iter(lambda: os.read(read, 4096), b"")).decode()
     _, status = os.waitpid(child, 0)
     assert status == 0 and said.startswith("3 True the controller was made before this process was forked"), said
+    assert said.endswith("the batch of controllers was made before this process was forked, and belongs to the other one; make one here, by lads.vector.Controllers(policy, ...)")
     controller.reset()
     assert np.array_equal(controller.step(seen)[0], action), "the parent goes on"
 

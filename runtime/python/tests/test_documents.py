@@ -1,14 +1,11 @@
-"""Every snippet of the documents runs as it is typed."""
+"""Every snippet of Python in the documents runs as it is typed."""
 
 import os
 import re
-import sys
 
 import pytest
 
 from conftest import PROJECT
-
-sys.path.insert(0, str(PROJECT / "exporter"))
 
 DOCUMENTS = ("README.md", "docs/python.md", "runtime/python/README.md")
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)

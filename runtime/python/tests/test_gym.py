@@ -1,5 +1,6 @@
 """Evaluation in environments of Gymnasium's API: classic ones, the official kitchen, and one of our own."""
 
+import functools
 import json
 
 import gymnasium
@@ -13,7 +14,7 @@ from lads import gym
 
 
 def servo(plain, **arguments):
-    return gym.evaluate(plain.controller(), environments.Servo, **{"episodes": 6, "seed": 3, **arguments})
+    return gym.evaluate(plain.controller(), **{"make_env": environments.Servo, "episodes": 6, "seed": 3, **arguments})
 
 
 def test_episodes_have_seeds_of_their_own(plain):
@@ -29,8 +30,9 @@ def test_episodes_have_seeds_of_their_own(plain):
         controller.executed(np.zeros(3, np.float32))  # it stays as it is
 
 
-def test_over_processes_it_is_the_same(plain):
-    assert servo(plain, processes=2) == servo(plain)
+def test_over_processes_it_is_the_same(plain, tmp_path):
+    assert servo(plain, processes=2, make_env=functools.partial(environments.Closing, tmp_path)) == servo(plain)
+    assert 1 <= len(list(tmp_path.glob("closed-*"))) <= 2, "the environment of every process is closed"
 
 
 def test_a_loop_of_ones_own_is_the_same(plain):
@@ -68,7 +70,7 @@ def test_success_is_what_one_says(plain):
     for row in tasks.episodes:
         assert row.success == (len(row.completions) == 2) and {name for name, _ in row.completions} <= {"high", "low"}
     assert tasks.score["n_rate"] == pytest.approx(np.mean([len(row.completions) for row in tasks.episodes]))
-    assert tasks.score["full_success"] == tasks.success.rate
+    assert tasks.score["full_success"] == tasks.success.rate and "un_instructed" not in tasks.score
     with pytest.raises(lads.errors.EvaluationError, match="no 'episode_task_completions'; give completed="):
         servo(plain, sub_tasks=("high",))
 
@@ -90,7 +92,8 @@ def test_progress_is_told(plain):
     ("arguments", "text"),
     [
         ({"episodes": 0}, "0 episodes in 1 processes"),
-        ({"make_env": lambda: environments.Servo(observe=5), "observation": lambda seen: seen[:5]}, r"episode 0: channel `observation`: its shape is \(5,\)"),
+        ({"max_steps": 0}, "max_steps is 0; give 1 or more"),
+        ({"make_env": lambda: environments.Servo(observe=5), "observation": lambda seen: seen[:5]}, r"episode 0: channel 'observation': the environment gives shape \(5,\), the policy takes \(8,\); give observation="),
         ({"observation": lambda seen: {"camera": seen}}, "episode 0: the environment's observation has no 'observation', it has 'camera'"),
         ({"observation": lambda seen: seen * np.nan}, "episode 0: channel `observation`, element 0 `joint1` is not finite"),
         ({"make_env": lambda: gymnasium.make("CartPole-v1"), "observation": environments.fill}, "the environment takes Discrete.*give action="),
@@ -117,7 +120,8 @@ def test_classic_environments(plain, name, action):
     assert len(found.episodes) == 3 and found.success is None
     again = gym.evaluate(plain.controller(), lambda: gymnasium.make(name), episodes=3, observation=environments.fill, action=action, processes=2)
     assert again == found
-    assert gym.evaluate(plain.controller(), lambda: gymnasium.make(name), 3, observation=environments.fill, action=action, success=lambda rollout: rollout.terminated).success
+    judged = gym.evaluate(plain.controller(), lambda: gymnasium.make(name), 3, observation=environments.fill, action=action, success=lambda rollout: rollout.terminated)
+    assert judged.success == gym.Rate(sum(row.terminated for row in found.episodes), 3)
 
 
 def test_the_official_kitchen_as_lads_run_has_it():

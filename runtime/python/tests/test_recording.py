@@ -4,13 +4,24 @@ import json
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 import environments
 import lads
 
 
+def read(path):
+    """Messages by topic, and the metadata."""
+    found = {}
+    with path.open("rb") as file:
+        opened = make_reader(file)
+        (metadata,) = [row.metadata for row in opened.iter_metadata()]
+        for _, channel, message in opened.iter_messages():
+            found.setdefault(channel.topic, []).append(json.loads(message.data))
+    return found, metadata
+
+
 def test_a_recording_holds_what_happened(kitchen, tmp_path):
-    reader = pytest.importorskip("mcap.reader")
     rows = kitchen.golden.observations["observation"]
     controller = kitchen.controller("kbls")
     path = tmp_path / "flight.mcap"
@@ -24,12 +35,8 @@ def test_a_recording_holds_what_happened(kitchen, tmp_path):
         recorder.instruct("mbts")
         recorder.step(rows[0])
         assert not path.exists(), "nothing is half-written"
-    found = {}
-    with path.open("rb") as file:
-        opened = reader.make_reader(file)
-        (metadata,) = [row.metadata for row in opened.iter_metadata()]
-        for _, channel, message in opened.iter_messages():
-            found.setdefault(channel.topic, []).append(json.loads(message.data))
+    found, metadata = read(path)
+    assert json.loads(metadata["action_names"]) == [element.name for element in kitchen.contract.action.elements]
     assert metadata["bundle_sha256"] == kitchen.contract.bundle_sha256 and metadata["seed"] == "3" and metadata["note.robot"] == "none"
     assert [(row["instruction_id"], row["steps"], row["success"]) for row in found["/episode"]] == [("kbls", 12, True), ("mbts", 1, False)]
     assert found["/completion"] == [{"sub_task": "kettle", "step": 5}]
@@ -42,6 +49,7 @@ def test_a_recording_holds_what_happened(kitchen, tmp_path):
 
 
 def test_it_drives_an_environment(plain, tmp_path):
+    seen, done = [], []
     with lads.Recorder(plain.controller(), tmp_path / "servo.mcap") as recorder:
         policy = lads.gym.Policy(recorder)
         environment = environments.Servo()
@@ -49,17 +57,40 @@ def test_it_drives_an_environment(plain, tmp_path):
             policy.reset()
             observation, _ = environment.reset(seed=seed)
             for _ in range(5):
-                observation, *_ = environment.step(policy(observation))
-    assert (tmp_path / "servo.mcap").stat().st_size > 1000
+                seen.append(observation.astype(np.float32))
+                done.append(policy(observation))
+                observation, *_ = environment.step(done[-1])
+    found, _ = read(tmp_path / "servo.mcap")
+    assert [(row["episode"], row["steps"]) for row in found["/episode"]] == [(0, 5), (1, 5)]
+    assert np.array_equal(np.float32([row["values"] for row in found["/observation"]]), seen)
+    assert np.array_equal(np.float32([row["policy"] for row in found["/action"]]), done)
+
+
+def test_what_is_recorded_is_the_observation_by_its_name(bundles, plain, seen, tmp_path):
+    policy = lads.open(bundles["skilldiffuser"])
+    golden = policy.golden
+    given = {"noise": golden.noise[0], **{name: values[0] for name, values in golden.observations.items()}}
+    recorder = lads.Recorder(policy.controller(golden.instruction), tmp_path / "a.mcap")
+    with pytest.raises(lads.errors.RecordError, match="does not hold noise that is given"):
+        recorder.step(given)
+    shared = seen.copy()
+    with lads.Recorder(plain.controller(), tmp_path / "b.mcap") as recorder:
+        recorder.step({"observation": seen})
+        recorder.step(shared, shared[:3])
+        with pytest.raises(lads.errors.InputError, match="channel `observation` is not given"):
+            recorder.step({})
+    found, _ = read(tmp_path / "b.mcap")
+    assert np.array_equal(np.float32([row["values"] for row in found["/observation"]]), [seen, seen])
 
 
 def test_what_cannot_be_recorded_is_named(bundles, plain, seen, tmp_path):
     camera = lads.open(bundles["camera"])
     with pytest.raises(lads.errors.RecordError, match="the policy observes `observation`, `camera`, `mode`; a recording holds one channel"):
         lads.Recorder(camera.controller(), tmp_path / "a.mcap")
-    with pytest.raises(lads.errors.RecordError, match="nowhere/a.mcap: it cannot be written"):
-        with lads.Recorder(plain.controller(), tmp_path / "nowhere/a.mcap") as recorder:
-            recorder.step(seen)
+    with pytest.raises(lads.errors.RecordError, match="nowhere/a.mcap: cannot be written"):
+        lads.Recorder(plain.controller(), tmp_path / "nowhere/a.mcap")
+    with pytest.raises(OverflowError):
+        lads.Recorder(plain.controller(), tmp_path / "a.mcap", seed=-1)
     with pytest.raises(ZeroDivisionError):
         with lads.Recorder(plain.controller(), tmp_path / "b.mcap") as recorder:
             recorder.step(seen)

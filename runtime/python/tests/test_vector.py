@@ -1,13 +1,14 @@
 """Batches of controllers over threads: the same bits as one after the other."""
 
-import threading
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import lads
-from conftest import replay
+from conftest import busy, replay
 from lads.vector import Controllers
 
 
@@ -90,6 +91,21 @@ def test_batches_that_make_no_sense(kitchen, arguments, text):
         Controllers(kitchen, 2).step(np.stack([kitchen.golden.observations["observation"][0]] * 2))
 
 
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc lists a process's threads on Linux alone")
+def test_a_closed_batch_has_no_threads(plain, seen):
+    running = lambda: {path.name for path in Path("/proc/self/task").iterdir()}
+    before = running()
+    batch = Controllers(plain, 3, threads=3)
+    batch.step(np.stack([seen] * 3))
+    own = running() - before
+    assert len(own) == 3
+    batch.close()
+    deadline = time.monotonic() + 60
+    while running() & own and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not running() & own and batch.threads == 3
+
+
 def test_never_more_threads_than_controllers(plain):
     assert Controllers(plain, 2, threads=10**9).threads == 2 and Controllers(plain, 1).threads == 1
 
@@ -122,24 +138,7 @@ def test_wrong_arrays_are_named(plain, seen, change, text):
 def test_one_batch_and_two_threads(kitchen):
     seen = np.repeat(kitchen.golden.observations["observation"][:1], 8, 0)
     batch = Controllers(kitchen, 8, kitchen.golden.instruction, threads=1)
-    stop, refused = threading.Event(), []
-
-    def work():
-        while not stop.is_set():
-            try:
-                batch.step(seen)
-            except lads.errors.BusyError as error:
-                refused.append(str(error))
-
-    threads = [threading.Thread(target=work) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    deadline = time.monotonic() + 60
-    while not refused and time.monotonic() < deadline:
-        time.sleep(0.01)
-    stop.set()
-    for thread in threads:
-        thread.join()
-    assert refused and "at work in another thread" in refused[0]
+    refused, _ = busy(lambda: batch.step(seen), 2)
+    assert "the batch is at work in another thread" in refused
     batch.reset()
     assert batch.step(seen)[1].timestep.tolist() == [0] * 8

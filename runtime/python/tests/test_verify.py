@@ -1,23 +1,20 @@
 """Faithful exports are EQUIVALENT to the policy in PyTorch, and every fault of an export is DIFFERENT."""
 
 import json
-import sys
 
 import gymnasium
+import jsonschema
 import numpy as np
 import onnx
 import pytest
+import torch
+from lads_exporter import bundle, random_policy
+from lads_exporter.kinds import KINDS
+from lads_exporter.twin import Twin
 
 import environments
 import lads
 from conftest import PROJECT
-
-sys.path.insert(0, str(PROJECT / "exporter"))
-
-import torch  # noqa: E402
-from lads_exporter import bundle, random_policy  # noqa: E402
-from lads_exporter.kinds import KINDS  # noqa: E402
-from lads_exporter.twin import Twin  # noqa: E402
 
 # PyTorch's threads would only wait for each other.
 torch.set_num_threads(1)
@@ -92,7 +89,7 @@ def test_a_faithful_export_is_equivalent(tmp_path):
     data = found.data
     assert data["policy"]["compared_steps"] == 5 * 40 and data["policy"]["largest_action_difference"] < 1e-5
     assert data["environment"]["identical_bits"] and data["environment"]["states"] == 5 * 41
-    assert data["rollouts"]["episodes"] == 70 and data["contract"]["fields"] == ["action", "control_period_s", "observation"]
+    assert data["rollouts"]["episodes"] == 70 and data["contract"]["fields"] == ["control_period_s"]
     assert data["reference"]["weights_from"] == "PyTorch" and data["setting"]["environment"] == "Servo"
 
 
@@ -188,7 +185,6 @@ def test_an_environment_that_is_not_the_same_twice(tmp_path):
 
 
 def test_certificates_are_written(tmp_path):
-    jsonschema = pytest.importorskip("jsonschema")
     found = recurrent(tmp_path)
     assert found.verdict == "INCONCLUSIVE"
     found.write(tmp_path / "certificate.json")
@@ -197,6 +193,62 @@ def test_certificates_are_written(tmp_path):
     jsonschema.validate(json.loads((tmp_path / "certificate.json").read_text()), schema)
     page = (tmp_path / "certificate.html").read_text()
     assert "INCONCLUSIVE" in page and "weights from PyTorch" in page and str(found).startswith("INCONCLUSIVE\n- ")
+    with pytest.raises(lads.errors.ProofError, match="nowhere/a.html: it cannot be written"):
+        found.write(tmp_path / "nowhere/a.html")
+
+
+@pytest.mark.parametrize(("more", "text"), [(-10, "the environment ended after 31 states, the reference's after 41"), (10, "the environment goes on after 41 states, the reference's ended")])
+def test_an_environment_that_ends_otherwise(tmp_path, more, text):
+    policy, opened, _ = exported("recurrent", tmp_path)
+
+    class Third(environments.Servo):
+        """Every third episode, which is the reference's actions executed again, has another length."""
+
+        episodes = 0
+
+        def reset(self, **arguments):
+            self.episodes += 1
+            self.STEPS = 40 + more * (self.episodes % 3 == 0)
+            return super().reset(**arguments)
+
+    found = lads.verify(InPyTorch(policy, (-1, 1)), opened.controller(), Third, episodes=2)
+    assert found.verdict == "DIFFERENT" and found.data["environment"]["first_difference"]["what"] == text, str(found)
+
+
+def test_without_a_control_period_the_contract_is_not_compared(plain):
+    class Untimed(environments.Servo):
+        dt = None
+
+    same = plain.controller()
+    verify = lambda **arguments: lads.verify(lambda seen: same.step(seen)[0], plain.controller(), Untimed, episodes=60, traced=1, success=lambda rollout: True, **arguments)
+    found = verify()
+    assert found.verdict == "INCONCLUSIVE" and found.data["contract"]["fields"] == []
+    assert any("the contract was not compared" in row and "give control_period=" in row and "--complete" not in row for row in found.reasons), str(found)
+    found = verify(control_period=plain.contract.control_period)
+    assert found.verdict == "EQUIVALENT" and any("the contract beyond its control period" in row for row in found.data["not_covered"])
+
+
+def test_a_plan_without_scores_is_refused(tmp_path):
+    _, opened, model = exported("lads", tmp_path)
+    whole = InOnnxRuntime(model)
+
+    class WithoutScores:
+        reset = whole.reset
+
+        def __call__(self, observation):
+            reply = whole(observation)
+            return lads.Reply(reply.action, reply.plan)
+
+    known = [opened.contract.instructions[0].id]
+    with pytest.raises(lads.errors.ProofError, match="a plan before it has given scores"):
+        lads.verify(WithoutScores(), opened.controller(), environments.Servo, instructions=known, episodes=1, success="is_success")
+
+
+def narrow():
+    """Less than the policy may answer."""
+    environment = environments.Servo()
+    environment.action_space = gymnasium.spaces.Box(np.float32([-5, -0.5, -5]), np.float32([5, 0.5, 5]))
+    return environment
 
 
 @pytest.mark.parametrize(
@@ -206,6 +258,9 @@ def test_certificates_are_written(tmp_path):
         ({"episodes": 0}, lads.errors.ProofError, "0 episodes of which"),
         ({"make_env": lambda: gymnasium.make("Pendulum-v1"), "observation": environments.fill, "action": lambda action: action[:1]}, lads.errors.EvaluationError, "says nothing about success; give success="),
         ({"success": "won"}, lads.errors.EvaluationError, "no 'won'; give success="),
+        ({"max_steps": 0}, lads.errors.EvaluationError, "max_steps is 0"),
+        ({"make_env": narrow}, lads.errors.ProofError, "the contract's limits of joint2_velocity exceed the environment's action space; give action="),
+        ({"make_env": lambda: environments.Servo(observe=5), "observation": lambda seen: seen[:5]}, lads.errors.InputError, r"channel 'observation': the environment gives shape \(5,\), the policy takes \(8,\); give observation="),
     ],
 )
 def test_what_cannot_be_compared_is_named(plain, arguments, error, text):

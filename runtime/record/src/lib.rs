@@ -1,4 +1,5 @@
-//! The flight recorder: episodes as an MCAP file that Foxglove opens and that `lads-run replay` computes again.
+//! The flight recorder: episodes as an MCAP file, for Foxglove and whatever else reads MCAP. `lads-run replay` computes a log of
+//! `lads-run --log` again.
 //!
 //! One channel per kind of message, JSON with a JSON schema each:
 //!
@@ -22,6 +23,8 @@
 
 mod read;
 mod schema;
+#[cfg(test)]
+mod tests;
 pub mod trace;
 mod write;
 
@@ -36,7 +39,9 @@ pub use read::read;
 pub use write::write;
 
 /// Version of the messages; changes when one changes its meaning or goes.
-pub const FORMAT_VERSION: u32 = 1;
+///
+/// Version 1, which is read too, has names of elements with spaces between them; version 2 has them as a JSON array.
+pub const FORMAT_VERSION: u32 = 2;
 
 /// Name of the metadata record.
 const METADATA: &str = "lads";
@@ -102,8 +107,8 @@ pub enum LogError {
     /// It is no MCAP file, or cut off, or damaged.
     #[error("it is no whole MCAP file ({0}); record it again")]
     Mcap(#[from] mcap::McapError),
-    /// It is MCAP, but not from `lads-run --log`.
-    #[error("it is no log of lads-run ({0}); record one with --log")]
+    /// It is MCAP, but not what [`write()`] makes.
+    #[error("it is no log of lads ({0}); record one with lads-run --log")]
     Foreign(String),
 }
 

@@ -89,13 +89,17 @@ fn origin(bytes: &[u8]) -> Result<(Origin, usize), LogError> {
             .ok_or_else(|| foreign(format!("its metadata lack {key}")))
     };
     let version: u32 = number(&entries, "format_version")?;
-    if version != FORMAT_VERSION {
+    if !(1..=FORMAT_VERSION).contains(&version) {
         return Err(foreign(format!(
             "its messages are of version {version}, known is {FORMAT_VERSION}"
         )));
     }
     let names = |key: &str| -> Result<Vec<String>, LogError> {
-        Ok(text(key)?.split_whitespace().map(str::to_owned).collect())
+        let text = text(key)?;
+        if version == 1 {
+            return Ok(text.split_whitespace().map(str::to_owned).collect());
+        }
+        serde_json::from_str(&text).map_err(|error| foreign(format!("its {key}: {error}")))
     };
     let notes = entries.iter().filter_map(|(key, value)| {
         let key = key.strip_prefix("note.")?;

@@ -23,7 +23,7 @@ pub fn write<W: Write + Seek>(log: &Log, to: W) -> mcap::McapResult<()> {
     let options = WriteOptions::new()
         .compression(None)
         .profile("")
-        .library(concat!("lads-sim ", env!("CARGO_PKG_VERSION")));
+        .library(concat!("lads-record ", env!("CARGO_PKG_VERSION")));
     let mut writer = Writer::with_options(BufWriter::new(to), options)?;
     writer.write_metadata(&metadata(&log.origin, log.flights.len()))?;
     let mut recorder = Recorder::new(writer, &log.origin)?;
@@ -45,8 +45,8 @@ fn metadata(origin: &Origin, episodes: usize) -> Metadata {
         ("seed", origin.seed.to_string()),
         ("noise", origin.noise.clone()),
         ("control_period_s", origin.control_period_s.to_string()),
-        ("observation_names", origin.observation_names.join(" ")),
-        ("action_names", origin.action_names.join(" ")),
+        ("observation_names", listed(&origin.observation_names)),
+        ("action_names", listed(&origin.action_names)),
     ];
     let period = origin.period.map(|period| (PERIOD, period.to_string()));
     let known = known.into_iter().chain(period);
@@ -57,6 +57,11 @@ fn metadata(origin: &Origin, episodes: usize) -> Metadata {
         name: METADATA.to_owned(),
         metadata: known.chain(notes).collect(),
     }
+}
+
+/// Names as a JSON array.
+fn listed(names: &[String]) -> String {
+    serde_json::json!(names).to_string()
 }
 
 struct Recorder<W: Write + Seek> {
@@ -79,7 +84,7 @@ impl<W: Write + Seek> Recorder<W> {
                 _ => None,
             };
             let about: BTreeMap<_, _> = names
-                .map(|names| ("elements".to_owned(), names.join(" ")))
+                .map(|names| ("elements".to_owned(), listed(names)))
                 .into_iter()
                 .collect();
             channels.push(writer.add_channel(schema, topic.name, "json", &about)?);

@@ -67,6 +67,8 @@ pub struct Reply {
     pub plan: Option<u32>,
     /// The logits of a step that decided.
     pub logits: Vec<f32>,
+    /// By how much the best of them leads the second one; `None` where there are not two.
+    pub margin: Option<f32>,
     /// Its action.
     pub action: Vec<f32>,
 }

@@ -326,7 +326,8 @@ fn uncompared(contract: &Compared, policy: &Answers, environment: &Physics) -> V
         format!("no {what} was compared: the reference's traces hold none that could be")
     });
     let unrecorded = contract.fields.is_empty().then(|| {
-        "the contract was not compared: the reference records none; complete it: python -m lads_exporter reference --complete".to_owned()
+        let remedy = contract.remedy;
+        format!("the contract was not compared: the reference records none; {remedy}")
     });
     none.chain(unrecorded).collect()
 }

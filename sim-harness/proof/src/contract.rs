@@ -30,13 +30,19 @@ pub struct Compared {
     pub image_differing: Vec<FieldDifference>,
     /// Fields that differ and say only where the policy comes from.
     pub history: Vec<FieldDifference>,
+    /// What to do where no field was compared.
+    #[serde(skip)]
+    pub remedy: &'static str,
 }
 
 impl Compared {
     /// Compares the contract of the run with the reference's, and what the image that ran says with the run's contract. The image says some
     /// of the fields, with numbers of 32 bits.
     pub fn new(run: &Value, reference: Option<&Value>, image: &Value) -> Self {
-        let mut compared = Self::default();
+        let mut compared = Self {
+            remedy: "complete it: python -m lads_exporter reference --complete",
+            ..Self::default()
+        };
         if let Some(reference) = reference {
             let mut all = Vec::new();
             differences(String::new(), run, reference, &mut all);
@@ -58,8 +64,12 @@ impl Compared {
     }
 
     /// Compares the contract of the run with what is known of the reference's, which may be a part: a field that nobody states is not compared.
-    pub fn with_stated(run: &Value, stated: &Value) -> Self {
-        let mut compared = Self::default();
+    /// `remedy` says how to state one.
+    pub fn with_stated(run: &Value, stated: &Value, remedy: &'static str) -> Self {
+        let mut compared = Self {
+            remedy,
+            ..Self::default()
+        };
         // What is stated takes the place of what the run says, so the sides are exchanged back.
         restricted(String::new(), stated, run, &mut compared.differing);
         for difference in &mut compared.differing {
@@ -223,7 +233,7 @@ mod tests {
         let stated = json!({"decision": {"rule": "argmax"}, "period": 0.02});
         let mut run = contract();
         run["period"] = json!(0.04);
-        let found = Compared::with_stated(&run, &stated);
+        let found = Compared::with_stated(&run, &stated, "state one");
         assert_eq!(fields(&found.differing), ["period"]);
         assert_eq!(found.differing[0].run, "0.04");
         assert_eq!(found.differing[0].reference, "0.02");

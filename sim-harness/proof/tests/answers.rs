@@ -71,6 +71,7 @@ fn own() -> Replay {
             Vec::new()
         },
         action: vec![step as f32],
+        ..Reply::default()
     });
     Replay {
         replies: replies.collect(),

@@ -14,7 +14,7 @@ pub(super) struct Groups(Vec<(Group, Vec<Range<usize>>)>);
 
 impl Groups {
     /// Takes a layer of an entry in.
-    pub fn add(&mut self, entry: &str, layer: &LayerReport) {
+    pub fn add(&mut self, entry: &str, layer: &LayerReport, takes_integers: bool) {
         let shares =
             |words: &Range<usize>| words.start < layer.words.end && layer.words.start < words.end;
         let belongs = |(group, words): &(Group, Vec<Range<usize>>)| {
@@ -39,6 +39,7 @@ impl Groups {
             group.layers.push(Layer {
                 nodes: BTreeSet::from([layer.node.clone()]),
                 weights: layer.weights,
+                takes_integers,
             });
             words.push(layer.words.clone());
         }
@@ -71,11 +72,11 @@ mod tests {
     #[test]
     fn entries_that_share_weights_are_one_group() {
         let mut groups = Groups::default();
-        groups.add("act", &layer("a", 0..10));
-        groups.add("step", &layer("b", 10..50));
-        groups.add("start", &layer("c", 50..60));
+        groups.add("act", &layer("a", 0..10), true);
+        groups.add("step", &layer("b", 10..50), true);
+        groups.add("start", &layer("c", 50..60), true);
         // Some columns of the step's matrix.
-        groups.add("start", &layer("d", 20..30));
+        groups.add("start", &layer("d", 20..30), true);
         let groups = groups.sorted();
         let names: Vec<_> = groups.iter().map(Group::name).collect();
         assert_eq!(names, ["start, step", "act"]);

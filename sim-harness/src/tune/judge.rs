@@ -1,19 +1,24 @@
 //! Does a policy whose numbers have fewer bits still answer as with 32?
 //!
-//! What only helps to select an index must select the same one in every decision, and most decisions must be clear by more than the
-//! logits are off: the questions are a sample, and a decision that was a close call elsewhere may fall out otherwise. What is in the
-//! action must stay inside the contract's tolerance. Nothing here can fail.
+//! What only helps to select an index must select the same one in every decision, its logits must be twice as near as a certificate wants them,
+//! and nearly all decisions must be clear by more than the logits are off: the questions are a sample, and a decision that was a close call
+//! elsewhere may fall out otherwise. What is in the
+//! action must stay inside the contract's tolerance, and a trajectory encoder must see the same plan in every segment: how near it was to
+//! another is not known. Nothing here can fail.
 
 use std::fmt;
 
 use lads_compiler::Evidence;
-use lads_proof::answers::{Replay, Reply, largest_up_to_a_constant};
+use lads_proof::answers::{LOGIT_TOLERANCE, Replay, largest_up_to_a_constant};
 
 /// A decision is clear if its margin is more than so many times the largest difference of a logit: two logits may be off.
 pub const MARGIN_FACTOR: f64 = 2.0;
 
-/// The share of decisions that have to be clear: of fifty, one may hang on the rounding, if it came to the worst.
-pub const CLEAR_SHARE: f64 = 0.98;
+/// Half of what a certificate allows a logit: its episodes are others.
+pub const LOGIT_BOUND: f64 = LOGIT_TOLERANCE / 2.0;
+
+/// The share of decisions that have to be clear: of a hundred, one may hang on the rounding, if it came to the worst.
+pub const CLEAR_SHARE: f64 = 0.99;
 
 /// Why a candidate is not the same policy.
 #[derive(Debug, Clone, PartialEq)]
@@ -26,6 +31,11 @@ pub enum Loss {
         changed: usize,
         /// The largest margin of one of them with 32 bits.
         margin: f64,
+    },
+    /// A logit is off by more than [`LOGIT_BOUND`].
+    Logit {
+        /// By so much at most.
+        difference: f64,
     },
     /// Every decision is the same, and too many are close calls.
     Unclear {
@@ -55,6 +65,10 @@ impl fmt::Display for Loss {
             Self::Selected { changed, margin } => write!(
                 f,
                 "{changed} decisions fall out otherwise, one with a margin of {margin:.1e}"
+            ),
+            Self::Logit { difference } => write!(
+                f,
+                "a logit is off by {difference:.1e}, allowed {LOGIT_BOUND:.1e}"
             ),
             Self::Unclear { share, logit } => write!(
                 f,
@@ -121,11 +135,17 @@ pub fn judge(exact: &[Replay], candidate: &[Replay], tolerance: f64) -> Judged {
         if let Some(why) = &got.refused {
             refused.get_or_insert_with(|| why.clone());
         }
-        let segments = wanted.encoded.iter().zip(&got.encoded);
-        encoded += segments
-            .flat_map(|(wanted, got)| wanted.iter().zip(got))
-            .filter(|(wanted, got)| wanted != got)
-            .count();
+        let segments = wanted.encoded.as_deref().unwrap_or_default();
+        seen.segments += segments.len();
+        encoded += match &got.encoded {
+            Some(got) if got.len() == segments.len() => segments
+                .iter()
+                .zip(got)
+                .filter(|(wanted, got)| wanted != got)
+                .count(),
+            // An encoder that refuses a segment gives none.
+            _ => segments.len(),
+        };
         for (wanted, got) in wanted.replies.iter().zip(&got.replies) {
             seen.steps += 1;
             let action = largest(&wanted.action, &got.action);
@@ -134,7 +154,7 @@ pub fn judge(exact: &[Replay], candidate: &[Replay], tolerance: f64) -> Judged {
                 continue;
             }
             seen.decisions += 1;
-            let margin = margin(wanted);
+            let margin = wanted.margin.map(f64::from);
             margins.extend(margin);
             let logits = wanted.logits.iter().zip(&got.logits);
             let logit = largest_up_to_a_constant(
@@ -158,6 +178,10 @@ pub fn judge(exact: &[Replay], candidate: &[Replay], tolerance: f64) -> Judged {
             changed,
             margin: largest_changed,
         })
+    } else if seen.largest_logit_error > LOGIT_BOUND {
+        Some(Loss::Logit {
+            difference: seen.largest_logit_error,
+        })
     } else if !margins.is_empty() && seen.clear_share < CLEAR_SHARE {
         Some(Loss::Unclear {
             share: seen.clear_share,
@@ -179,20 +203,6 @@ pub fn judge(exact: &[Replay], candidate: &[Replay], tolerance: f64) -> Judged {
     }
 }
 
-/// By how much the best logit leads the second one; `None` of a decision without two.
-fn margin(reply: &Reply) -> Option<f64> {
-    let mut best = [f64::NEG_INFINITY; 2];
-    for &logit in &reply.logits {
-        let logit = f64::from(logit);
-        if logit > best[0] {
-            best = [logit, best[0]];
-        } else {
-            best[1] = best[1].max(logit);
-        }
-    }
-    best[1].is_finite().then(|| best[0] - best[1])
-}
-
 /// The largest difference of an element; infinite where one is no number.
 fn largest(wanted: &[f32], got: &[f32]) -> f64 {
     wanted.iter().zip(got).fold(0.0, |largest, (a, b)| {
@@ -207,13 +217,16 @@ fn largest(wanted: &[f32], got: &[f32]) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use lads_proof::answers::Reply;
+
     use super::*;
 
-    fn reply(plan: u32, logits: &[f32], action: f32) -> Reply {
+    fn reply(plan: u32, logits: &[f32], margin: Option<f32>, action: f32) -> Reply {
         Reply {
             decided: !logits.is_empty(),
             plan: Some(plan),
             logits: logits.to_vec(),
+            margin,
             action: vec![action],
         }
     }
@@ -227,9 +240,9 @@ mod tests {
 
     fn exact() -> Vec<Replay> {
         replay(vec![
-            reply(1, &[0.0, 2.0, 1.0], 0.5),
-            reply(1, &[], 0.5),
-            reply(2, &[0.0, 0.0, 0.5], 0.25),
+            reply(1, &[0.0, 2.0, 1.0], Some(1.0), 0.5),
+            reply(1, &[], None, 0.5),
+            reply(2, &[0.0, 0.0, 0.5], Some(0.5), 0.25),
         ])
     }
 
@@ -268,12 +281,25 @@ mod tests {
 
     #[test]
     fn close_calls_are_a_loss() {
-        // Off by 0.3: a margin of 0.5 is within twice that, one of 1 is not.
-        let judged = altered(|replies| replies[0].logits = vec![-0.3, 2.3, 1.0]);
+        // Off by 0.004: a margin of 0.007 is within twice that, one of 0.5 is not.
+        let mut close = exact();
+        close[0].replies[0].margin = Some(0.007);
+        let mut other = close.clone();
+        other[0].replies[0].logits = vec![-0.004, 2.004, 1.0];
+        let judged = judge(&close, &other, 1e-3);
         let Some(Loss::Unclear { share, logit }) = judged.loss else {
             panic!("{judged:?}");
         };
-        assert!((share - 0.5).abs() < 1e-9 && (logit - 0.3).abs() < 1e-6);
+        assert!((share - 0.5).abs() < 1e-9 && (logit - 0.004).abs() < 1e-6);
+    }
+
+    #[test]
+    fn logits_are_nearer_than_a_certificate_wants_them() {
+        let judged = altered(|replies| replies[0].logits = vec![-0.3, 2.3, 1.0]);
+        let Some(Loss::Logit { difference }) = judged.loss else {
+            panic!("{judged:?}");
+        };
+        assert!((difference - 0.3).abs() < 1e-6);
     }
 
     #[test]
@@ -295,5 +321,9 @@ mod tests {
         assert!(judge(&with(&[1, 2]), &with(&[1, 2]), 1e-3).is_same());
         let judged = judge(&with(&[1, 2]), &with(&[1, 3]), 1e-3);
         assert_eq!(judged.loss, Some(Loss::Encoded { changed: 1 }));
+        assert_eq!(judged.evidence.segments, 2);
+        // One that refuses a segment has seen none of them.
+        let judged = judge(&with(&[1, 2]), &exact(), 1e-3);
+        assert_eq!(judged.loss, Some(Loss::Encoded { changed: 2 }));
     }
 }

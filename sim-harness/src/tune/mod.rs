@@ -1,7 +1,7 @@
 //! The smallest image that keeps every plan: formats for weights and caches, chosen by what a policy answers with them.
 //!
 //! The policy answers the recorded questions of a reference (open loop, as in [`verify::policy`](crate::verify::policy)) once with 32 bits
-//! and once with each candidate's; [`judge`] compares the two, [`search`] tries candidates from the smallest up. The golden episode alone
+//! and once with each candidate's; [`mod@judge`] compares the two, [`mod@search`] tries candidates from the smallest up. The golden episode alone
 //! is no evidence: a policy may replay it with the same bits and decide otherwise elsewhere. What can fail: a bundle that does not compile
 //! even with 32 bits, memory; it can be told to stop.
 
@@ -12,7 +12,7 @@ pub mod search;
 use std::sync::atomic::AtomicBool;
 
 use lads_compiler::{Bundle, CompileError, Image, Options, Storage};
-use lads_core::{Isa, Policy};
+use lads_core::{Decision, Isa, Policy};
 use lads_proof::answers::{ACTION_TOLERANCE, Replay};
 use lads_proof::reference::Reference;
 
@@ -36,6 +36,11 @@ pub enum TuneError {
         "with 32 bits the policy refuses a step of the reference: {0}; make the reference again"
     )]
     Refused(String),
+    /// The questions are so close that the policy is not clear about its own answers.
+    #[error(
+        "the policy with 32 bits does not pass itself: {0}; make a reference with other episodes"
+    )]
+    Unclear(String),
 }
 
 /// What is asked, and of whom.
@@ -73,7 +78,12 @@ impl Tuning<'_> {
             return Err(TuneError::Refused(why));
         }
         let tolerance = f64::from(self.bundle.golden().tolerance).min(ACTION_TOLERANCE);
-        let found = search(&self.parts(&exact)?, &mut |storage| {
+        let own = judge(&wanted, &wanted, tolerance);
+        if let Some(loss) = &own.loss {
+            return Err(TuneError::Unclear(loss.to_string()));
+        }
+        let parts = self.parts(&exact, own.evidence.segments > 0)?;
+        let found = search(&parts, own, &mut |storage| {
             tried(storage);
             match self.compile(storage) {
                 Ok(image) => Ok(judge(&wanted, &self.ask(&image, stop)?, tolerance)),
@@ -92,22 +102,25 @@ impl Tuning<'_> {
     }
 
     /// What may be stored otherwise. Entries that read the same weights, as those do that read one token each of one network, are one
-    /// part: stored in two formats, the weights would be there twice.
-    fn parts(&self, exact: &Image) -> Result<Parts, CompileError> {
+    /// part: stored in two formats, the weights would be there twice. What nobody asked keeps its bits.
+    fn parts(&self, exact: &Image, encoder_was_asked: bool) -> Result<Parts, CompileError> {
         let smallest = Options {
             storage: Some(Storage::of_weights(search::WEIGHTS[0])),
             force: true,
             ..Options::default()
         };
-        // Layers that keep their bits whatever is asked for are no candidates.
         let smallest = lads_compiler::compile_with(self.bundle, &smallest)?;
+        let unasked = if encoder_was_asked {
+            vec![]
+        } else {
+            self.bundle.encoding_entries()
+        };
         let mut groups = Groups::default();
         let programs = exact.report().programs.iter();
-        for (program, small) in programs.zip(&smallest.report().programs) {
+        let programs = programs.zip(&smallest.report().programs);
+        for (program, small) in programs.filter(|(it, _)| !unasked.contains(&it.entry)) {
             for (layer, small) in program.layers.iter().zip(&small.layers) {
-                if layer.format != small.format {
-                    groups.add(&program.entry, layer);
-                }
+                groups.add(&program.entry, layer, layer.format != small.format);
             }
         }
         Ok(Parts {
@@ -132,6 +145,8 @@ impl Tuning<'_> {
         policy::ask(
             &policy,
             self.isa,
+            // The likeliest index, whatever the contract's rule: margins say nothing of a draw.
+            Decision::Argmax,
             self.reference,
             self.assignments,
             traced,

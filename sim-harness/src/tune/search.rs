@@ -1,4 +1,4 @@
-//! Candidates from the smallest up: group by group of entries, the largest first, then layer by layer, then the caches.
+//! Candidates from the smallest up: group by group of entries, the largest first, then the caches, then layer by layer.
 //!
 //! Every candidate is asked with what was accepted before it in place, so that the last one that was accepted is the result, as it was
 //! seen. The same parts and the same answers give the same result. What can fail: the trial itself.
@@ -29,6 +29,8 @@ pub struct Layer {
     pub nodes: BTreeSet<String>,
     /// Number of weights.
     pub weights: usize,
+    /// Whether integers store it; one that weighs its inputs very differently keeps its floats.
+    pub takes_integers: bool,
 }
 
 impl Group {
@@ -49,7 +51,7 @@ impl Group {
 pub struct Parts {
     /// The groups, the largest first.
     pub groups: Vec<Group>,
-    /// Whether there are KV caches or rings.
+    /// Whether there are KV caches.
     pub has_cache: bool,
 }
 
@@ -75,66 +77,71 @@ pub struct Found {
     pub choices: Vec<Choice>,
 }
 
-/// Looks for the smallest formats; `trial` asks one candidate.
+/// Looks for the smallest formats; `exact` is what was seen with 32 bits, `trial` asks one candidate.
 pub fn search<E>(
     parts: &Parts,
+    exact: Judged,
     trial: &mut dyn FnMut(&Storage) -> Result<Judged, E>,
 ) -> Result<Found, E> {
     let mut found = Found {
-        judged: trial(&Storage::default())?,
+        judged: exact,
         storage: Storage::default(),
         choices: vec![],
     };
     for group in &parts.groups {
-        let mut refused = vec![];
-        let mut accepted = WeightFormat::F32;
-        for format in WEIGHTS {
-            let candidate = with(&found.storage, &group.entries, format);
-            let judged = trial(&candidate)?;
-            if let Some(loss) = &judged.loss {
-                refused.push((format.name().to_owned(), loss.to_string()));
-                continue;
-            }
-            accepted = format;
-            found.storage = candidate;
-            found.judged = judged;
-            break;
-        }
-        let mut stored = accepted.name().to_owned();
-        if accepted != WEIGHTS[0] {
-            let smaller = layers(group, &mut found, trial)?;
-            if smaller > 0 {
-                let format = WEIGHTS[0].name();
-                stored = format!(
-                    "{stored}, {smaller} of {} layers {format}",
-                    group.layers.len()
-                );
-            }
-        }
-        found.choices.push(Choice {
-            part: group.name(),
-            stored,
-            refused,
-        });
+        let formats =
+            WEIGHTS.map(|format| (format.name(), with(&found.storage, &group.entries, format)));
+        let kept = WeightFormat::F32.name();
+        found.choose(group.name(), kept, formats, trial)?;
     }
     if parts.has_cache {
-        let candidate = found.storage.clone().with_cache(CacheFormat::F16);
-        let judged = trial(&candidate)?;
-        let (mut stored, mut refused) = (CacheFormat::F32, vec![]);
-        if let Some(loss) = &judged.loss {
-            refused.push((CacheFormat::F16.name().to_owned(), loss.to_string()));
-        } else {
-            stored = CacheFormat::F16;
-            found.storage = candidate;
-            found.judged = judged;
+        let half = found.storage.clone().with_cache(CacheFormat::F16);
+        let formats = [(CacheFormat::F16.name(), half)];
+        found.choose("cache".to_owned(), CacheFormat::F32.name(), formats, trial)?;
+    }
+    // Last, because a cache takes more than a layer.
+    let smallest = WEIGHTS[0].name();
+    for (group, choice) in parts.groups.iter().zip(0..) {
+        if found.choices[choice].stored != smallest {
+            let taken = layers(group, &mut found, trial)?;
+            if taken > 0 {
+                let all = group.layers.len();
+                let more = format!(", {taken} of {all} layers {smallest}");
+                found.choices[choice].stored.push_str(&more);
+            }
         }
-        found.choices.push(Choice {
-            part: "cache".to_owned(),
-            stored: stored.name().to_owned(),
-            refused,
-        });
     }
     Ok(found)
+}
+
+impl Found {
+    /// Takes the first candidate that is the same policy, or keeps what is there, under the name `kept`.
+    fn choose<E>(
+        &mut self,
+        part: String,
+        kept: &str,
+        candidates: impl IntoIterator<Item = (&'static str, Storage)>,
+        trial: &mut dyn FnMut(&Storage) -> Result<Judged, E>,
+    ) -> Result<(), E> {
+        let mut choice = Choice {
+            part,
+            stored: kept.to_owned(),
+            refused: vec![],
+        };
+        for (format, candidate) in candidates {
+            let judged = trial(&candidate)?;
+            if let Some(loss) = &judged.loss {
+                choice.refused.push((format.to_owned(), loss.to_string()));
+                continue;
+            }
+            format.clone_into(&mut choice.stored);
+            self.storage = candidate;
+            self.judged = judged;
+            break;
+        }
+        self.choices.push(choice);
+        Ok(())
+    }
 }
 
 /// The same with another format of these parts.
@@ -151,11 +158,9 @@ fn layers<E>(
     found: &mut Found,
     trial: &mut dyn FnMut(&Storage) -> Result<Judged, E>,
 ) -> Result<usize, E> {
-    if group.layers.len() < 2 {
-        return Ok(0);
-    }
     let mut alone = vec![];
-    for layer in &group.layers {
+    let layers = group.layers.iter().filter(|layer| layer.takes_integers);
+    for layer in layers {
         let judged = trial(&with(&found.storage, &layer.nodes, WEIGHTS[0]))?;
         if judged.is_same() {
             let seen = judged.evidence;
@@ -192,6 +197,7 @@ mod tests {
                 .map(|nodes| Layer {
                     nodes: nodes.iter().map(|&name| name.to_owned()).collect(),
                     weights: 10,
+                    takes_integers: nodes[0] != "d",
                 })
                 .collect(),
         };
@@ -207,7 +213,7 @@ mod tests {
     /// A policy that is the same while `is_same` says so.
     fn searched(is_same: impl Fn(&Storage) -> bool) -> (Found, usize) {
         let mut trials = 0;
-        let found = search(&parts(), &mut |storage| {
+        let found = search(&parts(), Judged::default(), &mut |storage| {
             trials += 1;
             let loss = Loss::Encoded { changed: 1 };
             Ok::<_, Infallible>(Judged {
@@ -227,7 +233,7 @@ mod tests {
             .with_part("act", WeightFormat::Int8)
             .with_cache(CacheFormat::F16);
         assert_eq!(found.storage, all);
-        assert_eq!(trials, 4);
+        assert_eq!(trials, 3);
         let stored: Vec<_> = found.choices.iter().map(|choice| &*choice.stored).collect();
         assert_eq!(stored, ["int8", "int8", "f16"]);
     }

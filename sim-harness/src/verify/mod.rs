@@ -48,6 +48,7 @@ pub fn run(
     let replays = policy::ask(
         &evaluation.policy,
         evaluation.isa,
+        contract.decision(),
         reference,
         evaluation.assignments,
         traced,

@@ -5,7 +5,7 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use lads_core::{Controller, Instruction, Isa, Policy};
+use lads_core::{Controller, Decision, Instruction, Isa, Policy};
 use lads_host::Memory;
 use lads_proof::answers::{Replay, Reply};
 use lads_proof::reference::{Reference, Trace};
@@ -13,11 +13,12 @@ use lads_proof::reference::{Reference, Trace};
 use crate::evaluate::{Assignment, EvaluationError};
 use crate::plans::Segment;
 
-/// Asks `policy`, on the instruction set `isa` and by its contract's own rule, about the first `episodes` traced episodes of each assigned
+/// Asks `policy`, on the instruction set `isa` and by the rule `decision`, about the first `episodes` traced episodes of each assigned
 /// instruction. `finished` is called after each episode, `stop` ends the work early.
 pub fn ask(
     policy: &Policy<'_>,
     isa: Isa,
+    decision: Decision,
     reference: &Reference,
     assignments: &[Assignment],
     episodes: u32,
@@ -28,7 +29,7 @@ pub fn ask(
     let mut controller = memory
         .controller_with(policy, isa)
         .map_err(EvaluationError::Memory)?;
-    controller.set_decision(policy.contract().decision());
+    controller.set_decision(decision);
     let encoder = Segment::of(policy).filter(|encoder| Some(encoder.steps) == reference.period);
     let mut replays = Vec::new();
     for &Assignment {
@@ -84,6 +85,10 @@ fn replay(controller: &mut Controller<'_, '_>, instruction: u32, trace: &Trace) 
             decided,
             plan: report.selected.map(|selected| selected.index),
             logits: scores.to_vec(),
+            margin: report
+                .selected
+                .map(|selected| selected.margin)
+                .filter(|margin| decided && margin.is_finite()),
             action: action.clone(),
         });
         // The next question has the reference's history. An executed action is finite, as the trace's length and origin say.

@@ -260,6 +260,7 @@ pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usi
     let replays = verify::policy::ask(
         &policy,
         Isa::detect(),
+        policy.contract().decision(),
         reference,
         &assignments,
         1,

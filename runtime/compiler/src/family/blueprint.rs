@@ -22,6 +22,14 @@ pub(crate) enum Keep {
     Kv(Network),
 }
 
+impl Blueprint {
+    /// What makes an entry run.
+    pub fn events_of(&self, entry: &str) -> impl Iterator<Item = Event> {
+        let calls = self.calls.iter().filter(move |call| call.entry == entry);
+        calls.map(|call| call.event)
+    }
+}
+
 /// A state whose width follows from the values that are bound to it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct State {

@@ -103,7 +103,7 @@ fn width(parts: &Parts, contract: &Contract, of: usize) -> Option<u32> {
     })
 }
 
-/// 4-byte words of all rings and KV caches.
+/// 4-byte words of all KV caches.
 pub(crate) fn rows_len(parts: &Parts) -> usize {
     let words = |(name, cache): (&String, &Cache)| {
         let halves = if is_cleared(parts, name) { 2 } else { 1 };

@@ -242,8 +242,8 @@ fn onnx_node_cases() {
     let without: Vec<&str> = (documented.split_whitespace())
         .filter(|operator| !passed.contains_key(*operator))
         .collect();
-    // The package's cases of these search several rows, have inputs or sequences that no entry has, or numbers of 64 bits; those of
-    // policy files of the field are compared with ONNX Runtime by `tests/parity/test_import.py`.
+    // The package's cases of these search several rows, have inputs or sequences that no entry has, or numbers of 64 bits; what
+    // policy files of the field have of them is compared with tract in `field.rs`, or with ONNX Runtime by `tests/parity/test_import.py`.
     let left = [
         "ArgMax",
         "ArgMin",

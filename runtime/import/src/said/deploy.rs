@@ -114,10 +114,19 @@ fn term(name: &str, row: &Value, commands: &Value, refuse: &mut impl FnMut(&str,
     if let Some((low, high)) = clip(&format!("{name}, clip"), row, refuse) {
         term.clip = Some(Clip::Between([low, high]));
     }
-    term.history = row
+    if let Some(length) = row
         .get("history_length")
-        .and_then(Value::number)
-        .map(|length| length.max(1.0) as usize);
+        .filter(|length| **length != Value::Null)
+    {
+        // 0 and 1 both mean no history.
+        term.history = length
+            .number()
+            .filter(|length| length.fract() == 0.0 && (0.0..=1e6).contains(length))
+            .map(|length| length.max(1.0) as usize);
+        if term.history.is_none() {
+            refuse(&format!("{name}, history_length"), "whole number of steps");
+        }
+    }
     let command = row
         .get("params")
         .and_then(|params| params.get("command_name"))
@@ -126,7 +135,7 @@ fn term(name: &str, row: &Value, commands: &Value, refuse: &mut impl FnMut(&str,
         .and_then(|command| commands.get(command))
         .and_then(|command| command.get("ranges"))
     {
-        ranged(&mut term, ranges);
+        ranged(&mut term, ranges, refuse);
     }
     term
 }
@@ -172,13 +181,15 @@ fn bounds(value: &Value) -> Option<(Each, Each)> {
 }
 
 /// Names and limits of a command's elements; one without a range is not given to the policy.
-fn ranged(term: &mut Term, ranges: &Value) {
-    let rows: Vec<(&String, Vec<f64>)> = ranges
-        .pairs()
-        .iter()
-        .filter_map(|(name, range)| Some((name, range.numbers()?)))
-        .filter(|(_, range)| range.len() == 2)
-        .collect();
+fn ranged(term: &mut Term, ranges: &Value, refuse: &mut impl FnMut(&str, &str)) {
+    let mut rows: Vec<(&String, [f64; 2])> = vec![];
+    for (name, range) in ranges.pairs() {
+        match range.numbers().as_deref() {
+            Some(&[low, high]) => rows.push((name, [low, high])),
+            _ if *range == Value::Null => {}
+            _ => refuse(&format!("range of {name}"), "pair of numbers, or null"),
+        }
+    }
     if rows.is_empty() {
         return;
     }
@@ -224,6 +235,18 @@ mod tests {
             ("joint_ids_map: [1, 0]\nstiffness: [1, 2, 3]", "stiffness"),
             ("actions: {JointPositionAction: {clip: [1]}}", "clip"),
             ("observations: {a: {scale: big}}", "a, scale"),
+            (
+                "observations: {a: {history_length: many}}",
+                "a, history_length",
+            ),
+            (
+                "observations: {a: {history_length: 2.5}}",
+                "a, history_length",
+            ),
+            (
+                "commands: {base: {ranges: {x: [1]}}}\nobservations: {a: {params: {command_name: base}}}",
+                "range of x",
+            ),
         ] {
             let mut problems = Problems::default();
             deploy(text, "deploy.yaml", &mut problems);

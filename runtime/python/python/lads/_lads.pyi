@@ -12,7 +12,7 @@ from .vector import Report
 
 Array: TypeAlias = NDArray[Any]
 Floats: TypeAlias = NDArray[np.float32]
-Observation: TypeAlias = Array | Mapping[str, Array]
+Observation: TypeAlias = Array | dict[str, Array]
 Told: TypeAlias = str | Floats
 Path: TypeAlias = str | os.PathLike[str]
 
@@ -47,14 +47,21 @@ def template(
 ) -> str: ...
 def forked() -> None: ...
 def wilson(successes: int, trials: int) -> tuple[float, float]: ...
-def score(outcomes: Sequence[tuple[int, int, bool]]) -> str: ...
+def score(outcomes: Sequence[tuple[int, bool]]) -> str: ...
 def judge(
     controller: Controller,
     reference: bytes,
     run: bytes,
-    replayed: Sequence[tuple[int, int, NDArray[np.float64]]],
+    replayed: Sequence[tuple[int, int, NDArray[np.float64], bool]],
     about: str,
 ) -> tuple[str, str, str]: ...
+def check_log(
+    policy: Policy,
+    path: Path,
+    seed: int,
+    noise: str,
+    notes: Mapping[str, str],
+) -> None: ...
 def write_log(
     policy: Policy,
     path: Path,
@@ -64,6 +71,7 @@ def write_log(
     episodes: Sequence[Mapping[str, Any]],
 ) -> None: ...
 def command(arguments: Sequence[str]) -> int: ...
+def write(path: Path, text: str) -> None: ...
 
 class Policy:
     @property

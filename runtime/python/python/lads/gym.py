@@ -86,7 +86,7 @@ class Episode:
     success: bool | None
     """None where nothing says what success is."""
     completions: tuple[tuple[str, int], ...]
-    """Sub-tasks with the first step, from 1, after which they were done."""
+    """Sub-tasks with the number of control steps after which they were first done, 0 where from the start."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def evaluate(
 
 
 def _score(episodes):
-    return json.loads(_lads.score([(len(episode.completions), 0, bool(episode.success)) for episode in episodes]))
+    return json.loads(_lads.score([(len(episode.completions), bool(episode.success)) for episode in episodes]))
 
 
 class Progress:
@@ -259,8 +259,14 @@ _running = None
 
 def _begin(pickled):
     global _running
+    # Here for the same reason as above.
+    from multiprocessing.util import Finalize
+
     job = pickle.loads(pickled)
     _running = job, job.make_env()
+    close = getattr(_running[1], "close", None)
+    if close:
+        Finalize(None, close, exitpriority=0)  # with a priority, it is called when the process ends
 
 
 def _run(number):

@@ -1,4 +1,7 @@
-"""Control steps into a file: MCAP, which Foxglove opens and `lads-run replay` computes again."""
+"""Control steps into a file: MCAP, for Foxglove and whatever else reads it. `lads-run replay` takes the logs of `lads-run --log` alone.
+
+What can fail: a policy whose observation is not one vector of floats, noise that the caller gives, a path that cannot be written.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,15 @@ from typing import Any
 import numpy as np
 
 from . import _lads
+from .errors import RecordError
 
 
 class Recorder:
-    """A controller that keeps what it does, for a policy that observes one vector; used in its place.
+    """A controller that keeps what it does, for a policy that observes one vector.
 
-    `reset` and `instruct` begin a new episode, `end` says how the last one came out. Nothing is written before `close`, so that no step waits
-    for a disk; as a context manager it is closed at the end, and an exception leaves no file. A step costs a copy of what goes in and out.
+    It has a controller's `step`, `executed`, `reset`, `instruct` and `policy`, which is what a control loop and `lads.gym.Policy` use. `reset`
+    and `instruct` begin a new episode, `end` says how the last one came out. Nothing is written before `close`, so that no step waits for a
+    disk; as a context manager it is closed at the end, and an exception leaves no file. A step costs a copy of what goes in and out.
     """
 
     def __init__(
@@ -33,8 +38,9 @@ class Recorder:
         self._head = (seed, noise, dict(notes or {}))
         self._episodes: list[dict[str, Any]] = []
         self._steps: list[dict[str, Any]] = []
-        # What cannot be recorded is refused before the first step.
-        _lads.write_log(controller.policy, os.devnull, *self._head, [])
+        _lads.check_log(controller.policy, self.path, *self._head)
+        (self._channel,) = (channel.name for channel in controller.policy.contract.observations)
+        self._drawn = {channel.name for channel in controller.policy.contract.channels if channel.role == "noise"}
 
     @property
     def policy(self) -> _lads.Policy:
@@ -43,14 +49,17 @@ class Recorder:
 
     def step(self, observation: Any, out: np.ndarray | None = None) -> tuple[np.ndarray, _lads.StepReport]:
         """The controller's `step`, kept."""
+        named = observation if isinstance(observation, dict) else {self._channel: observation}
+        if self._drawn & named.keys():
+            raise RecordError("a recording does not hold noise that is given; leave it out, or give policy.controller(noise=), a seed")
+        seen = np.array(named.get(self._channel)).ravel()  # now: `out` may be the same memory
         start = time.perf_counter_ns()
         action, report = self.controller.step(observation, out)
         spent = time.perf_counter_ns() - start
         selected = report.selected
-        seen = next(iter(observation.values())) if isinstance(observation, dict) else observation
         self._steps.append(
             {
-                "observations": np.array(seen).ravel(),
+                "observations": seen,
                 "actions": np.array(action),
                 "executed": np.array(action),
                 "plans": selected and selected.index,

@@ -5,7 +5,7 @@ Nothing here imports gymnasium: an environment is what has `reset(seed=, options
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,7 +29,7 @@ class Rollout:
     info: Mapping
     """What the last step said."""
     completions: tuple[tuple[str, int], ...]
-    """Sub-tasks with the first step, from 1, after which they were done, in order of time."""
+    """Sub-tasks with the number of control steps after which they were first done, 0 where from the start, in order of time."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,10 @@ class Rules:
     sub_tasks: tuple[str, ...] = ()
     completed: object = None
     """A key of `info`, or a callable of it, for the names of the sub-tasks that are done."""
-    keys: tuple = field(default=SUCCESS, repr=False)
+
+    def __post_init__(self):
+        if self.max_steps is not None and self.max_steps < 1:
+            raise EvaluationError(f"max_steps is {self.max_steps}; give 1 or more, or None for episodes as long as the environment's")
 
     def reset_options(self, episode):
         """What `reset` is given."""
@@ -74,7 +77,7 @@ class Rules:
             return bool(rollout.info[self.success])
         if self.sub_tasks:
             return len(rollout.completions) == len(self.sub_tasks)
-        return next((bool(rollout.info[key]) for key in self.keys if key in rollout.info), None)
+        return next((bool(rollout.info[key]) for key in SUCCESS if key in rollout.info), None)
 
 
 def episode_seed(seed, episode):
@@ -83,16 +86,16 @@ def episode_seed(seed, episode):
 
 
 def play(environment, act, rules, seed, episode, watch=None):
-    """Runs one episode by `act(observation) -> action` -> Rollout. `watch(observation)` is called with every observation, the last one too.
+    """Runs one episode by `act(observation) -> action` -> Rollout. `watch(observation)` is called once with every observation, the last one too.
 
     `act` may return None to give up: the episode is over.
     """
     observation, info = environment.reset(seed=episode_seed(seed, episode), options=rules.reset_options(episode))
     steps, total, terminated, truncated = 0, 0.0, False, False
     completions = dict.fromkeys(rules.done(info), 0) if _says(rules, info) else {}
+    if watch:
+        watch(observation)
     while not (terminated or truncated):
-        if watch:
-            watch(observation)
         action = act(observation)
         if action is None:
             break
@@ -102,8 +105,8 @@ def play(environment, act, rules, seed, episode, watch=None):
         for name in rules.done(info):
             completions.setdefault(name, steps)
         truncated = truncated or steps == rules.max_steps
-    if watch:
-        watch(observation)
+        if watch:
+            watch(observation)
     return Rollout(steps, total, bool(terminated), bool(truncated), info, tuple(completions.items()))
 
 
@@ -128,7 +131,10 @@ def convert(observation, channels):
 
 
 def _cast(value, channel):
-    array = np.asarray(value)
+    # What one number is in the environment is an array of one element here.
+    array = np.atleast_1d(np.asarray(value))
+    if array.shape != channel.shape:
+        raise InputError(f"channel {channel.name!r}: the environment gives shape {array.shape}, the policy takes {channel.shape}; give observation=, a callable that makes one of the other")
     if channel.dtype.kind == "f" and array.dtype.kind in "fiub":
         return np.ascontiguousarray(array, channel.dtype)
     if not np.can_cast(array.dtype, channel.dtype, "same_kind") or array.dtype.kind == "f":

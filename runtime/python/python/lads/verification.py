@@ -2,13 +2,15 @@
 
 The policy alone (the reference's observations, asked again), the environment alone (the reference's actions, executed again), and both
 together (the same episodes in closed loop, as pairs). Here the episodes are run; `lads_proof`, in Rust, judges and writes the certificate. What
-can fail: an environment that does not say what success is, a reference whose action has another shape.
+can fail: an environment that does not say what success is, or takes less than the contract's limits allow; a reference whose action has
+another shape, or which gives plans without scores.
 """
 
 from __future__ import annotations
 
 import base64
 import json
+import os
 import platform
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -36,7 +38,7 @@ class Reply:
     plan: int | None = None
     """The index in force."""
     logits: np.ndarray | None = None
-    """The scores, one per index, of a step that selects; None in a step that keeps its index."""
+    """The scores, one per index, of a step that selects, such as the first of an episode; None in a step that keeps its index."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +53,9 @@ class Certificate:
     json: str
     html: str
 
-    def write(self, path) -> None:
-        """Writes the page where the name ends in .html, otherwise the JSON."""
-        path = Path(path)
-        path.write_text(self.html if path.suffix == ".html" else self.json + "\n", encoding="utf-8")
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Writes the page where the name ends in .html, otherwise the JSON; the file is there whole or not at all."""
+        _lads.write(path, self.html if Path(path).suffix == ".html" else self.json + "\n")
 
     def __str__(self) -> str:
         return "\n".join([self.verdict, *(f"- {reason}" for reason in self.reasons)])
@@ -85,11 +86,11 @@ def verify(
 
     `reference(observation)` is any callable: it gets what the controller gets, arrays of the channels' dtypes, and gives the action, an array
     [actions], or a `Reply`. What it has of `reset` is called when an episode begins, with the instruction where `instructions` are given.
-    Its actions are clipped to the environment's action space, as the environment does itself. Each of `episodes` is run by both, of each of
-    `instructions` (by default the one that the controller follows); the first `traced` of them are compared step by step. `sub_tasks` may be a
-    dictionary by instruction. `state(environment, observation)` gives what the environment alone is compared by, by default the
-    observation. `control_period` is the reference's, in seconds, by default the environment's `dt`. The other arguments are those of
-    `lads.gym.evaluate`. 59 episodes are the fewest that can be EQUIVALENT, 146 with four sub-tasks.
+    Without `action`, its actions are clipped to the environment's action space, inside which the contract's limits have to lie. Each of
+    `episodes` is run by both, of each of `instructions` (by default the one that the controller follows); the first `traced` of them are
+    compared step by step. `sub_tasks` may be a dictionary by instruction. `state(environment, observation)` gives what the environment alone
+    is compared by, by default the observation. `control_period` is the reference's, in seconds, by default the environment's `dt`; without
+    either the contract is not compared, and nothing is EQUIVALENT. The other arguments are those of `lads.gym.evaluate`. 59 episodes are the fewest that can be EQUIVALENT, 146 with four sub-tasks.
     """
     if not 1 <= traced or episodes < 1:
         raise ProofError(f"{episodes} episodes of which {traced} are traced; give one or more of each")
@@ -105,17 +106,17 @@ def verify(
         for index, (instruction, commanded) in enumerate(zip(known, tasks)):
             rules = Rules(options, max_steps, success, commanded, completed)
             asked = _Reference(reference, setting, environment, instruction if instructions is not None else None)
-            deployed = _Deployed(setting, environment, instruction)
+            deployed = _Deployed(setting, environment, instruction, asked)
             rows = [[], []]
             for number in range(episodes):
                 for row, side in zip(rows, (asked, deployed)):
                     row.append(_episode(environment, side, rules, setting, number))
                 if number < setting.traced:
-                    replayed.append((index, number, _replay(environment, asked.commands, rules, setting, number)))
+                    replayed.append((index, number, *_replay(environment, asked.commands, rules, setting, number)))
                 report(index * episodes + number + 1, len(known) * episodes)
             for side, row in zip((theirs, ours), rows):
                 side.append({"id": instruction, "text": instruction, "split": "", "sub_tasks": commanded, "episodes": row})
-        about = _about(setting, environment, tasks, theirs, ours, control_period)
+        about = _about(setting, environment, tasks, theirs, control_period)
     finally:
         getattr(environment, "close", lambda: None)()
     name = reference_name or f"the callable {getattr(reference, '__name__', type(reference).__name__)}"
@@ -204,8 +205,12 @@ class _Reference(_Side):
         super().__init__(setting, environment)
         self.reference, self.instruction = reference, instruction
         space = getattr(environment, "action_space", None)
-        clips = setting.action is None and hasattr(space, "low")
-        self.limits = (np.ravel(space.low), np.ravel(space.high)) if clips else None
+        channel = setting.contract.action
+        self.limits = None
+        # A space of another size is named where an action is executed.
+        if setting.action is None and hasattr(space, "low") and np.size(space.low) == np.prod(channel.shape):
+            self.limits = np.ravel(space.low), np.ravel(space.high)
+            _inside(channel, *self.limits)
 
     def begin_episode(self):
         reset = getattr(self.reference, "reset", None)
@@ -221,6 +226,8 @@ class _Reference(_Side):
             raise ProofError(f"the reference gives an action of shape {action.shape}, the contract says {wanted}; give one that does")
         if self.limits:
             action = np.clip(action, *self.limits).astype(np.float32)
+        if isinstance(reply, Reply) and reply.plan is not None and reply.logits is None and not self.plans:
+            raise ProofError("the reference gives a plan before it has given scores; give lads.Reply(action, plan, logits) in every step that selects, or the action alone")
         if isinstance(reply, Reply) and reply.logits is not None:
             ordered = np.sort(np.asarray(reply.logits, np.float64))
             plan = int(np.argmax(reply.logits)) if reply.plan is None else reply.plan
@@ -228,9 +235,20 @@ class _Reference(_Side):
         return action
 
 
+def _inside(channel, low, high):
+    """Refuses a contract whose action could leave the environment's action space, to which the reference's alone would be clipped."""
+    rows = channel.elements or [channel] * len(low)
+    wide = [row.name for row, least, most in zip(rows, low, high) if np.float32(row.min) < np.float32(least) or np.float32(row.max) > np.float32(most)]
+    if wide:
+        raise ProofError(f"the contract's limits of {', '.join(dict.fromkeys(wide))} exceed the environment's action space; give action=, a callable that makes what the environment takes")
+
+
 class _Deployed(_Side):
-    def __init__(self, setting, environment, instruction):
+    """The controller's policy; what it selects is kept where the reference says what it selects."""
+
+    def __init__(self, setting, environment, instruction, asked):
         super().__init__(setting, environment)
+        self.asked = asked
         sample, noise, portable = setting.controller._settings
         told = instruction if setting.contract.context.words else None
         self.controller = setting.controller.policy.controller(told, sample=sample, noise=noise, portable=portable)
@@ -244,7 +262,7 @@ class _Deployed(_Side):
         except LadsError:
             self.gave_up = True
             return None  # a policy that refuses has failed; why is what the comparison step by step says
-        if report.selected and report.selected.fresh:
+        if self.asked.plans and report.selected and report.selected.fresh:
             self.decide(report.selected.index, report.selected.margin, self.controller.scores)
         return action
 
@@ -291,9 +309,9 @@ def _text(rows, kind):
 
 
 def _replay(environment, commands, rules, setting, number):
-    """The environment's states under the reference's actions, float64 [n, S]."""
+    """The environment's states under the reference's actions, float64 [n, S], and whether it ended the episode with the last of them."""
     states, rest = [], iter(commands)
-    play(
+    rollout = play(
         environment,
         lambda _: next(rest, None),
         rules,
@@ -301,19 +319,16 @@ def _replay(environment, commands, rules, setting, number):
         number,
         lambda observation: states.append(setting.state_of(environment, observation)),
     )
-    return np.stack(states)
+    return np.stack(states), rollout.terminated or rollout.truncated
 
 
-def _about(setting, environment, tasks, theirs, ours, control_period):
+def _about(setting, environment, tasks, theirs, control_period):
     """What is judged besides the rollouts."""
     contract = setting.contract
-    not_covered = []
+    not_covered = ["the contract beyond its control period: neither the reference nor the environment states more"]
     decides = any(episode["plans"] for row in theirs for episode in row["episodes"])
     if not decides and contract.indices:
         not_covered.append("indices and their scores: the reference gives actions alone (lads.Reply has both)")
-        for episode in (episode for row in ours for episode in row["episodes"]):
-            episode["plans"], episode["margins"], episode["decided_at"] = [], [], []
-            episode.get("trace", {}).update(logits="")
     if contract.noise_elements:
         not_covered.append("noise: the policy draws its own")
     known = [instruction.id for instruction in contract.instructions]
@@ -322,13 +337,7 @@ def _about(setting, environment, tasks, theirs, ours, control_period):
     longest = max(episode["steps"] for row in theirs for episode in row["episodes"][: setting.traced])
     if contract.context.steps and longest <= contract.context.steps:
         not_covered.append(f"what happens after {longest} control steps: no replayed episode is longer, and the policy's context holds {contract.context.steps}")
-    ends = {"observation": {channel.name: _described(channel) for channel in contract.observations}, "action": _described(contract.action)}
-    stated = dict(ends)
     period = control_period if control_period is not None else _period(environment)
-    if period is None:
-        not_covered.append("the control period: the environment has no dt, and none was given")
-    else:
-        stated["control_period_s"] = float(period)
     names = list(dict.fromkeys(name for commanded in tasks for name in commanded))
     spec = getattr(environment, "spec", None)
     return {
@@ -337,14 +346,11 @@ def _about(setting, environment, tasks, theirs, ours, control_period):
         "versions": _versions(),
         "sub_tasks": names,
         "commanded": [[names.index(name) for name in commanded] for commanded in tasks],
-        "contract": {**ends, "control_period_s": contract.control_period},
-        "stated": stated,
+        # Dtypes and shapes are not among them: what the reference gets is made by the contract.
+        "contract": {"control_period_s": contract.control_period},
+        "stated": {} if period is None else {"control_period_s": float(period)},
         "not_covered": not_covered,
     }
-
-
-def _described(channel):
-    return {"dtype": str(channel.dtype), "shape": list(channel.shape)}
 
 
 def _period(environment):

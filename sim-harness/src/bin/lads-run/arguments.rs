@@ -103,6 +103,9 @@ pub struct PolicyArguments {
     /// Instructions that the kernels run on; left out, the widest of this CPU. The results have the same bits on all
     #[arg(long)]
     pub isa: Option<IsaName>,
+    /// Whether the bundle is compiled with 32 bits, whatever it was tuned to.
+    #[arg(skip)]
+    pub exact: bool,
 }
 
 /// Instruction sets by name.

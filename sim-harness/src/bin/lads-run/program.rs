@@ -5,7 +5,7 @@
 
 use std::path::{Path, PathBuf};
 
-use lads_compiler::Bundle;
+use lads_compiler::{Bundle, Options};
 use lads_core::{Isa, Policy};
 use lads_host::{Memory, Opened};
 
@@ -31,7 +31,12 @@ impl Program {
             isa,
         };
         let Some(path) = &asked.image else {
-            let image = lads_host::open(model).map_err(refused)?;
+            let options = if asked.exact {
+                Options::exact()
+            } else {
+                Options::default()
+            };
+            let image = lads_host::open_with(model, &options).map_err(refused)?;
             let Some(bundle) = image.bundle().cloned() else {
                 let wrong = "it is a compiled image; name its bundle, and the image with --image";
                 return Err(about(model, &wrong));

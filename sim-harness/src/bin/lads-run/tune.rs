@@ -10,7 +10,7 @@ use lads_host::input;
 use lads_sim::faults::Faults;
 use lads_sim::output;
 use lads_sim::tune::{TuneError, Tuned, Tuning};
-use lads_sim::verify::reference::Reference;
+use lads_sim::verify::reference::{Reference, ReferenceError};
 
 use crate::arguments::{LanguageArguments, PolicyArguments, Tune, Wanted};
 use crate::bench;
@@ -29,17 +29,18 @@ pub fn run(asked: &Tune, stop: &AtomicBool) -> Result<ExitCode, End> {
     output::check(&[], &[("-o", target)]).map_err(refused)?;
     let bytes = input::read(model)
         .map_err(|error| refused(format_args!("{}: {error}", model.display())))?;
-    let reference_bytes = input::read(&file).map_err(|error| {
-        refused(format_args!(
-            "{}: {error}; make one: make reference",
-            file.display()
-        ))
+    let questions = input::read(&file).map_err(|source| {
+        refused(ReferenceError::File {
+            path: file.clone(),
+            source,
+        })
     })?;
-    let reference = Reference::open(&file).map_err(refused)?;
+    let reference = Reference::read(&questions, &file).map_err(refused)?;
     let policy = PolicyArguments {
         model: model.clone(),
         image: None,
         isa: asked.isa,
+        exact: true,
     };
     let wanted = Wanted {
         policy: &policy,
@@ -60,6 +61,12 @@ pub fn run(asked: &Tune, stop: &AtomicBool) -> Result<ExitCode, End> {
     let tuned = bench::with(&wanted, stop, |bench| {
         let subject = lads_sim::verify::subject(bench.bundle, bench.environment);
         reference.check(&subject).map_err(refused)?;
+        if bench.bundle.sha256() != sha256(&bytes) {
+            return Err(refused(format_args!(
+                "{}: it changed while it was read; start again",
+                model.display()
+            )));
+        }
         let tuning = Tuning {
             bundle: bench.bundle,
             reference: &reference,
@@ -78,7 +85,7 @@ pub fn run(asked: &Tune, stop: &AtomicBool) -> Result<ExitCode, End> {
         })
     })?;
     let evidence = Evidence {
-        reference_sha256: sha256(&reference_bytes),
+        reference_sha256: sha256(&questions),
         ..tuned.found.judged.evidence.clone()
     };
     let record = Record::new(tuned.found.storage.clone(), evidence);
