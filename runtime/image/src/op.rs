@@ -153,7 +153,7 @@ macro_rules! ops {
         /// One operation of a program.
         #[derive(Debug, Clone, core::marker::Copy, PartialEq)]
         #[expect(missing_docs, reason = "each variant holds the record of the same name, which is documented")]
-        pub enum Op { $($name($name),)* }
+        pub enum Op { $($(#[cfg(feature = $feature)])? $name($name),)* }
 
         impl Op {
             /// The names of all operations, in the order of their opcodes.
@@ -164,7 +164,7 @@ macro_rules! ops {
                 let mut words = [0; OP_WORDS];
                 let mut out = Writer::new(&mut words);
                 match self {
-                    $(Self::$name(op) => {
+                    $($(#[cfg(feature = $feature)])? Self::$name(op) => {
                         const { assert!($name::WORDS < OP_WORDS, "an op and its code fit") };
                         out.word($code);
                         op.put(&mut out);
@@ -197,51 +197,42 @@ macro_rules! ops {
 
             /// The op's name.
             pub const fn name(&self) -> &'static str {
-                match self { $(Self::$name(_) => stringify!($name),)* }
+                match self { $($(#[cfg(feature = $feature)])? Self::$name(_) => stringify!($name),)* }
             }
 
             /// Checks the op, see [`Operation::check`].
             pub fn check(&self, checker: &Checker) -> Result<(), Fault> {
-                match self {
-                    $($(#[cfg(feature = $feature)])? Self::$name(op) => op.check(checker),)*
-                    #[allow(unreachable_patterns, reason = "there is something left out or not")]
-                    _ => Err(Fault::LeftOut),
-                }
+                match self { $($(#[cfg(feature = $feature)])? Self::$name(op) => op.check(checker),)* }
             }
 
             /// Runs the op, see [`Operation::run`]. Inlined: it belongs to the loop over a program.
             #[inline(always)]
             pub(crate) fn run(&self, weights: &[f32], machine: &mut Machine) -> Result<(), ExecError> {
-                match self {
-                    $($(#[cfg(feature = $feature)])? Self::$name(op) => op.run(weights, machine),)*
-                    // What was left out never decodes.
-                    #[allow(unreachable_patterns, reason = "there is something left out or not")]
-                    _ => Err(ExecError::Span),
-                }
+                match self { $($(#[cfg(feature = $feature)])? Self::$name(op) => op.run(weights, machine),)* }
             }
 
             /// Shows what the op reads, then what it writes, see [`Operation::accesses`].
             pub fn accesses(&self, see: &mut dyn FnMut(Access)) {
-                match self { $(Self::$name(op) => op.accesses(see),)* }
+                match self { $($(#[cfg(feature = $feature)])? Self::$name(op) => op.accesses(see),)* }
             }
 
             /// Shows every span of the arena that is not empty, see [`Operation::each_span`].
             pub fn each_span(&mut self, visit: &mut dyn FnMut(&mut Span)) {
-                match self { $(Self::$name(op) => op.each_span(visit),)* }
+                match self { $($(#[cfg(feature = $feature)])? Self::$name(op) => op.each_span(visit),)* }
             }
 
             /// The integers that the op reads and writes.
             pub fn slots(&self) -> Slots {
-                match self { $(Self::$name(op) => op.slots(),)* }
+                match self { $($(#[cfg(feature = $feature)])? Self::$name(op) => op.slots(),)* }
             }
 
             /// What the op costs at the largest context.
             pub fn work(&self) -> Work {
-                match self { $(Self::$name(op) => op.work(),)* }
+                match self { $($(#[cfg(feature = $feature)])? Self::$name(op) => op.work(),)* }
             }
         }
 
-        $(impl From<$name> for Op {
+        $($(#[cfg(feature = $feature)])? impl From<$name> for Op {
             fn from(op: $name) -> Self {
                 Self::$name(op)
             }

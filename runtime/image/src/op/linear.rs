@@ -28,7 +28,7 @@ impl Field for Activation {
         out.word(kind);
         alpha.put(out);
     }
-    #[inline]
+    #[inline(always)]
     fn take(from: &mut Reader) -> Option<Self> {
         let kind = from.word()?;
         let alpha = f32::take(from)?;
