@@ -234,4 +234,4 @@ macro_rules! kinds {
     };
 }
 
-kinds! { lads lang_dt lisa vae lcsd skilldiffuser history plain recurrent stacked camera }
+kinds! { lads lang_dt lisa vae lcsd skilldiffuser history plain recurrent stacked camera images }

@@ -18,8 +18,8 @@ const STRICT: [&str; 4] = ["-Wall", "-Wextra", "-Werror", "-pedantic"];
 /// Bytes of machine code and constants in a stripped program with what one family of policies needs, at most.
 const MOST_TEXT: usize = 200 * 1024;
 
-/// The same with all operations.
-const MOST_TEXT_OF_ALL: usize = 280 * 1024;
+/// The same with all operations. Those of images are 80 KB of it, most of that convolutions and pools for three instruction sets.
+const MOST_TEXT_OF_ALL: usize = 360 * 1024;
 
 fn crate_path(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(path)

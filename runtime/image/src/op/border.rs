@@ -76,7 +76,8 @@ impl Operation for Border {
         })
     }
 
-    #[inline]
+    // Not part of the loop over a program, whose frame would grow by what this one needs; a call is nothing beside an image.
+    #[inline(never)]
     fn run(&self, weights: &[f32], machine: &mut Machine) -> Result<(), ExecError> {
         let (read, y) = Readable::cut(weights, machine.arena, self.y)?;
         let value = match self.value {

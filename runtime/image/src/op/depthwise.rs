@@ -43,7 +43,8 @@ impl Operation for Depthwise {
         exactly(self.bias.len, [self.c])
     }
 
-    #[inline]
+    // Not part of the loop over a program, whose frame would grow by what this one needs; a call is nothing beside an image.
+    #[inline(never)]
     fn run(&self, weights: &[f32], machine: &mut Machine) -> Result<(), ExecError> {
         let isa = machine.isa;
         let (read, y) = Readable::cut(weights, machine.arena, self.y.at)?;
