@@ -12,6 +12,7 @@ from torch import nn
 from torch.nn import functional
 
 from .. import contract as contracts, graphs, random_policy
+from ..model import Normalizer
 from . import common, plain
 
 
@@ -134,7 +135,7 @@ class Images(nn.Module):
 
     def __init__(self, cameras, hidden):
         super().__init__()
-        self.normalizer = common.normalizer()
+        self.normalizer = Normalizer(len(common.ENVIRONMENT["observation"]))
         self.encoders = nn.ModuleList(Encoder(camera) for camera in cameras)
         features = [encoder.features() for encoder in self.encoders]
         widths = [sum(features), *hidden]
@@ -155,6 +156,7 @@ def randomize(policy, seed):
     generator = torch.Generator().manual_seed(seed)
     draw = lambda tensor: torch.randn(tensor.shape, generator=generator)
     random_policy.draw_weights(policy, generator)
+    random_policy.place_normalizer(policy.normalizer, common.ENVIRONMENT["observation"])
     with torch.no_grad():
         for module in policy.modules():
             if isinstance(module, nn.Conv2d):

@@ -1,6 +1,6 @@
 //! The border of an image, which makes every pixel of a convolution the same work.
 
-use super::picture::Pair;
+use super::picture::{Pair, called};
 use super::{Operation, Work};
 use crate::access::{self, Access, AccessKind};
 use crate::check::{Checked, Checker, Fault, exactly, require};
@@ -76,31 +76,32 @@ impl Operation for Border {
         })
     }
 
-    // Not part of the loop over a program, whose frame would grow by what this one needs; a call is nothing beside an image.
-    #[inline(never)]
+    #[inline]
     fn run(&self, weights: &[f32], machine: &mut Machine) -> Result<(), ExecError> {
-        let (read, y) = Readable::cut(weights, machine.arena, self.y)?;
-        let value = match self.value {
-            Some(value) => Some(read.get(value.into())?),
-            None => None,
-        };
-        for [first, rows, len] in self.sides() {
-            let side = y.get_mut(first as usize..).unwrap_or(&mut []);
-            for row in side
-                .chunks_mut(self.line().max(1) as usize)
-                .take(rows as usize)
-            {
-                let row = row.get_mut(..len as usize).unwrap_or(&mut []);
-                match value {
-                    None => row.fill(0.0),
-                    Some(value) => {
-                        let values = value.iter().cycle();
-                        row.iter_mut().zip(values).for_each(|(y, &x)| *y = x);
+        called(|| {
+            let (read, y) = Readable::cut(weights, machine.arena, self.y)?;
+            let value = match self.value {
+                Some(value) => Some(read.get(value.into())?),
+                None => None,
+            };
+            for [first, rows, len] in self.sides() {
+                let side = y.get_mut(first as usize..).unwrap_or(&mut []);
+                for row in side
+                    .chunks_mut(self.line().max(1) as usize)
+                    .take(rows as usize)
+                {
+                    let row = row.get_mut(..len as usize).unwrap_or(&mut []);
+                    match value {
+                        None => row.fill(0.0),
+                        Some(value) => {
+                            let values = value.iter().cycle();
+                            row.iter_mut().zip(values).for_each(|(y, &x)| *y = x);
+                        }
                     }
                 }
             }
-        }
-        Ok(())
+            Ok(())
+        })
     }
 
     fn accesses(&self, see: &mut dyn FnMut(Access)) {

@@ -2,7 +2,7 @@
 
 use lads_kernels as kernels;
 
-use super::picture::{Picture, Window};
+use super::picture::{Picture, Window, called};
 use super::{Operation, Work};
 use crate::access::{self, Access, AccessKind};
 use crate::check::{Checked, Checker, apart, exactly};
@@ -51,22 +51,23 @@ impl Operation for Conv {
         exactly(self.bias.len, [self.n])
     }
 
-    // Not part of the loop over a program, whose frame would grow by what this one needs; a call is nothing beside an image.
-    #[inline(never)]
+    #[inline]
     fn run(&self, weights: &[f32], machine: &mut Machine) -> Result<(), ExecError> {
-        let isa = machine.isa;
-        let (read, y) = Readable::cut(weights, machine.arena, self.y.at)?;
-        let conv = kernels::Conv {
-            sweep: self.window.sweep(self.x, self.y),
-            c: self.c as usize,
-            n: self.n as usize,
-            w: read.get(self.w.into())?,
-            bias: read.get(self.bias.into())?,
-            activation: self.activation,
-            accumulate: self.accumulate,
-        };
-        conv.run(isa, read.get(self.x.at.into())?, y);
-        Ok(())
+        called(|| {
+            let isa = machine.isa;
+            let (read, y) = Readable::cut(weights, machine.arena, self.y.at)?;
+            let conv = kernels::Conv {
+                sweep: self.window.sweep(self.x, self.y),
+                c: self.c as usize,
+                n: self.n as usize,
+                w: read.get(self.w.into())?,
+                bias: read.get(self.bias.into())?,
+                activation: self.activation,
+                accumulate: self.accumulate,
+            };
+            conv.run(isa, read.get(self.x.at.into())?, y);
+            Ok(())
+        })
     }
 
     fn accesses(&self, see: &mut dyn FnMut(Access)) {

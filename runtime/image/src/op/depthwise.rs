@@ -2,7 +2,7 @@
 
 use lads_kernels as kernels;
 
-use super::picture::{Picture, Window};
+use super::picture::{Picture, Window, called};
 use super::{Activation, Operation, Work};
 use crate::access::{self, Access, AccessKind};
 use crate::check::{Checked, Checker, apart, exactly};
@@ -43,20 +43,21 @@ impl Operation for Depthwise {
         exactly(self.bias.len, [self.c])
     }
 
-    // Not part of the loop over a program, whose frame would grow by what this one needs; a call is nothing beside an image.
-    #[inline(never)]
+    #[inline]
     fn run(&self, weights: &[f32], machine: &mut Machine) -> Result<(), ExecError> {
-        let isa = machine.isa;
-        let (read, y) = Readable::cut(weights, machine.arena, self.y.at)?;
-        let layer = kernels::Depthwise {
-            sweep: self.window.sweep(self.x, self.y),
-            c: self.c as usize,
-            w: read.get(self.w.into())?,
-            bias: read.get(self.bias.into())?,
-            activation: self.activation,
-        };
-        layer.run(isa, read.get(self.x.at.into())?, y);
-        Ok(())
+        called(|| {
+            let isa = machine.isa;
+            let (read, y) = Readable::cut(weights, machine.arena, self.y.at)?;
+            let layer = kernels::Depthwise {
+                sweep: self.window.sweep(self.x, self.y),
+                c: self.c as usize,
+                w: read.get(self.w.into())?,
+                bias: read.get(self.bias.into())?,
+                activation: self.activation,
+            };
+            layer.run(isa, read.get(self.x.at.into())?, y);
+            Ok(())
+        })
     }
 
     fn accesses(&self, see: &mut dyn FnMut(Access)) {

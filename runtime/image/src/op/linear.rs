@@ -28,7 +28,10 @@ impl Field for Activation {
         out.word(kind);
         alpha.put(out);
     }
-    // Always: out of line it keeps the whole record in memory, and the loop over a program takes 2 KB more.
+    #[expect(
+        clippy::inline_always,
+        reason = "out of line it keeps the whole record in memory, and the loop over a program takes 2 KB more"
+    )]
     #[inline(always)]
     fn take(from: &mut Reader) -> Option<Self> {
         let kind = from.word()?;

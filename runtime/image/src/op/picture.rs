@@ -151,3 +151,10 @@ impl Window {
         }
     }
 }
+
+/// Runs an operation on images out of the loop over a program, whose frame would grow by what each of them needs: a call is nothing
+/// beside an image. Generic, so that a build without the operation has none of it.
+#[inline(never)]
+pub(super) fn called<T>(run: impl FnOnce() -> T) -> T {
+    run()
+}

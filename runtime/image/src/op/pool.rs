@@ -2,7 +2,7 @@
 
 use lads_kernels as kernels;
 
-use super::picture::{Pair, Picture, Window};
+use super::picture::{Pair, Picture, Window, called};
 use super::{Operation, Work};
 use crate::access::{self, Access, AccessKind};
 use crate::check::{Checked, Checker, apart};
@@ -44,26 +44,27 @@ impl Operation for Pool {
         apart(self.y.at, [self.x.at])
     }
 
-    // Not part of the loop over a program, whose frame would grow by what this one needs; a call is nothing beside an image.
-    #[inline(never)]
+    #[inline]
     fn run(&self, weights: &[f32], machine: &mut Machine) -> Result<(), ExecError> {
-        let isa = machine.isa;
-        let (read, y) = Readable::cut(weights, machine.arena, self.y.at)?;
-        let pool = kernels::Pool {
-            kind: self.kind,
-            size: self.size.sizes(),
-            out: self.window.out.sizes(),
-            c: self.c as usize,
-            kernel: self.window.kernel.sizes(),
-            stride: self.window.stride.sizes(),
-            dilation: self.window.dilation.sizes(),
-            before: self.before.sizes(),
-            after: self.after.sizes(),
-            x_strides: self.x.strides(),
-            y_strides: self.y.strides(),
-        };
-        pool.run(isa, read.get(self.x.at.into())?, y);
-        Ok(())
+        called(|| {
+            let isa = machine.isa;
+            let (read, y) = Readable::cut(weights, machine.arena, self.y.at)?;
+            let pool = kernels::Pool {
+                kind: self.kind,
+                size: self.size.sizes(),
+                out: self.window.out.sizes(),
+                c: self.c as usize,
+                kernel: self.window.kernel.sizes(),
+                stride: self.window.stride.sizes(),
+                dilation: self.window.dilation.sizes(),
+                before: self.before.sizes(),
+                after: self.after.sizes(),
+                x_strides: self.x.strides(),
+                y_strides: self.y.strides(),
+            };
+            pool.run(isa, read.get(self.x.at.into())?, y);
+            Ok(())
+        })
     }
 
     fn accesses(&self, see: &mut dyn FnMut(Access)) {

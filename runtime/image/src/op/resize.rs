@@ -2,7 +2,7 @@
 
 use lads_kernels as kernels;
 
-use super::picture::{Pair, Picture};
+use super::picture::{Pair, Picture, called};
 use super::{Operation, Work};
 use crate::access::{self, Access, AccessKind};
 use crate::check::{Checked, Checker, apart, exactly};
@@ -42,21 +42,22 @@ impl Operation for Resize {
         Ok(())
     }
 
-    // Not part of the loop over a program, whose frame would grow by what this one needs; a call is nothing beside an image.
-    #[inline(never)]
+    #[inline]
     fn run(&self, weights: &[f32], machine: &mut Machine) -> Result<(), ExecError> {
-        let isa = machine.isa;
-        let (read, y) = Readable::cut(weights, machine.arena, self.y.at)?;
-        let resize = kernels::Resize {
-            size: self.size.sizes(),
-            c: self.c as usize,
-            rows: read.get(self.rows.into())?,
-            cols: read.get(self.cols.into())?,
-            x_strides: self.x.strides(),
-            y_strides: self.y.strides(),
-        };
-        resize.run(isa, read.get(self.x.at.into())?, y);
-        Ok(())
+        called(|| {
+            let isa = machine.isa;
+            let (read, y) = Readable::cut(weights, machine.arena, self.y.at)?;
+            let resize = kernels::Resize {
+                size: self.size.sizes(),
+                c: self.c as usize,
+                rows: read.get(self.rows.into())?,
+                cols: read.get(self.cols.into())?,
+                x_strides: self.x.strides(),
+                y_strides: self.y.strides(),
+            };
+            resize.run(isa, read.get(self.x.at.into())?, y);
+            Ok(())
+        })
     }
 
     /// Reads the whole image: which pixels the tables name is not looked at.
