@@ -44,12 +44,11 @@ class Dropout(nn.Module):
 def attend(q, k, v, mask, step=1):
     """Masked attention: q [B, h, R, d], k and v [B, h, S, d], mask [B, 1, R, S] added to the scores.
 
-    On a CPU in two blocks of queries, each against the keys up to its last row: a quarter of the
-    square is never computed, and in bfloat16 this takes less than half the time of the fused operator.
+    In two blocks of queries, each against the keys up to its last row: a quarter of the square is never computed,
+    and in bfloat16 on a CPU this takes less than half the time of the fused operator. On a GPU too, where training
+    with the fused operator and this mask came to a loss that is not finite.
     Query row R - 1 stands at key S - 1, the row before it at S - 1 - step, and so on.
     """
-    if q.is_cuda:
-        return F.scaled_dot_product_attention(q, k, v, attn_mask=mask.to(q.dtype))
     rows, keys = q.shape[2], k.shape[2]
     q, mask = q * q.shape[-1] ** -0.5, mask.to(q.dtype)
     size = max(16, -(-rows // 2))

@@ -84,7 +84,7 @@ pub struct Replay {
     pub replies: Vec<Reply>,
     /// Why it refused the next step, if it did.
     pub refused: Option<String>,
-    /// The plan that its trajectory encoder sees in each segment of the reference's; `None` if it has no encoder.
+    /// The plan that its trajectory encoder sees in each segment of the reference's, fewer where it refused one; `None` if it has no encoder.
     pub encoded: Option<Vec<u32>>,
 }
 
@@ -298,7 +298,12 @@ impl<'t> Traced<'t> {
 
     fn encoded(&self, numbering: &Numbering, answers: &mut Answers) -> Option<String> {
         let (ours, theirs) = (self.replay.encoded.as_ref()?, self.trace.encoded.as_ref()?);
-        let mut first = None;
+        let mut first = (ours.len() != theirs.len()).then(|| {
+            let (ours, theirs) = (ours.len(), theirs.len());
+            format!("the trajectory encoder sees a plan in {ours} of {theirs} segments")
+        });
+        answers.differing_segments += theirs.len().saturating_sub(ours.len());
+        answers.compared_segments += theirs.len().saturating_sub(ours.len());
         let margins = self
             .trace
             .encoded_margins

@@ -186,6 +186,13 @@ fn an_encoder_that_sees_other_plans_is_a_difference_but_for_close_calls() {
     let close = judged(|replay| replay.encoded = Some(vec![1, 0, 0]));
     assert_eq!((close.differing_segments, close.differing_episodes), (0, 0));
     assert_eq!(judged(|replay| replay.encoded = None).compared_segments, 0);
+    // An encoder that refuses the second segment.
+    let refused = judged(|replay| replay.encoded = Some(vec![1]));
+    assert_eq!(
+        [refused.compared_segments, refused.differing_segments],
+        [3, 2]
+    );
+    difference(&refused, "sees a plan in 1 of 3 segments");
 }
 
 #[test]

@@ -143,7 +143,7 @@ pub fn judge(exact: &[Replay], candidate: &[Replay], tolerance: f64) -> Judged {
                 .zip(got)
                 .filter(|(wanted, got)| wanted != got)
                 .count(),
-            // An encoder that refuses a segment gives none.
+            // An encoder that refuses a segment stops there.
             _ => segments.len(),
         };
         for (wanted, got) in wanted.replies.iter().zip(&got.replies) {

@@ -47,7 +47,7 @@ pub fn ask(
             if let Some(trace) = &recorded.trace {
                 replays.push(Replay {
                     episode,
-                    encoded: encoder.and_then(|encoder| encode(&mut controller, trace, encoder)),
+                    encoded: encoder.map(|encoder| encode(&mut controller, trace, encoder)),
                     ..replay(&mut controller, index, trace)
                 });
             }
@@ -100,18 +100,14 @@ fn replay(controller: &mut Controller<'_, '_>, instruction: u32, trace: &Trace) 
     replay
 }
 
-/// What the policy's trajectory encoder sees in each full segment of a trace; `None` where it refuses one.
-fn encode(
-    controller: &mut Controller<'_, '_>,
-    trace: &Trace,
-    encoder: Segment,
-) -> Option<Vec<u32>> {
+/// What the policy's trajectory encoder sees in each full segment of a trace, up to the first that it refuses.
+fn encode(controller: &mut Controller<'_, '_>, trace: &Trace, encoder: Segment) -> Vec<u32> {
     let contract = controller.policy().contract();
     let [observations, actions] =
         [contract.observation_len(), contract.action_len()].map(|len| len * encoder.steps);
     let segments = trace.observations.chunks_exact(observations);
     segments
         .zip(trace.actions.chunks_exact(actions))
-        .map(|(seen, done)| encoder.encode(controller, seen, done).ok())
+        .map_while(|(seen, done)| encoder.encode(controller, seen, done).ok())
         .collect()
 }
