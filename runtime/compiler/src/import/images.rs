@@ -110,7 +110,11 @@ fn windows(
                     (large, small)
                 };
             }
-            other => return Err(format!("does not support auto_pad = {other}")),
+            other => {
+                return Err(format!(
+                    "does not support auto_pad = {other}, only NOTSET, VALID, SAME_UPPER and SAME_LOWER"
+                ));
+            }
         }
         let padded = sides[i] + before[i] + after[i];
         let rest = padded.checked_sub(wide).ok_or_else(|| {
