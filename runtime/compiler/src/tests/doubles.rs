@@ -36,14 +36,13 @@ pub fn outputs(
         if values.contains_key(&id) {
             continue;
         }
-        let value = match g.constant(id) {
-            Some(constant) => Value::of(constant),
-            None => {
-                let node = g.node(id);
-                let operands: Vec<_> = node.inputs.iter().map(|id| values[id].view()).collect();
-                let shape = g.known_shape(id).expect("a known shape");
-                evaluate(&node.op, &operands, &shape)
-            }
+        let value = if let Some(constant) = g.constant(id) {
+            Value::of(constant)
+        } else {
+            let node = g.node(id);
+            let operands: Vec<_> = node.inputs.iter().map(|id| values[id].view()).collect();
+            let shape = g.known_shape(id).expect("a known shape");
+            evaluate(&node.op, &operands, &shape)
         };
         let value = value.unwrap_or_else(|| panic!("{:?} is not evaluated", g.op(id)));
         values.insert(id, value);
