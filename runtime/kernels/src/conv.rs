@@ -132,12 +132,16 @@ impl Conv<'_> {
     /// Computes `y` from `x`, both from the first pixel on. A view that is too short, or weights that are, leave `y` as it was.
     pub fn run(&self, isa: Isa, x: &[f32], y: &mut [f32]) {
         let [rows, cols] = self.sweep.kernel;
-        let k = rows * cols * self.c;
         let there = self
             .sweep
             .reach(self.c)
             .is_some_and(|reach| reach <= x.len());
-        if there && k > 0 && self.w.len() == conv_packed_len([k, self.n]) {
+        let k = (rows.checked_mul(cols)).and_then(|kernel| kernel.checked_mul(self.c));
+        let packed = k
+            .zip(self.n.checked_next_multiple_of(LANES))
+            .and_then(|(k, n)| k.checked_mul(n));
+        let k = k.unwrap_or(0);
+        if there && k > 0 && packed == Some(self.w.len()) {
             isa.run(Pixels {
                 conv: self,
                 k,

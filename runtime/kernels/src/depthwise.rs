@@ -61,7 +61,11 @@ impl Depthwise<'_> {
     pub fn run(&self, isa: Isa, x: &[f32], y: &mut [f32]) {
         let [rows, cols] = self.sweep.kernel;
         let there = (self.sweep.reach(self.c)).is_some_and(|reach| reach <= x.len());
-        if there && self.c > 0 && self.w.len() == depthwise_packed_len([rows * cols, self.c]) {
+        let packed = rows
+            .checked_mul(cols)
+            .zip(self.c.checked_next_multiple_of(LANES))
+            .and_then(|(kernel, c)| kernel.checked_mul(c));
+        if there && self.c > 0 && packed == Some(self.w.len()) {
             isa.run(Channels { layer: self, x, y });
         }
     }

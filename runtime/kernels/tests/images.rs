@@ -214,9 +214,81 @@ fn what_is_too_short_is_left_as_it_was() {
         .run(isa, &vec![1.0; x_len], &mut y);
         layer.run(isa, &vec![1.0; x_len - 1], &mut y);
         assert!(y.iter().all(|&y| y == 5.0));
+        // A kernel whose size is beyond a usize.
+        let beyond = Sweep {
+            kernel: [usize::MAX / 2 + 1, 2],
+            dilation: [0, 0],
+            ..sweep
+        };
+        Conv {
+            sweep: beyond,
+            w: &[],
+            ..conv
+        }
+        .run(isa, &vec![1.0; x_len], &mut y);
+        Depthwise {
+            sweep: beyond,
+            w: &[],
+            ..layer
+        }
+        .run(isa, &vec![1.0; x_len], &mut y);
+        assert!(y.iter().all(|&y| y == 5.0));
         // Whole pixels that there are are written.
         conv.run(isa, &vec![1.0; x_len], &mut y[..4]);
         assert_eq!(y[..5], [8.0, 8.0, 8.0, 5.0, 5.0]);
+    }
+}
+
+#[test]
+fn activations_keep_what_is_no_number_and_bound_what_is_infinite() {
+    let kinds = [
+        Activation::None,
+        Activation::Relu,
+        Activation::LeakyRelu(0.1),
+        Activation::Clipped(6.0),
+    ];
+    let (sweep, [x_len, y_len]) = sweep([1, 1], [[1, 1], [1, 1], [1, 1], [1, 1]], [0, 0]);
+    assert_eq!([x_len, y_len], [1, 1]);
+    for activation in kinds {
+        for x in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -0.0, 7.0] {
+            let mut packed = vec![0.0; conv_packed_len([1, 1])];
+            packed[0] = 1.0;
+            let results = [false, true].map(|depthwise| {
+                on_all(|isa| {
+                    let mut y = vec![0.0];
+                    if depthwise {
+                        let layer = Depthwise {
+                            sweep,
+                            c: 1,
+                            w: &packed,
+                            bias: &[0.0],
+                            activation,
+                        };
+                        layer.run(isa, &[x], &mut y);
+                    } else {
+                        let conv = Conv {
+                            sweep,
+                            c: 1,
+                            n: 1,
+                            w: &packed,
+                            bias: &[0.0],
+                            activation,
+                            accumulate: false,
+                        };
+                        conv.run(isa, &[x], &mut y);
+                    }
+                    [y]
+                })
+            });
+            let wanted = lads_kernels::reference::activation(activation, f64::from(x)) as f32;
+            for [y] in results {
+                assert_eq!(y[0].is_nan(), x.is_nan(), "{activation:?} of {x}");
+                assert!(
+                    x.is_nan() || y[0] == wanted,
+                    "{activation:?} of {x} is {y:?}"
+                );
+            }
+        }
     }
 }
 

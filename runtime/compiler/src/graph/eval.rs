@@ -319,10 +319,10 @@ pub(crate) fn apply<T: Real>(unary: Unary, x: T) -> T {
     let alpha = T::exact(f32::from_bits(unary.alpha));
     let softplus = |x: T| x.max(zero) + (-x.abs()).exp().ln_1p();
     match unary.kind.0 {
-        UnaryKind::Relu => x.max(zero),
+        UnaryKind::Relu if x < zero => zero,
         UnaryKind::LeakyRelu if x < zero => alpha * x,
         UnaryKind::Elu if x < zero => alpha * x.exp_m1(),
-        UnaryKind::LeakyRelu | UnaryKind::Elu => x,
+        UnaryKind::Relu | UnaryKind::LeakyRelu | UnaryKind::Elu => x,
         UnaryKind::Tanh => x.tanh(),
         UnaryKind::Sigmoid => one / (one + (-x).exp()),
         UnaryKind::Exp => x.exp(),

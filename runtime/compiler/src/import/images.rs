@@ -224,6 +224,12 @@ fn pool(g: &mut Graph, x: &Operands, a: &Attributes, kind: PoolKind) -> Outputs 
         return Err("misses its kernel_shape".into());
     }
     let windows = windows(a, &sides, &kernel, round_up)?;
+    let covered = [0, 1].map(|i| (windows.kernel[i] - 1) * windows.dilation[i] + 1);
+    if (0..2).any(|i| windows.before[i].max(windows.after[i]) >= covered[i]) {
+        return Err(
+            "has a padding as large as its window, so that some windows see nothing".into(),
+        );
+    }
     let last = channels_last(g, image)?;
     let y = g.pool(kind, windows, last)?;
     channels_first(g, y).map(|y| vec![y])

@@ -16,10 +16,12 @@ struct Places {
 }
 
 impl Places {
-    /// The place in an input of `from` elements, of which `to` are made, of output `i`.
-    fn of(&self, i: usize, from: usize, to: usize, scale: f64) -> Result<f64, String> {
+    /// The place of output `i` in an input of `from` elements, of which `to` are made; `scale` is a quotient, so that a place that is a
+    /// whole number is one.
+    fn of(&self, i: usize, from: usize, to: usize, scale: [f64; 2]) -> Result<f64, String> {
         let (at, from, to) = (i as f64, from as f64, to as f64);
-        let half_pixel = (at + 0.5) / scale - 0.5;
+        let [over, under] = scale;
+        let half_pixel = (at + 0.5) * under / over - 0.5;
         Ok(match self.mode.as_str() {
             "half_pixel" => half_pixel,
             "pytorch_half_pixel" => {
@@ -30,19 +32,12 @@ impl Places {
                 }
             }
             "half_pixel_symmetric" => {
-                let adjusted = to / (scale * from);
+                let adjusted = to * under / (over * from);
                 from / 2.0 * (1.0 - adjusted) + half_pixel
             }
-            "asymmetric" => at / scale,
-            "align_corners" => {
-                // The length before it was rounded down, as ONNX' own cases have it.
-                let whole = from * scale;
-                if whole > 1.0 {
-                    at * (from - 1.0) / (whole - 1.0)
-                } else {
-                    0.0
-                }
-            }
+            "asymmetric" => at * under / over,
+            // The length that there is, as PyTorch and ONNX Runtime have it, and not the one before it was rounded down.
+            "align_corners" => at * (from - 1.0) / (to - 1.0).max(1.0),
             other => {
                 return Err(format!(
                     "does not support coordinate_transformation_mode = {other}"
@@ -52,7 +47,7 @@ impl Places {
     }
 
     /// First input, second input and weight of the second, for each of `to` outputs.
-    fn table(&self, from: usize, to: usize, scale: f64) -> Result<Tensor, String> {
+    fn table(&self, from: usize, to: usize, scale: [f64; 2]) -> Result<Tensor, String> {
         let last = (from - 1) as f64;
         let mut table = vec![];
         for i in 0..to {
@@ -123,7 +118,7 @@ pub(super) fn resize(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
         None => (0..rank).collect(),
     };
     // New length and scale of each axis.
-    let mut to: Vec<(usize, f64)> = shape.iter().map(|&len| (len, 1.0)).collect();
+    let mut to: Vec<(usize, [f64; 2])> = shape.iter().map(|&len| (len, [1.0, 1.0])).collect();
     let scales = x.optional(2).map(|id| {
         let scales = g
             .constant(id)
@@ -135,14 +130,14 @@ pub(super) fn resize(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
         (_, Some(lens)) => {
             for (&axis, &len) in axes.iter().zip(&lens) {
                 let len = usize::try_from(len).unwrap_or(0);
-                to[axis] = (len, len as f64 / shape[axis] as f64);
+                to[axis] = (len, [len as f64, shape[axis] as f64]);
             }
             lens.len()
         }
         (Some(scales), None) => {
             for (&axis, &scale) in axes.iter().zip(&scales) {
                 let scale = f64::from(scale);
-                to[axis] = ((shape[axis] as f64 * scale).floor() as usize, scale);
+                to[axis] = ((shape[axis] as f64 * scale).floor() as usize, [scale, 1.0]);
             }
             scales.len()
         }

@@ -284,6 +284,7 @@ impl Lowering<'_, '_> {
         let images = Images::of(self.view(residual)?);
         if let Some(buffer) = images.view.buffer()
             && images.view.strides.last() == Some(&1)
+            && images.view.is_injective(&shape)
             && larger(there, wanted) == there
             && self.view(x)?.buffer() != Some(buffer)
             && !self.placed.contains_key(&id)

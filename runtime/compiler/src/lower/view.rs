@@ -57,6 +57,23 @@ impl View {
         (0..shape.len()).all(|i| shape[i] == 1 || self.strides[i] == own[i])
     }
 
+    /// Whether no two elements share a place, as those of a broadcast do.
+    pub fn is_injective(&self, shape: &[usize]) -> bool {
+        let mut axes: Vec<_> = self
+            .strides
+            .iter()
+            .zip(shape)
+            .filter(|(_, len)| **len > 1)
+            .collect();
+        axes.sort_unstable();
+        let mut reach = 1;
+        axes.into_iter().all(|(&stride, &len)| {
+            let apart = stride >= reach;
+            reach += stride * (len - 1);
+            apart
+        })
+    }
+
     /// How many elements the view spans, gaps included.
     pub fn reach(&self, shape: &[usize]) -> usize {
         1 + shape

@@ -72,6 +72,28 @@ fn convolutions() {
     agrees(sequence.output("y", &[1, 5, 5]));
 }
 
+/// What is added to a convolution is not written over where its elements share their place.
+#[test]
+fn broadcasts_are_added_by_copy() {
+    for (images, from) in [(2, [1, 4, 4]), (1, [1, 1, 4]), (2, [1, 1, 4])] {
+        let added = Small::new()
+            .input("a", &[images, 3, 6])
+            .input("b", &[1, 4])
+            .random("w", &[4, 3, 3])
+            .random("m", &[4, from.iter().product()])
+            .integers("shape", &from.map(|len| len as i64))
+            .integers("wide", &[images as i64, 4, 4])
+            .node("Conv", &["a", "w"], &["c"], &[])
+            .node("Transpose", &["c"], &["t"], &[ints("perm", &[0, 2, 1])])
+            .node("MatMul", &["b", "m"], &["z"], &[])
+            .node("Reshape", &["z", "shape"], &["r"], &[])
+            .node("Expand", &["r", "wide"], &["e"], &[])
+            .node("Add", &["t", "e"], &["y"], &[])
+            .output("y", &[images, 4, 4]);
+        agrees(added);
+    }
+}
+
 #[test]
 fn pools() {
     let pool = |operator: &str, attributes: &[crate::onnx::AttributeProto]| {

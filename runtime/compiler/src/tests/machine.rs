@@ -142,7 +142,10 @@ impl<'w> Machine<'w> {
                             element(UnaryKind::LeakyRelu, alpha, sum as f32)
                         }
                         Activation::Clipped(bound) => {
-                            element(UnaryKind::Relu, 0.0, sum as f32).min(bound)
+                            match element(UnaryKind::Relu, 0.0, sum as f32) {
+                                sum if sum > bound => bound,
+                                sum => sum,
+                            }
                         }
                         Activation::Tanh => element(UnaryKind::Tanh, 0.0, sum as f32),
                         Activation::Sigmoid => element(UnaryKind::Sigmoid, 0.0, sum as f32),

@@ -74,7 +74,8 @@ pub(super) fn conv<T: Real>(
         }
         let sum = conv.activation.map_or(sum, |unary| apply(unary, sum));
         let bound = conv.bound.map(|bound| T::exact(f32::from_bits(bound)));
-        bound.map_or(sum, |bound| sum.min(bound))
+        // A sum that is no number stays none, as in the kernels.
+        bound.map_or(sum, |bound| if sum > bound { bound } else { sum })
     })
 }
 
@@ -104,7 +105,9 @@ pub(super) fn pool<T: Real>(
             T::of(count.max(1) as i64)
         };
         match kind {
-            PoolKind::Max => inside().fold(T::neg_infinity(), T::max),
+            PoolKind::Max => inside().fold(T::neg_infinity(), |most, x| {
+                if most.is_nan() || most > x { most } else { x }
+            }),
             PoolKind::Mean => inside().sum::<T>() / counted(windows, size(&image)),
             PoolKind::PaddedMean => inside().sum::<T>() / counted(&whole, padded),
         }
