@@ -16,13 +16,11 @@ pub use images::{conv, depthwise, pool, resize};
 /// `x`, after the non-linearity.
 pub fn activation(activation: Activation, x: f64) -> f64 {
     match activation {
-        Activation::None => x,
-        Activation::Relu if x < 0.0 => 0.0,
-        Activation::Relu => x,
-        Activation::LeakyRelu(alpha) => x.max(0.0) + f64::from(alpha) * x.min(0.0),
-        Activation::Clipped(_) if x < 0.0 => 0.0,
+        // What is no number stays none.
+        Activation::Relu | Activation::Clipped(_) if x < 0.0 => 0.0,
         Activation::Clipped(bound) if x > f64::from(bound) => f64::from(bound),
-        Activation::Clipped(_) => x,
+        Activation::None | Activation::Relu | Activation::Clipped(_) => x,
+        Activation::LeakyRelu(alpha) => x.max(0.0) + f64::from(alpha) * x.min(0.0),
         Activation::Tanh => libm::tanh(x),
         Activation::Sigmoid => 1.0 / (1.0 + libm::exp(-x)),
         Activation::Elu(alpha) => x.max(0.0) + f64::from(alpha) * libm::expm1(x.min(0.0)),
