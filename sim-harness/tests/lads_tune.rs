@@ -89,7 +89,7 @@ fn every_plan_is_kept_and_the_bundle_says_so() {
         .output();
     let verified = String::from_utf8(verified.unwrap().stdout).unwrap();
     assert!(
-        verified.contains("0 of 202 replayed episodes differ"),
+        verified.contains("0 of 101 replayed episodes differ"),
         "{verified}"
     );
     let exact = lads_compiler::compile_with(&bundle, &lads_compiler::Options::exact()).unwrap();

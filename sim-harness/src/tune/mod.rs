@@ -144,9 +144,8 @@ impl Tuning<'_> {
         let traced = self.reference.traced_episodes;
         policy::ask(
             &policy,
-            self.isa,
             // The likeliest index, whatever the contract's rule: margins say nothing of a draw.
-            Decision::Argmax,
+            (self.isa, Decision::Argmax),
             self.reference,
             self.assignments,
             traced,

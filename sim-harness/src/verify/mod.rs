@@ -47,8 +47,7 @@ pub fn run(
     let traced = evaluation.setup.traced;
     let replays = policy::ask(
         &evaluation.policy,
-        evaluation.isa,
-        contract.decision(),
+        (evaluation.isa, contract.decision()),
         reference,
         evaluation.assignments,
         traced,

@@ -17,8 +17,7 @@ use crate::plans::Segment;
 /// instruction. `finished` is called after each episode, `stop` ends the work early.
 pub fn ask(
     policy: &Policy<'_>,
-    isa: Isa,
-    decision: Decision,
+    (isa, decision): (Isa, Decision),
     reference: &Reference,
     assignments: &[Assignment],
     episodes: u32,

@@ -259,8 +259,7 @@ pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usi
     let stop = AtomicBool::new(false);
     let replays = verify::policy::ask(
         &policy,
-        Isa::detect(),
-        policy.contract().decision(),
+        (Isa::detect(), policy.contract().decision()),
         reference,
         &assignments,
         1,
