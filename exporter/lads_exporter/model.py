@@ -45,8 +45,8 @@ def attend(q, k, v, mask, step=1):
     """Masked attention: q [B, h, R, d], k and v [B, h, S, d], mask [B, 1, R, S] added to the scores.
 
     In two blocks of queries, each against the keys up to its last row: a quarter of the square is never computed,
-    and in bfloat16 on a CPU this takes less than half the time of the fused operator. On a GPU too, where training
-    with the fused operator and this mask came to a loss that is not finite.
+    and in bfloat16 on a CPU this takes less than half the time of the fused operator. On a GPU too: there, trainings
+    with the fused operator in this place ended with a loss that is not finite.
     Query row R - 1 stands at key S - 1, the row before it at S - 1 - step, and so on.
     """
     rows, keys = q.shape[2], k.shape[2]

@@ -298,12 +298,13 @@ impl<'t> Traced<'t> {
 
     fn encoded(&self, numbering: &Numbering, answers: &mut Answers) -> Option<String> {
         let (ours, theirs) = (self.replay.encoded.as_ref()?, self.trace.encoded.as_ref()?);
+        let missing = theirs.len().saturating_sub(ours.len());
+        answers.compared_segments += missing;
+        answers.differing_segments += missing;
         let mut first = (ours.len() != theirs.len()).then(|| {
             let (ours, theirs) = (ours.len(), theirs.len());
             format!("the trajectory encoder sees a plan in {ours} of {theirs} segments")
         });
-        answers.differing_segments += theirs.len().saturating_sub(ours.len());
-        answers.compared_segments += theirs.len().saturating_sub(ours.len());
         let margins = self
             .trace
             .encoded_margins
