@@ -1,7 +1,8 @@
-//! What a policy expects and promises: its channels, their names, units and limits, and the instructions that it knows.
+//! The contract of a policy: its channels, their names, units and limits, and the instructions that
+//! it knows.
 //!
-//! A [`Contract`] is a view on the image, checked when the policy is opened; its accessors cannot fail, those with an index
-//! give `None` beyond the end.
+//! A [`Contract`] is a view on the image, checked when the policy is opened; its accessors cannot
+//! fail; those that take an index return `None` past the end.
 
 use core::error::Error;
 use core::fmt;
@@ -17,7 +18,7 @@ mod channel;
 pub(crate) use channel::Bounds;
 pub use channel::{Channel, ChannelId, DType, Element, Interval, QuaternionOrder, Role};
 
-/// The most channels that a policy may have.
+/// Largest number of channels that a policy may have.
 const MAX_CHANNELS: usize = 128;
 
 /// A checked view on the contract of a policy.
@@ -25,7 +26,7 @@ const MAX_CHANNELS: usize = 128;
 pub struct Contract<'a> {
     pub(crate) tables: Tables<'a>,
     record: ContractRecord,
-    /// The first observation channel.
+    /// Number of the first observation channel.
     observation: u32,
     observations_len: u32,
     observation_dtype: DType,
@@ -36,54 +37,55 @@ pub struct Contract<'a> {
     noise: Option<u32>,
 }
 
-/// What happens when a context has seen as many control steps as the policy was trained on.
+/// Behaviour once a context has seen as many control steps as the policy was trained on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Beyond {
-    /// The instruction stays in the context, the timestep starts again at 0.
+    /// Restart the timestep at 0 and keep the instruction in the context.
     Restart,
-    /// The step is refused.
+    /// Refuse the step.
     Refuse,
 }
 
 /// One instruction that a policy knows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct KnownInstruction<'a> {
-    /// Short name.
+    /// Short name of the instruction.
     pub id: &'a str,
-    /// What the person says.
+    /// The instruction as a person says it.
     pub text: &'a str,
-    /// `[n, E]` word embeddings.
+    /// Word embeddings, `[n, E]`.
     pub words: &'a [f32],
 }
 
-/// How an index is picked from scores.
+/// Rule by which an index is picked from scores.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Decision {
-    /// The largest score, the first of equal ones.
+    /// The index with the largest score, the first of equal ones.
     Argmax,
-    /// At random with the softmax of the scores over the temperature. A temperature that is not above zero means argmax.
+    /// An index drawn at random with the softmax of the scores over the temperature. A temperature
+    /// that is not above zero means argmax.
     Sample {
-        /// Divides the scores.
+        /// Divisor of the scores.
         temperature: f32,
-        /// The same seed gives the same indices.
+        /// Seed of the generator; the same seed gives the same indices.
         seed: u64,
     },
 }
 
-/// Where the values of noise channels come from.
+/// Source of the values of noise channels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Noise {
-    /// Zeros, the mean of what would be drawn.
+    /// Zeros, the mean of the standard normal distribution.
     Zero,
     /// Standard normals; the same seed gives the same values, on every target.
     Seeded {
-        /// Of the generator.
+        /// Seed of the generator.
         seed: u64,
     },
 }
 
 impl<'a> Contract<'a> {
-    /// Checks what the tables say at the policy's edge.
+    /// Checks the tables' description of the policy's channels and instructions.
     #[inline(never)]
     pub(crate) fn new_checked(tables: Tables<'a>) -> Result<Self, ContractError> {
         let record = tables.contract().ok_or(ContractError::Number)?;
@@ -174,27 +176,28 @@ impl<'a> Contract<'a> {
         Ok(())
     }
 
-    /// Name of the family of policies that this one belongs to, such as `lads`: to be shown, nothing depends on it.
+    /// Returns the name of the family of policies that this one belongs to, such as `lads`;
+    /// informational, nothing depends on it.
     pub fn family(&self) -> &'a str {
         self.tables.text(self.record.family)
     }
 
-    /// Environment, for example `franka-kitchen`.
+    /// Returns the name of the environment, for example `franka-kitchen`.
     pub fn environment_id(&self) -> &'a str {
         self.tables.text(self.record.environment_id)
     }
 
-    /// The environment's version.
+    /// Returns the version of the environment.
     pub fn environment_version(&self) -> &'a str {
         self.tables.text(self.record.environment_version)
     }
 
-    /// Time from one control step to the next, in seconds.
+    /// Returns the control period, the time from one control step to the next, in seconds.
     pub fn control_period_s(&self) -> f32 {
         self.record.control_period_s
     }
 
-    /// All channels, in the order of their [`ChannelId`]s.
+    /// Returns all channels, in the order of their [`ChannelId`]s.
     pub fn channels(&self) -> impl Iterator<Item = Channel<'a>> + use<'a> {
         let contract = *self;
         (0_u32..)
@@ -202,75 +205,76 @@ impl<'a> Contract<'a> {
             .filter_map(move |i| contract.channel(ChannelId(i)))
     }
 
-    /// A channel by its number.
+    /// Returns the channel with this number.
     #[inline]
     pub fn channel(&self, id: ChannelId) -> Option<Channel<'a>> {
         let record = self.tables.channel(id.0 as usize)?;
         Some(Channel::new(self.tables, record, id))
     }
 
-    /// A channel by its name.
+    /// Returns the channel with this name.
     pub fn find(&self, name: &str) -> Option<Channel<'a>> {
         self.channels()
             .find(|channel| same_text(channel.name(), name))
     }
 
-    /// The channels that the caller gives in every control step.
+    /// Returns the channels that the caller gives in every control step.
     pub fn observations(&self) -> impl Iterator<Item = Channel<'a>> + use<'a> {
         self.channels()
             .filter(|channel| channel.role() == Role::Observation)
     }
 
-    /// How many channels the caller gives in every control step; one or more.
+    /// Returns the number of channels that the caller gives in every control step; one or more.
     pub fn observations_len(&self) -> usize {
         self.observations_len as usize
     }
 
-    /// The first observation channel, the only one of most policies.
+    /// Returns the first observation channel, the only one of most policies.
     pub fn observation(&self) -> Channel<'a> {
         self.known(self.observation)
     }
 
-    /// Whether a control step would take these values: all observation channels once, each with finite values inside its limits.
+    /// Checks whether a control step would accept these values: all observation channels once, each
+    /// with finite values inside its limits.
     pub fn check_observations(&self, given: &[(ChannelId, Data)]) -> Result<(), InputError> {
         inputs::check(self, Role::Observation, given, 0).map(|_| ())
     }
 
-    /// Elements of the first observation channel.
+    /// Returns the number of elements of the first observation channel.
     pub fn observation_len(&self) -> usize {
         self.observation().len()
     }
 
-    /// The action channel.
+    /// Returns the action channel.
     pub fn action(&self) -> Channel<'a> {
         self.known(self.action)
     }
 
-    /// Elements of an action.
+    /// Returns the number of elements of an action.
     #[inline]
     pub fn action_len(&self) -> usize {
         self.action_bounds.len
     }
 
-    /// The limits of the action's elements, as a whole.
+    /// Returns the limits of all elements of the action.
     #[inline]
     pub(crate) fn action_bounds(&self) -> Bounds<'a> {
         self.action_bounds
     }
 
-    /// Number of the action channel.
+    /// Returns the number of the action channel.
     #[inline]
     pub(crate) fn action_id(&self) -> u32 {
         self.action
     }
 
-    /// Number of the noise channel.
+    /// Returns the number of the noise channel.
     #[inline]
     pub(crate) fn noise_id(&self) -> Option<u32> {
         self.noise
     }
 
-    /// The only observation channel, if it is one of floats.
+    /// Returns the only observation channel, if it is one of floats.
     #[inline]
     pub(crate) fn only_observation(&self) -> Result<ChannelId, InputError> {
         let id = ChannelId(self.observation);
@@ -294,34 +298,35 @@ impl<'a> Contract<'a> {
             .check(ChannelId(self.observation), values)
     }
 
-    /// The limits of the action's elements.
+    /// Returns the limits of the action's elements.
     #[inline]
     pub fn action_limits(&self) -> impl Iterator<Item = Interval> + use<'a> {
         self.action_bounds.iter()
     }
 
-    /// A channel that [`new_checked`](Self::new_checked) has found.
+    /// Returns a channel that [`new_checked`](Self::new_checked) has found.
     fn known(&self, i: u32) -> Channel<'a> {
         let record = self.tables.channel(i as usize);
         Channel::new(self.tables, record.unwrap_or(channel::EMPTY), ChannelId(i))
     }
 
-    /// The channel of word embeddings; `None` for a policy that takes no instruction.
+    /// Returns the channel of word embeddings; `None` for a policy that takes no instruction.
     pub fn instruction_channel(&self) -> Option<Channel<'a>> {
         self.channel(ChannelId(self.instruction?))
     }
 
-    /// The channel of random numbers; `None` for a policy that takes none.
+    /// Returns the channel of random numbers; `None` for a policy that takes none.
     pub fn noise_channel(&self) -> Option<Channel<'a>> {
         self.channel(ChannelId(self.noise?))
     }
 
-    /// Words of the longest instruction; 0 for a policy that takes none.
+    /// Returns the number of words of the longest instruction; 0 for a policy that takes none.
     pub fn words_len(&self) -> usize {
         self.words_shape(0)
     }
 
-    /// Elements of a word embedding; 0 for a policy that takes no instruction.
+    /// Returns the number of elements of a word embedding; 0 for a policy that takes no
+    /// instruction.
     pub fn word_dim(&self) -> usize {
         self.words_shape(1)
     }
@@ -332,13 +337,13 @@ impl<'a> Contract<'a> {
             .unwrap_or(0) as usize
     }
 
-    /// Control steps that a context holds; `None` when it has no such bound.
+    /// Returns the number of control steps that a context holds; `None` if it is unbounded.
     pub fn context_steps(&self) -> Option<usize> {
         let steps = self.record.context_steps as usize;
         (steps > 0).then_some(steps)
     }
 
-    /// What happens after [`context_steps`](Self::context_steps) control steps.
+    /// Returns the behaviour after [`context_steps`](Self::context_steps) control steps.
     pub fn beyond(&self) -> Beyond {
         match self.record.beyond {
             records::Beyond::Restart => Beyond::Restart,
@@ -346,7 +351,7 @@ impl<'a> Contract<'a> {
         }
     }
 
-    /// How an index is picked unless the caller says otherwise.
+    /// Returns the rule that picks an index unless the caller sets another one.
     pub fn decision(&self) -> Decision {
         match self.record.selection {
             SelectionRule::Argmax => Decision::Argmax,
@@ -357,7 +362,7 @@ impl<'a> Contract<'a> {
         }
     }
 
-    /// Where noise comes from unless the caller says otherwise.
+    /// Returns the source of noise unless the caller sets another one.
     pub fn noise(&self) -> Noise {
         match self.record.noise {
             NoiseRule::Zero => Noise::Zero,
@@ -367,43 +372,46 @@ impl<'a> Contract<'a> {
         }
     }
 
-    /// Language encoder that made the word embeddings; empty without instructions.
+    /// Returns the name of the language encoder that made the word embeddings; empty without
+    /// instructions.
     pub fn encoder(&self) -> &'a str {
         self.tables.text(self.record.encoder)
     }
 
-    /// SHA-256 of the language encoder's weights, hexadecimal.
+    /// Returns the SHA-256 of the language encoder's weights, hexadecimal.
     pub fn encoder_sha256(&self) -> &'a str {
         self.tables.text(self.record.encoder_sha256)
     }
 
-    /// Similarity to a known instruction from which other sentences may be followed; above 1 when none may be.
+    /// Returns the smallest similarity to a known instruction at which another sentence may be
+    /// followed; above 1 if none may be.
     pub fn acceptance(&self) -> f32 {
         self.record.acceptance
     }
 
-    /// SHA-256 of the bundle that the image was compiled from, hexadecimal.
+    /// Returns the SHA-256 of the bundle that the image was compiled from, hexadecimal.
     pub fn bundle_sha256(&self) -> &'a str {
         self.tables.text(self.record.bundle_sha256)
     }
 
-    /// Multiply-adds that the image says its most expensive control step takes, or the calls of another event if they take more.
+    /// Returns the multiply-adds of the policy's most expensive control step, or of the calls of
+    /// another event if they take more, as the image states them.
     pub fn worst_work(&self) -> u64 {
         self.record.worst_work
     }
 
-    /// How many instructions the policy knows.
+    /// Returns the number of instructions that the policy knows.
     pub fn instruction_count(&self) -> usize {
         self.tables.instructions_len()
     }
 
-    /// The instructions that the policy knows, in the order of their numbers.
+    /// Returns the instructions that the policy knows, in the order of their numbers.
     pub fn instructions(&self) -> impl Iterator<Item = KnownInstruction<'a>> + use<'a> {
         let contract = *self;
         (0..self.instruction_count()).filter_map(move |i| contract.instruction(i))
     }
 
-    /// Instruction number `i`.
+    /// Returns instruction number `i`.
     pub fn instruction(&self, i: usize) -> Option<KnownInstruction<'a>> {
         let InstructionRecord {
             id, text, words, ..
@@ -416,28 +424,30 @@ impl<'a> Contract<'a> {
     }
 }
 
-/// Whether two texts are the same. Byte by byte: comparing slices would call `bcmp`, which not every target has.
+/// Returns whether two texts are the same. Byte by byte: comparing slices would call `bcmp`, which
+/// not every target has.
 pub(crate) fn same_text(a: &str, b: &str) -> bool {
     a.bytes().eq(b.bytes())
 }
 
-/// Why a contract was refused.
+/// Reason why a contract was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum ContractError {
-    /// The control period, the temperature or the acceptance threshold is not a number that makes sense.
+    /// The control period, the temperature or the acceptance threshold is out of its valid range.
     Number,
-    /// No observation or more than a step has room for, no action, more than one action, instruction or noise, too many channels
+    /// The number, roles, names or types of the channels are invalid: no observation or more than a
+    /// step has room for, no action, more than one action, instruction or noise, too many channels
     /// in all, a name twice, or a role whose elements have the wrong type.
     Channels,
-    /// The shape of a channel makes no sense, or its elements are not as many.
+    /// The shape of a channel is invalid, or does not match the number of its elements.
     Shape {
-        /// Which one.
+        /// Number of the channel.
         channel: ChannelId,
     },
     /// The limits of a channel are not ordered numbers.
     Limits {
-        /// Which one.
+        /// Number of the channel.
         channel: ChannelId,
     },
     /// An instruction has no words, or more than the instruction channel holds.

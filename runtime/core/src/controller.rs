@@ -12,8 +12,9 @@
 //! ```
 //!
 //! Invariants:
-//! - A call that returns an error leaves the controller as it was: what a step computes goes to a second bank and to rows that do
-//!   not count yet, and is taken over at the end. (One exception: see [`Controller::set_instruction`].)
+//! - A call that returns an error leaves the controller unchanged: a step writes its results to a
+//!   second bank and to rows that are not yet valid, and commits them at the end. (One exception:
+//!   see [`Controller::set_instruction`].)
 //! - An action that leaves the controller is finite and inside the contract's limits.
 //! - Nothing is allocated, no call blocks, and the work of a step is bounded by what the image states.
 
@@ -33,18 +34,19 @@ use crate::policy::Policy;
 use crate::run::{Counters, Rows};
 use crate::workspace::Workspace;
 
-/// What a policy is told to do.
+/// Instruction that a policy is to follow.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Instruction<'w> {
     /// Number of an instruction in the contract.
     Id(u32),
     /// Word embeddings, `[n, word_dim]` with `n` from 1 to the contract's `words_len`.
     ///
-    /// Any are followed, of nonsense too: [`similarity::nearest`](crate::similarity::nearest) says what they are like before that.
+    /// Any embeddings are followed, even of nonsense: compare them with the known instructions
+    /// first, by [`similarity::nearest`](crate::similarity::nearest).
     Words(&'w [f32]),
 }
 
-/// What happened in a control step.
+/// Result of a control step, besides the action.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepReport {
     /// Control steps since the context began: 0 in the first step after an instruction, a reset or a restart of the context.
@@ -53,18 +55,18 @@ pub struct StepReport {
     pub selected: Option<Selected>,
 }
 
-/// The index in force, such as that of a latent plan.
+/// The index in force, such as that of a latent plan, and how it was selected.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Selected {
-    /// Which one, below [`Policy::index_count`].
+    /// Index selected, below [`Policy::index_count`].
     pub index: u32,
     /// The largest score of the last selection minus the second largest; infinite with a single one.
     pub margin: f32,
-    /// Whether this step selected it.
+    /// True if this step selected the index.
     pub fresh: bool,
 }
 
-/// Noise and the state of its generator.
+/// Source of noise, with the state of its generator.
 #[derive(Debug, Clone)]
 enum NoiseStream {
     Zero,
@@ -83,7 +85,7 @@ impl NoiseStream {
     }
 }
 
-/// A policy at work in memory that the caller lent.
+/// A running policy in memory that the caller lends.
 #[derive(Debug)]
 pub struct Controller<'a, 'm> {
     policy: Policy<'a>,
@@ -91,25 +93,26 @@ pub struct Controller<'a, 'm> {
     decider: Decider,
     noise: NoiseStream,
     counters: Counters,
-    /// Rows of KV caches that belong to the instruction.
+    /// Valid rows of each KV cache that belong to the instruction.
     base: [u32; MAX_ROW_STATES],
-    /// Whether an instruction is set, or the policy takes none.
+    /// True if an instruction is set, or the policy takes none.
     instructed: bool,
-    /// Whether a step has been taken in this episode.
+    /// True if a step has been taken in this episode.
     stepped: bool,
-    /// Whether the recorded episode was replayed without a difference.
+    /// True if the recorded episode was replayed without a difference.
     tested: bool,
 }
 
 impl<'a, 'm> Controller<'a, 'm> {
-    /// A controller with the contract's decision rule and no instruction yet, on the widest instructions that this CPU offers.
-    /// The workspace has to be one made for this policy: with that of another policy, calls fail with [`ExecError::Span`](crate::ExecError::Span).
+    /// Makes a controller with the contract's decision rule and no instruction yet, on the widest
+    /// instruction set that this CPU offers. The workspace has to be made for this policy; with
+    /// that of another policy, calls fail with [`ExecError::Span`](crate::ExecError::Span).
     pub fn new(policy: Policy<'a>, workspace: Workspace<'m>) -> Self {
         Self::with_isa(policy, workspace, Isa::detect())
     }
 
-    /// A controller on chosen instructions; the results have the same bits on all of them. [`Isa::portable`] runs the same machine
-    /// code on every CPU of a target.
+    /// Makes a controller that runs on a chosen instruction set; the results have the same bits on
+    /// all of them. [`Isa::portable`] runs the same machine code on every CPU of a target.
     pub fn with_isa(policy: Policy<'a>, mut workspace: Workspace<'m>, isa: Isa) -> Self {
         workspace.isa = isa;
         Self {
@@ -125,32 +128,34 @@ impl<'a, 'm> Controller<'a, 'm> {
         }
     }
 
-    /// The policy at work.
+    /// Returns the policy that this controller runs.
     pub fn policy(&self) -> &Policy<'a> {
         &self.policy
     }
 
-    /// The instructions that it runs on.
+    /// Returns the instruction set that the controller runs on.
     pub fn isa(&self) -> Isa {
         self.workspace.isa
     }
 
-    /// Changes how an index is picked, from the next selection on. Sampling starts again from the seed.
+    /// Changes the rule that picks an index, from the next selection on. Sampling starts again from
+    /// the seed.
     pub fn set_decision(&mut self, decision: Decision) {
         self.decider = Decider::new(decision);
     }
 
-    /// How an index is picked.
+    /// Returns the rule that picks an index.
     pub fn decision(&self) -> Decision {
         self.decider.rule()
     }
 
-    /// Changes where noise comes from, from the next step on. The generator starts again from the seed.
+    /// Changes the source of noise, from the next step on. The generator starts again from the
+    /// seed.
     pub fn set_noise(&mut self, noise: Noise) {
         self.noise = NoiseStream::new(noise);
     }
 
-    /// Where noise comes from.
+    /// Returns the source of noise.
     pub fn noise(&self) -> Noise {
         match self.noise {
             NoiseStream::Zero => Noise::Zero,
@@ -158,7 +163,7 @@ impl<'a, 'm> Controller<'a, 'm> {
         }
     }
 
-    /// Whether [`self_test`](Self::self_test) has passed.
+    /// Returns whether [`self_test`](Self::self_test) has passed.
     pub fn is_tested(&self) -> bool {
         self.tested
     }
@@ -167,13 +172,13 @@ impl<'a, 'm> Controller<'a, 'm> {
         self.tested = tested;
     }
 
-    /// Whether there is an instruction to follow, or the policy takes none.
+    /// Returns whether an instruction is set, or the policy takes none.
     pub fn is_instructed(&self) -> bool {
         self.instructed
     }
 
-    /// Starts a new episode with the same instruction: `t = 0`, what the instruction left stays. Sampling and noise go on where
-    /// they were.
+    /// Starts a new episode with the same instruction at `t = 0`; the state that the instruction
+    /// left is kept. Sampling and noise continue where they were.
     pub fn reset(&mut self) {
         self.counters = self.cleared(self.counters);
         self.counters.selected = 0;
@@ -183,7 +188,7 @@ impl<'a, 'm> Controller<'a, 'm> {
         self.stepped = false;
     }
 
-    /// The counters at the beginning of an episode or a context.
+    /// Returns the counters at the beginning of an episode or a context.
     fn cleared(&self, counters: Counters) -> Counters {
         let mut cleared = counters;
         cleared.timestep = 0;
@@ -213,7 +218,8 @@ impl<'a, 'm> Controller<'a, 'm> {
         }
     }
 
-    /// The scores of the last selection, one per index; zeros before the first, empty for a policy that selects nothing.
+    /// Returns the scores of the last selection, one per index; zeros before the first, empty for a
+    /// policy that selects nothing.
     pub fn scores(&self) -> &[f32] {
         let Some(scores) = self.policy.sizes.scores else {
             return &[];
@@ -226,12 +232,14 @@ impl<'a, 'm> Controller<'a, 'm> {
             .unwrap_or(&[])
     }
 
-    /// The action of the last step, or what [`executed`](Self::executed) said.
+    /// Returns the action of the last step, or the one passed to [`executed`](Self::executed)
+    /// since.
     pub fn last_action(&self) -> &[f32] {
         self.workspace.now.action
     }
 
-    /// A controller as [`new`](Self::new) made it, but for the rules of decision and noise.
+    /// Resets the controller to the state after [`new`](Self::new), with the given rules of
+    /// decision and noise.
     pub(crate) fn renew(&mut self, rule: Decision, noise: Noise) {
         self.instructed = self.policy.contract().instruction_channel().is_none();
         self.base = [0; MAX_ROW_STATES];
@@ -242,7 +250,8 @@ impl<'a, 'm> Controller<'a, 'm> {
         self.set_noise(noise);
     }
 
-    /// Where the coming step starts: a full context restarts behind the instruction, or refuses.
+    /// Computes the start of the coming step: a full context restarts after the instruction, or
+    /// refuses.
     fn begin(&self) -> Result<Begun, StepError> {
         if !self.instructed {
             return Err(StepError::NoInstruction);
@@ -267,10 +276,10 @@ impl<'a, 'm> Controller<'a, 'm> {
     }
 }
 
-/// Where a step starts.
+/// Start of a step.
 struct Begun {
     counters: Counters,
-    /// Whether the context starts again.
+    /// True if the context restarts.
     restarts: bool,
 }
 

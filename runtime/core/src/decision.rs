@@ -6,7 +6,7 @@ use rand_pcg::rand_core::Rng;
 
 use crate::contract::Decision;
 
-/// A decision rule and the state of its random numbers.
+/// A decision rule with the state of its random generator.
 #[derive(Debug, Clone)]
 pub(crate) struct Decider {
     rule: Decision,
@@ -32,7 +32,7 @@ impl Decider {
         self.rule
     }
 
-    /// The index of a selection; the scores are finite and there is at least one.
+    /// Picks an index; the scores are finite and there is at least one.
     pub fn pick(&mut self, scores: &[f32]) -> u32 {
         match self.rule {
             Decision::Sample { temperature, .. } if temperature > 0.0 => {
@@ -42,8 +42,8 @@ impl Decider {
         }
     }
 
-    /// Index `i` with probability `exp(l_i / T) / sum over j of exp(l_j / T)`: the first index at which the running sum of the
-    /// weights passes a uniform share of the whole.
+    /// Samples index `i` with probability `exp(l_i / T) / sum over j of exp(l_j / T)`: the first
+    /// index at which the running sum of the weights passes a uniform share of the whole.
     fn sample(&mut self, scores: &[f32], temperature: f32) -> u32 {
         let best = arg_max(scores);
         let max = scores.get(best).copied().unwrap_or(0.0);
@@ -63,7 +63,7 @@ impl Decider {
     }
 }
 
-/// The largest score minus the second largest; infinite for a single one.
+/// Returns the largest score minus the second largest; infinite for a single one.
 pub(crate) fn margin(scores: &[f32]) -> f32 {
     let (mut first, mut second) = (f32::NEG_INFINITY, f32::NEG_INFINITY);
     for &score in scores {

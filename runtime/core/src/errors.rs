@@ -1,52 +1,52 @@
-//! Why a call of the controller was refused: one small enum per operation.
+//! Errors of the controller's calls: one small enum per operation.
 
 use core::error::Error;
 use core::fmt;
 
 use lads_image::ExecError;
 
-/// What is wrong with the values that a caller gave for the channels.
+/// Error in the values that a caller gave for the channels.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum InputError {
-    /// A channel was not given, or the policy has more than the one that was.
+    /// A channel was not given, or the policy has more channels than the one that was given.
     Missing {
-        /// Which one.
+        /// Number of the channel.
         channel: u32,
     },
-    /// What was given is no channel that this call takes, or was given before.
+    /// A value was given for a channel that this call does not take, or that was given before.
     Unknown {
-        /// Its number.
+        /// Number of the channel.
         channel: u32,
     },
     /// The values have another type than the channel.
     Type {
-        /// Of the channel.
+        /// Number of the channel.
         channel: u32,
     },
-    /// The values are more or fewer than the channel's elements.
+    /// The number of values differs from the channel's elements.
     Length {
-        /// Of the channel.
+        /// Number of the channel.
         channel: u32,
-        /// Elements given.
+        /// Number of elements given.
         got: usize,
-        /// Elements in the contract.
+        /// Number of elements in the contract.
         needed: usize,
     },
-    /// An element is not a number or infinite.
+    /// An element is NaN or infinite.
     NotFinite {
-        /// Of the channel.
+        /// Number of the channel.
         channel: u32,
-        /// The first such element.
+        /// Index of the first such element.
         index: usize,
     },
     /// An element is outside the contract's limits.
     OutOfLimits {
-        /// Of the channel.
+        /// Number of the channel.
         channel: u32,
-        /// The first such element.
+        /// Index of the first such element.
         index: usize,
-        /// Its value.
+        /// Value of the element.
         value: f32,
         /// Smallest value allowed.
         min: f32,
@@ -56,7 +56,7 @@ pub enum InputError {
 }
 
 impl InputError {
-    /// The channel that is at fault.
+    /// Returns the channel at fault.
     pub fn channel(&self) -> u32 {
         match *self {
             Self::Missing { channel }
@@ -68,7 +68,7 @@ impl InputError {
         }
     }
 
-    /// The element that is at fault, where it is one.
+    /// Returns the element at fault, if the error concerns one.
     pub fn element(&self) -> Option<usize> {
         match *self {
             Self::NotFinite { index, .. } | Self::OutOfLimits { index, .. } => Some(index),
@@ -115,13 +115,14 @@ impl fmt::Display for InputError {
 
 impl Error for InputError {}
 
-/// Why the programs of a call gave nothing that may be used. A sound image and finite weights never cause it.
+/// Reason why the programs of a call gave no usable result. It never occurs with a sound image and
+/// finite weights.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum RunError {
     /// A program failed.
     Program(ExecError),
-    /// A program computed something that is not finite.
+    /// A program computed a value that is not finite.
     NotFinite,
 }
 
@@ -136,36 +137,36 @@ impl fmt::Display for RunError {
 
 impl Error for RunError {}
 
-/// Why an instruction was refused.
+/// Reason why an instruction was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum InstructionError {
     /// The policy takes no instruction.
     NotTaken,
-    /// The contract has no instruction of this number.
+    /// The contract has no instruction with this number.
     Unknown {
-        /// The number.
+        /// Number that was given.
         id: u32,
-        /// How many there are.
+        /// Number of instructions in the contract.
         count: u32,
     },
-    /// The embeddings are no whole number of words.
+    /// The length of the embeddings is not a multiple of the word dimension.
     Length {
-        /// Elements given.
+        /// Number of elements given.
         got: usize,
-        /// Elements of one word.
+        /// Number of elements of one word.
         word_dim: usize,
     },
-    /// No words, or more than the policy takes.
+    /// The instruction has no words, or more than the policy takes.
     Words {
-        /// Words given.
+        /// Number of words given.
         got: usize,
-        /// The most that the policy takes.
+        /// Largest number of words that the policy takes.
         most: usize,
     },
-    /// An element of the embeddings is not a number or infinite.
+    /// An element of the embeddings is NaN or infinite.
     NotFinite {
-        /// The first such element.
+        /// Index of the first such element.
         index: usize,
     },
     /// The programs failed; the controller has no instruction now.
@@ -195,29 +196,30 @@ impl fmt::Display for InstructionError {
 
 impl Error for InstructionError {}
 
-/// Why a control step, or what was said about the executed action, was refused.
+/// Reason why a control step, or a report of the executed action, was refused.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum StepError {
     /// The policy takes an instruction and none has been set.
     NoInstruction,
-    /// What was observed, or said to be executed, is not what the contract says.
+    /// The observation or the executed action violates the contract.
     Input(InputError),
-    /// The action has another length than the contract's.
+    /// The length of the action differs from the contract's.
     ActionLength {
-        /// Elements given.
+        /// Number of elements given.
         got: usize,
-        /// Elements in the contract.
+        /// Number of elements in the contract.
         needed: usize,
     },
-    /// The context holds as many control steps as the policy was trained on, and the contract says to stop there.
+    /// The context holds as many control steps as the policy was trained on, and the contract says
+    /// to refuse more.
     ContextFull {
-        /// Control steps of a context.
+        /// Number of control steps of a context.
         steps: usize,
     },
-    /// There was no step whose action could have been executed.
+    /// No step has been taken whose action could have been executed.
     NothingExecuted,
-    /// The policy computed nothing that may be used.
+    /// The policy computed no usable result.
     Run(RunError),
 }
 
@@ -252,29 +254,29 @@ impl From<RunError> for StepError {
     }
 }
 
-/// Why a chosen index gave no action.
+/// Reason why [`Controller::follow`](crate::Controller::follow) gave no action.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum FollowError {
-    /// The policy has no action for an index alone.
+    /// The policy cannot compute an action from an index alone.
     NotOffered,
-    /// What was observed is not what the contract says.
+    /// The observation violates the contract.
     Input(InputError),
-    /// The action has another length than the contract's.
+    /// The length of the action differs from the contract's.
     ActionLength {
-        /// Elements given.
+        /// Number of elements given.
         got: usize,
-        /// Elements in the contract.
+        /// Number of elements in the contract.
         needed: usize,
     },
-    /// There is no such index.
+    /// The index is out of range.
     Index {
         /// Index given.
         got: u32,
-        /// How many there are.
+        /// Number of indices.
         count: u32,
     },
-    /// The policy computed nothing that may be used.
+    /// The policy computed no usable result.
     Run(RunError),
 }
 
@@ -306,15 +308,15 @@ impl From<RunError> for FollowError {
     }
 }
 
-/// Why a demonstration could not be encoded.
+/// Reason why a demonstration could not be encoded.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum EncodeError {
     /// The image has no encoder.
     NoEncoder,
-    /// What was given is not what the contract says.
+    /// The demonstration violates the contract.
     Input(InputError),
-    /// The policy computed nothing that may be used.
+    /// The policy computed no usable result.
     Run(RunError),
 }
 

@@ -7,13 +7,15 @@ use crate::contract::{ChannelId, Contract, DType};
 use crate::inputs::{Data, Given, MAX_OBSERVATIONS};
 use crate::schedule::Sizes;
 
-/// A checked view on the recorded episode: what was observed, the index in force and the action of each control step.
+/// A checked view on the recorded episode: the observation, the index in force and the action of
+/// each control step.
 #[derive(Debug, Clone, Copy)]
 pub struct Golden<'a> {
     record: GoldenRecord,
-    /// The section behind its record.
+    /// Words of the section after its record.
     words: &'a [u32],
-    /// Where the values of each observation channel lie. Offsets, not slices: a self-test runs on small stacks.
+    /// Locations of the values of each observation channel. They are offsets, not slices, because a
+    /// self-test runs on small stacks.
     observations: [Option<Recorded>; MAX_OBSERVATIONS],
     selected: &'a [u32],
     noise: &'a [f32],
@@ -21,7 +23,7 @@ pub struct Golden<'a> {
     action_len: usize,
 }
 
-/// What a channel was over all steps: `steps * len` values from word `first` of the section.
+/// Values of one channel over all steps: `steps * len` values from word `first` of the section.
 #[derive(Debug, Clone, Copy)]
 struct Recorded {
     channel: ChannelId,
@@ -31,7 +33,7 @@ struct Recorded {
 }
 
 impl Recorded {
-    /// Its values at step `i`.
+    /// Returns the channel's values at step `i`.
     fn at<'a>(&self, words: &'a [u32], i: usize) -> Option<Data<'a>> {
         let words = words.get(self.first as usize..)?;
         let len = self.len as usize;
@@ -62,12 +64,14 @@ pub struct GoldenStep<'a> {
 }
 
 impl<'a> GoldenStep<'a> {
-    /// What was observed, one row for each observation channel in the contract's order.
+    /// Returns the observation of this step, one row for each observation channel in the contract's
+    /// order.
     pub fn observations(&self) -> &[(ChannelId, Data<'a>)] {
         self.given.all()
     }
 
-    /// The values of the only observation channel; empty for a policy that has others, or of another type.
+    /// Returns the values of the only observation channel; empty for a policy that has others, or
+    /// one of another type.
     pub fn observation(&self) -> &'a [f32] {
         match self.given.all() {
             [(_, Data::F32(values))] => values,
@@ -136,27 +140,28 @@ impl<'a> Golden<'a> {
         })
     }
 
-    /// Number of the instruction that was followed; `None` for a policy that takes none.
+    /// Returns the number of the instruction that was followed; `None` for a policy that takes
+    /// none.
     pub fn instruction(&self) -> Option<u32> {
         (self.record.instruction != records::NONE).then_some(self.record.instruction)
     }
 
-    /// Control steps.
+    /// Returns the number of control steps.
     pub fn len(&self) -> usize {
         self.record.steps as usize
     }
 
-    /// Never true: an episode has at least one step.
+    /// Always returns false: an episode has at least one step.
     pub fn is_empty(&self) -> bool {
         self.record.steps == 0
     }
 
-    /// Largest absolute difference of an action that the self-test accepts.
+    /// Returns the largest absolute difference of an action that the self-test accepts.
     pub fn tolerance(&self) -> f32 {
         self.record.tolerance
     }
 
-    /// Recorded step `i`.
+    /// Returns recorded step `i`.
     pub fn step(&self, i: usize) -> Option<GoldenStep<'a>> {
         let mut given = Given::default();
         self.observe(i, &mut given)?;
@@ -168,7 +173,7 @@ impl<'a> Golden<'a> {
         })
     }
 
-    /// Adds what was observed in step `i`.
+    /// Adds the observation of step `i`.
     pub(crate) fn observe(&self, i: usize, given: &mut Given<'a>) -> Option<()> {
         for recorded in self.observations.iter().flatten() {
             given.push(recorded.channel, recorded.at(self.words, i)?);
@@ -176,29 +181,29 @@ impl<'a> Golden<'a> {
         Some(())
     }
 
-    /// The index in force in step `i`.
+    /// Returns the index in force in step `i`.
     pub(crate) fn selected(&self, i: usize) -> Option<u32> {
         self.selected.get(i).copied()
     }
 
-    /// All draws of step `i`.
+    /// Returns all draws of step `i`.
     pub(crate) fn noise(&self, i: usize) -> Option<&'a [f32]> {
         row(self.noise, i, self.record.noise_len as usize)
     }
 
-    /// The action of step `i`.
+    /// Returns the action of step `i`.
     pub(crate) fn action(&self, i: usize) -> Option<&'a [f32]> {
         row(self.actions, i, self.action_len)
     }
 
-    /// All recorded steps in order.
+    /// Returns all recorded steps in order.
     pub fn steps(&self) -> impl Iterator<Item = GoldenStep<'a>> + use<'a> {
         let golden = *self;
         (0..self.len()).map_while(move |i| golden.step(i))
     }
 }
 
-/// Row `i` of `len` values.
+/// Returns row `i`, of `len` values.
 fn row(values: &[f32], i: usize, len: usize) -> Option<&[f32]> {
     let start = i.checked_mul(len)?;
     values.get(start..start.checked_add(len)?)

@@ -1,10 +1,11 @@
-//! What stands between a policy and the motors: a [`GuardedController`] is a [`Controller`](crate::Controller) whose inputs are
-//! watched and whose output is limited.
+//! Guard between a policy and the motors: a [`GuardedController`] is a
+//! [`Controller`](crate::Controller) whose inputs are watched and whose output is limited.
 //!
-//! In every control period it writes an action that is finite, inside the limits, and no further from the last one than the rate
-//! allows, whatever the observation, the clock or the policy do. When the policy's action cannot be used (an [`Intervention`]) the
-//! [`Fallback`] decides what is written instead. Before the self-test has passed and an instruction is set there is nothing but the
-//! safe action.
+//! In every control period it writes an action that is finite, inside the limits, and no further
+//! from the last one than the rate allows, whatever the observation, the clock or the policy do.
+//! When the policy's action cannot be used (an [`Intervention`]) the [`Fallback`] decides what is
+//! written instead. Before the self-test has passed and an instruction is set only the safe action
+//! is written.
 //!
 //! What can fail: [`GuardedController::new`], when the configuration contradicts the contract ([`GuardError`]); a step only when
 //! the caller's action has the wrong length, so that nothing can be written.
@@ -22,48 +23,51 @@ use crate::errors::{InputError, StepError};
 pub use controller::{GuardedController, SwapError};
 pub use limiter::Limits;
 
-/// What is written when the policy's action cannot be used. All of them keep the limits and the rate.
+/// Rule for the action to write when the policy's action cannot be used. Every rule keeps the
+/// limits and the rate.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Fallback {
-    /// To the safe action, and stay there until [`GuardedController::resume`].
+    /// Moves to the safe action and stays there until [`GuardedController::resume`].
     #[default]
     Stop,
-    /// The last action again.
+    /// Repeats the last action.
     Hold,
-    /// Towards the safe action: each period takes away `period / (period + time_constant)` of what is left.
+    /// Moves towards the safe action: each period takes away `period / (period + time_constant)` of
+    /// the remaining distance.
     Decay {
-        /// In seconds, above zero.
+        /// Time constant in seconds, above zero.
         time_constant_s: f32,
     },
 }
 
-/// How a guard works; the default takes the contract's limits, knows no rate, and stops at the first intervention.
+/// Configuration of a guard; the default takes the contract's limits, has no rate limit, and stops
+/// at the first intervention.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct GuardConfig<'c> {
-    /// What to do when the policy's action cannot be used.
+    /// Action to write when the policy's action cannot be used.
     pub fallback: Fallback,
-    /// Missed control periods that are still tolerated between two steps.
+    /// Number of missed control periods between two steps that is still tolerated.
     pub late_after: u32,
-    /// Periods in a row without an observation that can be used, in which the last action is repeated and the policy's state is
-    /// kept before the fallback takes over; 0 for none.
+    /// Number of periods in a row without a usable observation in which the last action is repeated
+    /// and the policy's state is kept before the fallback takes over; 0 for none.
     pub coast: u32,
-    /// The farthest that a timestamp may lie behind the last one, in its unit; 0 for any distance. One beyond it is refused, and
-    /// does not count as the last one.
+    /// Largest step from the last timestamp to the next, in its unit; 0 for any. A timestamp
+    /// further ahead is refused, and does not become the last one.
     pub max_jump: u64,
-    /// Stops after so many interventions in a row; 0 for never.
+    /// Number of interventions in a row after which the guard stops; 0 for never.
     pub stop_after: u32,
     /// Limits, rates and the safe action.
     pub limits: Limits<'c>,
 }
 
 impl GuardConfig<'_> {
-    /// Says what of it contradicts a contract, before a controller with its memory is made.
+    /// Checks the configuration against a contract, before a controller with its memory is made.
     pub fn check(&self, contract: &Contract) -> Result<(), GuardError> {
         self.share(contract)?;
         limiter::check(contract, &self.limits)
     }
 
-    /// The part of what is left to the safe action that a decay takes away in a period.
+    /// Returns the fraction of the distance to the safe action that a decay removes in a period.
     fn share(&self, contract: &Contract) -> Result<f32, GuardError> {
         match self.fallback {
             Fallback::Decay { time_constant_s } => {
@@ -81,80 +85,86 @@ impl GuardConfig<'_> {
 /// The clock of one control period.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Tick {
-    /// When the observation was taken, in any unit. One that is not later than the last one is stale.
+    /// Time at which the observation was taken, in any unit. An observation that is not later than
+    /// the last one is stale.
     pub timestamp: u64,
-    /// Control periods that have passed without a step since the last one.
+    /// Number of control periods that have passed without a step since the last one.
     pub missed: u32,
 }
 
-/// Why the policy's action was not used.
+/// Reason why the policy's action was not used.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum Intervention {
-    /// The self-test has not passed, and nobody has declined it.
+    /// The self-test has not passed, and the caller has not declined it with
+    /// [`GuardedController::arm_untested`].
     NotArmed,
-    /// Stopped, by the fallback or by the caller.
+    /// The guard is stopped, by the fallback or by the caller.
     Stopped,
-    /// There is no observation in this period.
+    /// No observation was given in this period.
     NoObservation,
     /// The observation is no later than the last one.
     Stale,
-    /// The timestamp lies farther ahead of the last one than the configuration allows: it is taken for damaged.
+    /// The timestamp is further ahead of the last one than the configuration allows and is
+    /// considered corrupt.
     Jump,
     /// More control periods were missed than tolerated.
     Late {
-        /// How many.
+        /// Number of missed periods.
         missed: u32,
     },
     /// The controller refused the observation, or could not compute an action.
     Refused(StepError),
 }
 
-/// What happened in a guarded control period.
+/// Result of a guarded control period.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct GuardReport {
-    /// What the controller says; `None` when it took no step.
+    /// Report of the controller; `None` when it took no step.
     pub step: Option<StepReport>,
-    /// Why the action is the fallback's; `None` when it is the policy's.
+    /// Reason why the action is the fallback's; `None` when it is the policy's.
     pub intervention: Option<Intervention>,
-    /// The action is the last one again, because the configuration lets so many observations be missed.
+    /// True if the last action is repeated because the configuration tolerates this many missed
+    /// observations.
     pub coasting: bool,
-    /// An element was at a limit or beyond and is now at the limit.
+    /// True if an element was at a limit or beyond and is now at the limit.
     pub saturated: bool,
-    /// An element moves as fast as it may, less far than it should.
+    /// True if an element moves as fast as it may, less far than it should.
     pub rate_limited: bool,
 }
 
-/// What a guard has done since it was made. Counters stay at their largest value.
+/// Counts of a guard's actions and interventions since it was made. A counter saturates at its
+/// largest value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counters {
-    /// Control periods.
+    /// Number of control periods.
     pub periods: u64,
-    /// Periods with the policy's action.
+    /// Number of periods with the policy's action.
     pub policy: u64,
-    /// Periods before arming.
+    /// Number of periods before arming.
     pub not_armed: u64,
-    /// Periods while stopped.
+    /// Number of periods while stopped.
     pub stopped: u64,
-    /// Periods without an observation.
+    /// Number of periods without an observation.
     pub no_observation: u64,
-    /// Stale observations, and those whose timestamp jumps.
+    /// Number of stale observations, including those whose timestamp jumps.
     pub stale: u64,
-    /// Periods in which the last action was repeated.
+    /// Number of periods in which the last action was repeated.
     pub coasted: u64,
-    /// Interventions because too many periods were missed.
+    /// Number of interventions because too many periods were missed.
     pub late: u64,
-    /// All missed periods.
+    /// Number of all missed periods.
     pub missed: u64,
-    /// Observations with an element that is not finite.
+    /// Number of observations with an element that is not finite.
     pub not_finite: u64,
-    /// Observations outside the contract's limits.
+    /// Number of observations outside the contract's limits.
     pub out_of_limits: u64,
-    /// Steps that the controller refused for another reason, such as a full context or no instruction.
+    /// Number of steps that the controller refused for another reason, such as a full context or no
+    /// instruction.
     pub refused: u64,
-    /// Periods with an action at a limit.
+    /// Number of periods with an action at a limit.
     pub saturated: u64,
-    /// Periods with an action that the rate held back.
+    /// Number of periods with an action that the rate limit reduced.
     pub rate_limited: u64,
 }
 
@@ -185,37 +195,38 @@ impl Counters {
     }
 }
 
-/// Why a guard's configuration was refused.
+/// Reason why a guard's configuration was refused.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum GuardError {
     /// The memory has too few elements.
     Memory {
-        /// Elements that there are.
+        /// Number of elements given.
         got: usize,
-        /// Elements that are needed.
+        /// Number of elements needed.
         needed: usize,
     },
-    /// Limits, rates or the safe action are not as long as an action.
+    /// Limits, rates or the safe action have another length than an action.
     Length {
-        /// Elements given.
+        /// Number of elements given.
         got: usize,
-        /// Elements in the contract.
+        /// Number of elements in the contract.
         needed: usize,
     },
-    /// A limit is not finite, below the other one, or leaves nothing of the contract's range.
+    /// A limit is not finite, the upper is below the lower, or they do not overlap the contract's
+    /// range.
     Limits {
-        /// The first such element.
+        /// Index of the first such element.
         index: usize,
     },
     /// A rate is not a finite number above zero.
     Rate {
-        /// The first such element.
+        /// Index of the first such element.
         index: usize,
     },
     /// The safe action is not finite or outside the limits.
     SafeAction {
-        /// The first such element.
+        /// Index of the first such element.
         index: usize,
     },
     /// The time constant of the decay is not a finite number above zero.
@@ -252,12 +263,13 @@ impl fmt::Display for GuardError {
 
 impl Error for GuardError {}
 
-/// The caller's action has another length than the contract's: nothing was written, and no step was taken.
+/// The caller's action has another length than the contract's: nothing was written, and no step was
+/// taken.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ActionLength {
-    /// Elements given.
+    /// Number of elements given.
     pub got: usize,
-    /// Elements in the contract.
+    /// Number of elements in the contract.
     pub needed: usize,
 }
 

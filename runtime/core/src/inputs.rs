@@ -1,4 +1,4 @@
-//! What a caller gives for the channels of a call, and the checks of it.
+//! Values that a caller gives for the channels of a call, and their checks.
 //!
 //! Nothing is copied: a program's inputs are filled from the caller's own slices. What can fail: a channel that is missing, given
 //! twice, of another type or length, or whose values are not finite or outside the contract's limits ([`InputError`]).
@@ -6,22 +6,22 @@
 use crate::contract::{Channel, ChannelId, Contract, DType, Interval, Role};
 use crate::errors::InputError;
 
-/// The most observation channels of a policy.
+/// Largest number of observation channels of a policy.
 pub const MAX_OBSERVATIONS: usize = 8;
 
-/// The values of a channel, as many as it has elements, in the order of its shape.
+/// Values of a channel, as many as it has elements, in the order of its shape.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Data<'d> {
-    /// Of a channel of floats.
+    /// Values of a channel of floats.
     F32(&'d [f32]),
-    /// Of a channel of bytes.
+    /// Values of a channel of bytes.
     U8(&'d [u8]),
-    /// Of a channel of integers.
+    /// Values of a channel of integers.
     I32(&'d [i32]),
 }
 
 impl Data<'_> {
-    /// How many values there are.
+    /// Returns the number of values.
     pub fn len(&self) -> usize {
         match self {
             Self::F32(values) => values.len(),
@@ -30,12 +30,12 @@ impl Data<'_> {
         }
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no values.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Their type.
+    /// Returns the type of the values.
     pub fn dtype(&self) -> DType {
         match self {
             Self::F32(_) => DType::F32,
@@ -45,7 +45,7 @@ impl Data<'_> {
     }
 }
 
-/// What was given for the observation channels, in memory of a fixed size.
+/// Values given for the observation channels, in memory of a fixed size.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Given<'d> {
     channels: [(ChannelId, Data<'d>); MAX_OBSERVATIONS],
@@ -62,7 +62,7 @@ impl Default for Given<'_> {
 }
 
 impl<'d> Given<'d> {
-    /// Adds a channel; one too many is dropped, which no contract has.
+    /// Adds a channel; one beyond [`MAX_OBSERVATIONS`], which no contract has, is dropped.
     pub fn push(&mut self, channel: ChannelId, data: Data<'d>) {
         if let Some(place) = self.channels.get_mut(self.len) {
             *place = (channel, data);
@@ -75,7 +75,8 @@ impl<'d> Given<'d> {
     }
 }
 
-/// Checks what was given for the channels of a role, each of which has to be there once, and returns the noise if it is given too.
+/// Checks the values given for the channels of a role, each of which has to be there once, and
+/// returns the noise if it is given too.
 pub(crate) fn check<'d>(
     contract: &Contract,
     role: Role,
@@ -142,7 +143,7 @@ fn check_channel(channel: &Channel, data: Data) -> Result<(), InputError> {
     }
 }
 
-/// Every value is finite and inside its limits.
+/// Checks that every value is finite and inside its limits.
 #[inline]
 pub(crate) fn check_floats<T: Copy + Into<f32>>(
     channel: ChannelId,
@@ -168,7 +169,7 @@ pub(crate) fn check_floats<T: Copy + Into<f32>>(
     Ok(())
 }
 
-/// Every value is inside its limits, compared exactly.
+/// Checks that every value is inside its limits, compared exactly.
 fn check_integers(
     channel: ChannelId,
     values: &[i32],

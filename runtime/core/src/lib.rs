@@ -1,17 +1,19 @@
 //! Runs a compiled policy: program image in, actions out, once every control period.
 //!
-//! - [`Policy::new_checked`] is a view on a program image, all of it checked; it copies nothing.
+//! - [`Policy::new_checked`] is a fully checked view on a program image; it copies nothing.
 //! - [`Workspace::new`] takes the caller's memory: [`Policy::arena_len`] and [`Policy::state_len`] elements.
 //! - [`Controller`] puts both to work: [`set_instruction`](Controller::set_instruction), then
 //!   [`step`](Controller::step) for every observation.
-//! - [`GuardedController`] puts a guard before it that watches the observations and the clock and limits the actions; what
-//!   drives a machine drives it through this one.
+//! - [`GuardedController`] wraps a controller in a guard that watches the observations and the
+//!   clock and limits the actions; drive real machines only through this one.
 //!
-//! Invariants: no `std`, no allocation, no unsafe code, no panic. Sizes (contract), weights (image) and mutable state
-//! (workspace) are three types. Everything about a model is checked when it is opened; afterwards only what the caller passes
-//! can be refused, with one small error enum per operation. The same image and the same calls give the same bits on every
-//! target and on every [`Isa`], which a controller chooses once, when it is made; numbers too small for a normal `f32` are the
-//! one exception: x86-64 takes them as zero while a program runs, so that they cost no time, and other targets compute with them.
+//! Invariants: no `std`, no allocation, no unsafe code, no panic. Sizes (contract), weights (image)
+//! and mutable state (workspace) are three types. Everything about a model is checked when it is
+//! opened; afterwards only what the caller passes can be refused, with one small error enum per
+//! operation. The same image and the same calls give the same bits on every target and on every
+//! [`Isa`], which a controller chooses once, when it is made; subnormal `f32` numbers are the one
+//! exception: x86-64 treats them as zero while a program runs, so that they cost no time, and other
+//! targets compute with them.
 //!
 //! ```no_run
 //! use lads_core::{Controller, Instruction, Policy, Workspace};

@@ -1,8 +1,9 @@
-//! Finding known instructions by what a person wrote: one rule, on every target, without tables.
+//! Finds known instructions by what a person wrote, by one rule on every target, without tables.
 
 use crate::contract::Contract;
 
-/// Numbers of the instructions (id and text) that a person means: the one with this id, else all with this text.
+/// Returns the numbers of the instructions (id and text) that a person means: the one with this id,
+/// else all with this text.
 ///
 /// White space around an id does not matter. Texts are compared word by word, the case of ASCII letters and the white space between
 /// words do not matter; texts may repeat.
@@ -25,7 +26,7 @@ pub fn instructions_called<'w, 'k: 'w>(
         .map(|(number, _)| number)
 }
 
-/// Whether two texts have the same words, up to the case of ASCII letters.
+/// Returns whether two texts have the same words, up to the case of ASCII letters.
 fn same_words(a: &[u8], b: &[u8]) -> bool {
     let (mut a, mut b) = (words(a), words(b));
     loop {
@@ -43,7 +44,8 @@ fn words(text: &[u8]) -> impl Iterator<Item = &[u8]> {
 }
 
 impl<'a> Contract<'a> {
-    /// Numbers of the instructions that a person means by `wanted`, UTF-8: see [`instructions_called`].
+    /// Returns the numbers of the instructions that a person means by `wanted`, UTF-8: see
+    /// [`instructions_called`].
     pub fn instructions_called<'w>(&self, wanted: &'w [u8]) -> impl Iterator<Item = u32> + 'w
     where
         'a: 'w,

@@ -24,18 +24,18 @@ use core::hint::black_box;
 use rand_pcg::Pcg64;
 use rand_pcg::rand_core::Rng;
 
-/// Stream of the generator, the first 128 bits of pi behind the point: not the one that plans are sampled from, so that both
-/// may have the same seed.
+/// Stream of the generator, the first 128 bits of pi after the point; it differs from the stream
+/// that plans are sampled from, so that both may have the same seed.
 const STREAM: u128 = 0x243f_6a88_85a3_08d3_1319_8a2e_0370_7344;
 
-/// A stream of standard normal numbers.
+/// A stream of standard normal random numbers.
 #[derive(Debug, Clone)]
 pub(crate) struct Normals {
     random: Pcg64,
 }
 
 impl Normals {
-    /// The stream of a seed, from its beginning.
+    /// Makes the stream of a seed, from its beginning.
     pub fn new(seed: u64) -> Self {
         Self {
             random: Pcg64::new(u128::from(seed), STREAM),
@@ -49,7 +49,8 @@ impl Normals {
         }
     }
 
-    /// An odd multiple of 2^-53 in (0, 1), all equally likely: neither end, and symmetric about one half.
+    /// Returns an odd multiple of 2^-53 in (0, 1), all equally likely: never 0 or 1, and symmetric
+    /// about one half.
     fn uniform(&mut self) -> f64 {
         // As digits of a number in [1, 2), because processors without f64 convert integers by branches; the difference is exact.
         let digits = self.random.next_u64() >> 12;
@@ -57,10 +58,11 @@ impl Normals {
     }
 }
 
-/// Coefficients of the highest power first, of three ranges: |u - 1/2| up to 0.425; root up to 5; beyond.
+/// Coefficients of a polynomial, highest power first, for each of three ranges: |u - 1/2| up to
+/// 0.425; root up to 5; beyond.
 type Polynomial = [[f64; 3]; 8];
 
-/// Coefficients a, c, e of AS 241.
+/// Numerator coefficients a, c, e of AS 241.
 #[rustfmt::skip]
 const ABOVE: Polynomial = [
     [2.5090809287301226727e+3, 7.74545014278341407640e-4, 2.01033439929228813265e-7],
@@ -73,7 +75,7 @@ const ABOVE: Polynomial = [
     [3.3871328727963666080e+0, 1.42343711074968357734e+0, 6.65790464350110377720e+0],
 ];
 
-/// Coefficients b, d, f of AS 241, and 1.
+/// Denominator coefficients b, d, f and 1 of AS 241.
 #[rustfmt::skip]
 const BELOW: Polynomial = [
     [5.2264952788528545610e+3, 1.05075007164441684324e-9, 2.04426310338993978564e-15],
@@ -86,14 +88,16 @@ const BELOW: Polynomial = [
     [1.0, 1.0, 1.0],
 ];
 
-/// All ones where `x > bound`, else zeros, for masks.
+/// Returns all ones if `x > bound`, else zeros, as a mask.
 ///
-/// Hidden from the compiler, which makes a branch around a polynomial of any mask that it knows to come from a comparison.
+/// The comparison is hidden from the compiler, which would otherwise turn the mask into a branch
+/// around a polynomial.
 fn all_above(x: f64, bound: f64) -> u64 {
     black_box(u64::from(x > bound).wrapping_neg())
 }
 
-/// The number below which a standard normal one lies with probability `u`, a multiple of 2^-53 between 0 and 1.
+/// Returns the number below which a standard normal one lies with probability `u`, a multiple of
+/// 2^-53 between 0 and 1.
 fn quantile(u: f64) -> f64 {
     let q = u - 0.5;
     // The smaller of `u` and `1 - u`, without a choice; both differences are exact.
@@ -115,14 +119,15 @@ fn quantile(u: f64) -> f64 {
     at(&ABOVE) * factor / at(&BELOW)
 }
 
-/// Natural logarithm of a normal positive number, within one unit in the last place.
+/// Returns the natural logarithm of a normal positive number, within one unit in the last place.
 ///
-/// `ln(x) = k ln 2 + ln(1 + f)` with `1 + f` between the roots of 1/2 and 2, and with `s = f / (2 + f)` an odd polynomial in `s`. Method
-/// and coefficients are those of FreeBSD's `e_log.c` (Sun Microsystems), without its special cases; so are the bits.
+/// `ln(x) = k ln 2 + ln(1 + f)` with `1 + f` between the roots of 1/2 and 2, and with
+/// `s = f / (2 + f)` an odd polynomial in `s`. Method and coefficients are those of FreeBSD's
+/// `e_log.c` (Sun Microsystems), without its special cases; the results are the same bits.
 fn ln(x: f64) -> f64 {
     const LN2_HIGH: f64 = 6.93147180369123816490e-01;
     const LN2_LOW: f64 = 1.90821492927058770002e-10;
-    /// The root of 1/2, to the digits that the method takes of it.
+    /// The root of 1/2, to the digits that the method uses.
     const ROOT_HALF: u64 = 0x3fe6_a09e << 32;
     const ONE: u64 = 1.0_f64.to_bits();
     const MANTISSA: u64 = (1 << 52) - 1;
@@ -153,10 +158,11 @@ mod tests {
     use super::*;
     use crate::decision;
 
-    /// Rows `quantile N EXACT BITS` and `draws SEED BITS ..`, see the head of the file.
+    /// Table of expected values: rows `quantile N EXACT BITS` and `draws SEED BITS ..`, described
+    /// at the head of the file.
     const TABLE: &str = include_str!("../tests/normals.txt");
 
-    /// The words of the table's rows of one kind.
+    /// Returns the words of the table's rows of one kind.
     fn rows(kind: &'static str) -> impl Iterator<Item = Vec<&'static str>> {
         TABLE.lines().filter_map(move |line| {
             let mut words = line.split(' ');
@@ -174,17 +180,18 @@ mod tests {
         sample
     }
 
-    /// Where the uniform number is `n * 2^-53`.
+    /// Returns the quantile of the uniform number `n * 2^-53`.
     fn quantile_of(n: u64) -> f64 {
         quantile(n as f64 / (1_u64 << 53) as f64)
     }
 
-    /// The normal distribution function, by the `libm` crate.
+    /// Evaluates the normal distribution function, by the `libm` crate.
     fn distribution(x: f64) -> f64 {
         0.5 * libm::erfc(-x / core::f64::consts::SQRT_2)
     }
 
-    /// The largest distance between a sample's distribution and the normal one (Kolmogorov and Smirnov).
+    /// Returns the largest distance between a sample's distribution and the normal one (Kolmogorov
+    /// and Smirnov).
     fn distance(mut sample: Vec<f32>) -> f64 {
         sample.sort_by(f32::total_cmp);
         let n = sample.len() as f64;
@@ -330,11 +337,11 @@ mod tests {
         }
     }
 
-    /// Names the case to the program under `callgrind`.
+    /// Environment variable that names the case to the program under `callgrind`.
     #[cfg(target_os = "linux")]
     const CHILD: &str = "LADS_NORMALS_UNDER_CALLGRIND";
 
-    /// What is counted: a fill of the stream `seed`, and quantiles.
+    /// Runs the code under count: a fill of the stream `seed`, and quantiles.
     #[cfg(target_os = "linux")]
     #[inline(never)]
     fn counted_normals(seed: u64, uniform: &[f64]) -> ([f32; 500], f64) {
@@ -343,8 +350,9 @@ mod tests {
         (out, uniform.iter().map(|&u| quantile(black_box(u))).sum())
     }
 
-    /// All cases: numbers of the middle, of the tails, of the outermost tails, and of all of these, each beside a fill of another
-    /// seed. Without `valgrind` there is nothing to compare.
+    /// Compares the instruction counts of all cases: numbers of the middle, of the tails, of the
+    /// outermost tails, and of all of these, each beside a fill of another seed. Without `valgrind`
+    /// there is nothing to compare.
     #[cfg(target_os = "linux")]
     #[test]
     fn every_number_takes_the_same_number_of_instructions() {

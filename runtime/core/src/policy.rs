@@ -1,9 +1,11 @@
-//! A policy: one image, checked once.
+//! A policy: one program image, checked once.
 //!
-//! [`Policy::new_checked`] copies nothing and allocates nothing; the policy borrows the image. It proves what running relies
-//! on: the tables decode, every program is well formed, every port fits what it is bound to, and every step of the longest context
-//! can be taken (the module `schedule` says what that means). Nor can an image ask for memory that its own programs do not use, or
-//! for more work than a limit that the caller may set. It does not read the weights: [`Policy::checksum_matches`] does.
+//! [`Policy::new_checked`] copies nothing and allocates nothing; the policy borrows the image. It
+//! proves every property that running relies on: the tables decode, every program is well formed,
+//! every port fits what it is bound to, and every step of the longest context can be taken (the
+//! module `schedule` says what that means). An image cannot ask for memory that its own programs do
+//! not use, or for more work than a limit that the caller may set. It does not read the weights:
+//! [`Policy::checksum_matches`] does.
 
 use core::error::Error;
 use core::fmt;
@@ -24,11 +26,13 @@ pub struct Policy<'a> {
 }
 
 impl<'a> Policy<'a> {
-    /// Multiply-adds that a control step may take unless the caller says otherwise: some seconds on a fast core.
+    /// Largest number of multiply-adds that a control step may take unless the caller sets another
+    /// limit: some seconds on a fast core.
     pub const WORK_LIMIT: u64 = 1 << 35;
 
-    /// Bytes of workspace that a host gives any policy. Real ones take a few megabytes, and an operating system that promises more
-    /// memory than it has would let an image take all of it; where the caller brings the memory, nothing asks for this limit.
+    /// Largest workspace, in bytes, that a host gives any policy. Real policies take a few
+    /// megabytes, and an operating system that promises more memory than it has would let an image
+    /// take all of it; where the caller brings the memory, nothing asks for this limit.
     pub const MEMORY_LIMIT: usize = 1 << 30;
 
     /// Opens an image that starts on a 4-byte boundary (64 is better); bytes after the image's own length are ignored.
@@ -36,7 +40,7 @@ impl<'a> Policy<'a> {
         Self::new_within(image, Self::WORK_LIMIT)
     }
 
-    /// Opens an image whose worst step takes no more than so many multiply-adds.
+    /// Opens an image whose worst step takes at most `work_limit` multiply-adds.
     pub fn new_within(image: &'a [u8], work_limit: u64) -> Result<Self, PolicyError> {
         let tables = Tables::new(image).map_err(PolicyError::Tables)?;
         let contract = Contract::new_checked(tables).map_err(PolicyError::Contract)?;
@@ -58,13 +62,13 @@ impl<'a> Policy<'a> {
         })
     }
 
-    /// What the policy expects and promises.
+    /// Returns the policy's contract: its channels and instructions.
     #[inline]
     pub fn contract(&self) -> &Contract<'a> {
         &self.contract
     }
 
-    /// The recorded episode of the self-test, if the image holds one.
+    /// Returns the recorded episode of the self-test, if the image holds one.
     pub fn golden(&self) -> Option<Golden<'a>> {
         // Read again rather than kept: a view takes more memory than the policy, and only a self-test wants it.
         self.has_golden
@@ -77,23 +81,25 @@ impl<'a> Policy<'a> {
         &self.contract.tables
     }
 
-    /// The image, without what lies behind it.
+    /// Returns the image, without the bytes after it.
     pub fn image(&self) -> &'a [u8] {
         self.tables().image()
     }
 
-    /// Bytes of the image.
+    /// Returns the size of the image in bytes.
     pub fn image_bytes(&self) -> usize {
         self.image().len()
     }
 
-    /// Elements of scratch memory that a controller needs: the largest program's arena.
+    /// Returns the number of elements of scratch memory that a controller needs: the largest
+    /// program's arena.
     pub fn arena_len(&self) -> usize {
         self.sizes.arena_len
     }
 
-    /// Elements of memory that survive a control step: rings and KV caches, twice (those in force and the next ones) the plain
-    /// states and the action, and what programs of one step hand to each other.
+    /// Returns the number of elements of memory that survive a control step: rings and KV caches,
+    /// twice (those in force and the next ones) the plain states and the action, and the values
+    /// that programs of one step hand to each other.
     pub fn state_len(&self) -> usize {
         let bank = self
             .sizes
@@ -105,27 +111,29 @@ impl<'a> Policy<'a> {
             .saturating_add(self.sizes.scratch_len)
     }
 
-    /// How many indices there are to select from; 0 for a policy that selects nothing.
+    /// Returns the number of indices to select from; 0 for a policy that selects nothing.
     pub fn index_count(&self) -> u32 {
         self.sizes.scores.map_or(0, |scores| scores.width)
     }
 
-    /// Elements of noise that a control step takes at most; 0 for a policy without noise.
+    /// Returns the largest number of elements of noise that a control step takes; 0 for a policy
+    /// without noise.
     pub fn noise_len(&self) -> usize {
         self.sizes.noise_len
     }
 
-    /// Whether [`Controller::follow`](crate::Controller::follow) is offered.
+    /// Returns whether the policy offers [`Controller::follow`](crate::Controller::follow).
     pub fn follows(&self) -> bool {
         self.sizes.follows
     }
 
-    /// Whether [`Controller::encode`](crate::Controller::encode) is offered.
+    /// Returns whether the policy offers [`Controller::encode`](crate::Controller::encode).
     pub fn encodes(&self) -> bool {
         self.sizes.encodes
     }
 
-    /// Reads the whole image and compares its checksum: true when not a bit of it has changed since it was compiled.
+    /// Reads the whole image and compares its checksum: true if no bit has changed since it was
+    /// compiled.
     // Goes over all bytes, and the static library builds this crate for size: compiled where it is called.
     #[inline]
     pub fn checksum_matches(&self) -> bool {
@@ -133,15 +141,15 @@ impl<'a> Policy<'a> {
     }
 }
 
-/// Why an image was refused.
+/// Reason why an image was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum PolicyError {
-    /// The image is no image of this version, or damaged.
+    /// The bytes are damaged or not an image of this version.
     Tables(TablesError),
-    /// The contract makes no sense.
+    /// The contract is invalid.
     Contract(ContractError),
-    /// States, entries and calls make no policy.
+    /// States, entries and calls do not form a valid policy.
     Schedule(ScheduleError),
     /// The recorded episode contradicts the contract.
     Golden,
@@ -149,7 +157,7 @@ pub enum PolicyError {
     Work {
         /// Multiply-adds of the worst step.
         needed: u64,
-        /// Multiply-adds allowed.
+        /// Multiply-adds that the caller allows.
         limit: u64,
     },
 }

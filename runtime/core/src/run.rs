@@ -1,9 +1,11 @@
-//! Runs the calls of an event: fills the inputs of each entry from what they are bound to, runs its program, and stores its outputs.
+//! Runs the calls of an event: fills the inputs of each entry from their sources, runs its program,
+//! and stores its outputs.
 //!
-//! Invariants: what is in force is not written. Plain states and the action go to the next bank, rows are written behind the valid
-//! ones (a ring has one row to spare, a KV cache that calls clear has a second half), and counters change in a copy; the controller
-//! takes all of it over at the end, or drops it. Values that leave a program are finite ([`RunError::NotFinite`] otherwise); what a
-//! program appends to a KV cache is not looked at.
+//! Invariants: the state in force is not written. Plain states and the action go to the next bank,
+//! rows are written after the valid ones (a ring has one row to spare, a KV cache that calls clear
+//! has a second half), and counters change in a copy; the controller takes all of it over at the
+//! end, or drops it. Values that leave a program are finite ([`RunError::NotFinite`] otherwise);
+//! the rows that a program appends to a KV cache are not checked.
 
 use lads_image::place::{INT_SLOTS, Place, Span};
 use lads_image::records::{
@@ -20,20 +22,21 @@ use crate::normal::Normals;
 use crate::policy::Policy;
 use crate::workspace::Workspace;
 
-/// The integers of a program.
+/// Integer slots of a program.
 type Ints = [u32; INT_SLOTS];
 
-/// How many rows of a ring or a KV cache are valid, and where they start.
+/// Valid rows of a ring or a KV cache, and their start.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Rows {
-    /// Valid rows.
+    /// Number of valid rows.
     pub len: u32,
-    /// Of a ring, the row of its memory that holds the oldest; of a KV cache with two halves, which one is in force.
+    /// For a ring, the row of its memory that holds the oldest; for a KV cache with two halves, the
+    /// half in force.
     pub start: u32,
 }
 
 impl Rows {
-    /// No rows of a ring: what follows lies behind those that were valid, which stay as they are.
+    /// Returns a ring without valid rows: new rows go after those that were valid, which are kept.
     pub fn emptied(self, ring: &StateRecord) -> Self {
         Self {
             len: 0,
@@ -45,9 +48,9 @@ impl Rows {
 /// The counters that a step advances.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Counters {
-    /// Control steps since the context began.
+    /// Number of control steps since the context began.
     pub timestep: u32,
-    /// The index in force.
+    /// Index in force.
     pub selected: u32,
     /// Largest score of the last selection minus the second largest.
     pub margin: f32,
@@ -55,7 +58,7 @@ pub(crate) struct Counters {
 }
 
 impl Counters {
-    /// Nothing has happened, and nothing was kept.
+    /// Counters of a new context, with nothing selected.
     pub const START: Self = Self {
         timestep: 0,
         selected: 0,
@@ -72,36 +75,36 @@ impl Counters {
     }
 }
 
-/// Where the draws of a step come from.
+/// Source of the noise of a step.
 #[derive(Debug, Clone)]
 pub(crate) enum Draws<'d> {
     /// Zeros.
     Zero,
-    /// A generator.
+    /// A seeded generator.
     Seeded(Normals),
-    /// What the caller recorded, not yet used.
+    /// Recorded values that are not used yet.
     Given(&'d [f32]),
 }
 
-/// The calls of one event at work.
+/// Execution of the calls of one event.
 pub(crate) struct Run<'r, 'a, 'm, 'd> {
     pub tables: &'r Tables<'a>,
     pub memory: &'r mut Workspace<'m>,
-    /// Channel of the action.
+    /// Number of the action channel.
     pub action: u32,
-    /// What the caller gave, but for noise, which is drawn.
+    /// Values that the caller gave, except for noise, which is drawn.
     pub given: &'r [(ChannelId, Data<'d>)],
-    /// Channel of the noise.
+    /// Number of the noise channel.
     pub noise: Option<u32>,
     pub draws: Draws<'d>,
     pub counters: Counters,
-    /// Words of the instruction that is taken in.
+    /// Number of words of the instruction that is set.
     pub words: u32,
-    /// The index that an entry has given as an output.
+    /// Index that an entry has given as an output.
     pub given_index: Option<u32>,
 }
 
-/// Elements of a span.
+/// Returns the elements of a span.
 #[inline]
 fn elements(arena: &mut [f32], span: Span) -> Result<&mut [f32], RunError> {
     let start = span.offset as usize;
@@ -110,7 +113,7 @@ fn elements(arena: &mut [f32], span: Span) -> Result<&mut [f32], RunError> {
         .ok_or(RunError::Program(ExecError::Span))
 }
 
-/// Elements `at..at + len` of a state's memory.
+/// Returns elements `at..at + len` of a state's memory.
 #[inline]
 fn part(memory: &[f32], at: usize, len: usize) -> Result<&[f32], RunError> {
     memory
@@ -125,7 +128,7 @@ fn part_mut(memory: &mut [f32], at: usize, len: usize) -> Result<&mut [f32], Run
         .ok_or(RunError::Program(ExecError::Span))
 }
 
-/// Copies values to the front of a span and zeros behind them.
+/// Copies values to the front of a span and fills the rest with zeros.
 #[inline]
 fn fill(to: &mut [f32], from: &[f32]) {
     assign(to, from);
@@ -133,7 +136,7 @@ fn fill(to: &mut [f32], from: &[f32]) {
 }
 
 impl<'r, 'a, 'm, 'd> Run<'r, 'a, 'm, 'd> {
-    /// Nothing has run yet; noise is zero.
+    /// Starts with no call run and noise of zero.
     pub fn new(
         policy: &'r Policy<'a>,
         memory: &'r mut Workspace<'m>,
@@ -156,7 +159,8 @@ impl<'r, 'a, 'm, 'd> Run<'r, 'a, 'm, 'd> {
 }
 
 impl Run<'_, '_, '_, '_> {
-    /// Runs one call: clears, runs its entry as often as it says. What it selects is the controller's to do.
+    /// Runs one call: clears its states, then runs its entry as often as the call says. The
+    /// controller makes the selection.
     #[inline]
     pub fn call(&mut self, call: &CallRecord) -> Result<(), RunError> {
         let tables = self.tables;
@@ -186,7 +190,7 @@ impl Run<'_, '_, '_, '_> {
         Ok(())
     }
 
-    /// Empties a state for what follows; what is in force stays.
+    /// Empties a state for the coming writes; the state in force stays.
     pub fn clear(&mut self, state: u32) -> Result<(), RunError> {
         let record = self.state(state)?;
         if record.kind == StateKind::Plain {
@@ -204,7 +208,7 @@ impl Run<'_, '_, '_, '_> {
         Ok(())
     }
 
-    /// The values of a plain state, as the step has left them so far.
+    /// Returns the values of a plain state, including this step's writes so far.
     #[inline]
     pub fn plain(&self, state: u32) -> Result<&[f32], RunError> {
         let record = self.state(state)?;
@@ -333,7 +337,8 @@ impl Run<'_, '_, '_, '_> {
         }
     }
 
-    /// All rows of a ring, the oldest first; those that are missing in front.
+    /// Reads all rows of a ring, the oldest first; missing rows come first and hold zeros or the
+    /// oldest row, by the ring's `fill`.
     fn read_ring(&mut self, state: u32, ring: &StateRecord, span: Span) -> Result<(), RunError> {
         let Rows { len, start } = self.counters.rows(state);
         let missing = ring.rows.saturating_sub(len);
@@ -352,7 +357,7 @@ impl Run<'_, '_, '_, '_> {
         Ok(())
     }
 
-    /// Takes the outputs of a program out of the arena.
+    /// Stores the outputs of a program from the arena.
     #[inline]
     fn store(&mut self, entry: &EntryRecord, ints: Ints) -> Result<(), RunError> {
         for PortRecord { source, place, .. } in self.tables.outputs(entry) {
@@ -420,7 +425,7 @@ impl Draws<'_> {
     }
 }
 
-/// Row of a ring's memory `by` behind `start`.
+/// Returns the row of a ring's memory that is `by` rows after `start`.
 fn wrapped(ring: &StateRecord, start: u32, by: u32) -> u32 {
     start
         .saturating_add(by)
@@ -428,7 +433,7 @@ fn wrapped(ring: &StateRecord, start: u32, by: u32) -> u32 {
         .unwrap_or(0)
 }
 
-/// First element, in the row memory, of row `by` of a ring whose oldest row is `start`.
+/// Returns the first element, in the row memory, of row `by` of a ring whose oldest row is `start`.
 fn row_at(ring: &StateRecord, start: u32, by: u32) -> usize {
     let row = wrapped(ring, start, by) as usize;
     (ring.offset as usize).saturating_add(row.saturating_mul(ring.width as usize))

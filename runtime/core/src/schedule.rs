@@ -1,14 +1,15 @@
 //! Proves that an image's channels, states, entries and calls make a policy that can be run blindly.
 //!
-//! What is proven, once, when an image is opened:
-//! - states lie one behind the other, so none overlap, and each is used;
+//! Opening an image proves once that
+//! - states are stored consecutively, so none overlap, and each is used;
 //! - every entry is a sound program whose ports have the length of what they are bound to;
 //! - every control step of a context writes the action, selects an index before it is read, reads nothing of the step that was
 //!   not written before, appends at most one row to a ring, clears a KV cache at most once, and never fills one beyond its rows:
 //!   the schedule is gone through step by step, with the longest instruction;
-//! - the image asks for no more rows than that takes, and says truly how much the worst step computes.
+//! - the image asks for no more rows than that takes, and states the true amount of work of the
+//!   worst step.
 //!
-//! What can fail: [`check`], with the record that is at fault ([`ScheduleError`]).
+//! What can fail: [`check`], with the record at fault ([`ScheduleError`]).
 
 mod error;
 mod walk;
@@ -24,32 +25,32 @@ use crate::contract::{Contract, DType, Role, same_text};
 
 pub use error::ScheduleError;
 
-/// The most states of an image: one bit each in a word.
+/// Largest number of states of an image: one bit each in a word.
 const MAX_STATES: usize = 64;
 
-/// The most control steps of a bounded context, and of two periods of an unbounded one.
+/// Largest number of control steps of a bounded context, and of two periods of an unbounded one.
 const MAX_STEPS: u32 = 1 << 14;
 
-/// The most entries and the most calls of an image, and the most ports on a side of an entry: going through a context takes time
-/// in proportion.
+/// Largest number of entries and of calls of an image, and of ports on a side of an entry: walking
+/// a context takes time in proportion.
 const MAX_RECORDS: usize = 64;
 
-/// What a run of each entry costs, in multiply-adds; one more for every op.
+/// Cost of a run of each entry, in multiply-adds; one more for every op.
 type Work = [u64; MAX_RECORDS];
 
-/// The most runs of one call.
+/// Largest number of runs of one call.
 const MAX_REPEAT: u32 = 1 << 16;
 
-/// What a policy needs, found while it is checked. Lengths count elements.
+/// Memory and work that a policy needs, computed while it is checked. Lengths count elements.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Sizes {
-    /// The largest entry's arena.
+    /// Arena of the largest entry.
     pub arena_len: usize,
-    /// Rings and KV caches.
+    /// Rings and KV caches together.
     pub rows_len: usize,
     /// Plain states that last longer than a step.
     pub bank_len: usize,
-    /// Plain states of a step.
+    /// Plain states that last one step.
     pub scratch_len: usize,
     /// Noise of the step that draws most.
     pub noise_len: usize,
@@ -57,17 +58,17 @@ pub(crate) struct Sizes {
     pub period: u32,
     /// The scores that an index is selected from, if one is.
     pub scores: Option<StateRecord>,
-    /// Whether an index alone gives an action.
+    /// True if an action can be computed from an index alone.
     pub follows: bool,
-    /// Whether demonstrations can be encoded.
+    /// True if demonstrations can be encoded.
     pub encodes: bool,
-    /// Of the worst step or call of another event, in multiply-adds.
+    /// Work of the worst step or call of another event, in multiply-adds.
     pub work: u64,
 }
 
 type Checked<T = ()> = Result<T, ScheduleError>;
 
-/// Checks everything and says what the policy needs.
+/// Checks everything and returns the sizes that the policy needs.
 pub(crate) fn check(tables: &Tables, contract: &Contract) -> Checked<Sizes> {
     let mut sizes = Sizes {
         period: 1,
@@ -88,7 +89,7 @@ pub(crate) fn check(tables: &Tables, contract: &Contract) -> Checked<Sizes> {
     Ok(sizes)
 }
 
-/// There are no more records than can be gone through at every step of a context.
+/// Checks that there are few enough records to go through them at every step of a context.
 fn few(tables: &Tables) -> Checked {
     let lists = tables.states_len() <= MAX_STATES
         && tables.entries_len() <= MAX_RECORDS
@@ -112,7 +113,7 @@ fn few(tables: &Tables) -> Checked {
     }
 }
 
-/// States lie where their order puts them.
+/// Checks that the states are stored in order, without gaps.
 #[inline(never)]
 fn states(tables: &Tables, sizes: &mut Sizes) -> Checked {
     let count = tables.states_len();
@@ -169,14 +170,14 @@ fn states(tables: &Tables, sizes: &mut Sizes) -> Checked {
     Ok(())
 }
 
-/// Whether a call clears a state.
+/// Returns whether a call clears a state.
 pub(crate) fn is_cleared(tables: &Tables, state: usize) -> bool {
     tables
         .calls()
         .any(|call| tables.clears(&call).iter().any(|&i| i as usize == state))
 }
 
-/// Whether an instruction appends to a state.
+/// Returns whether an instruction appends to a state.
 fn is_instructed(tables: &Tables, state: usize) -> bool {
     tables
         .calls()
@@ -185,7 +186,8 @@ fn is_instructed(tables: &Tables, state: usize) -> bool {
         .any(|entry| entry.cache as usize == state)
 }
 
-/// Every entry is a sound program with sound ports, and every KV cache is as large as what the programs use of it.
+/// Checks that every entry is a sound program with sound ports, and that every KV cache is as large
+/// as its programs use it.
 #[inline(never)]
 fn entries(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked<Work> {
     let (mut work, mut used) = ([0; MAX_RECORDS], [0; MAX_ROW_STATES]);
@@ -270,7 +272,7 @@ impl Side {
     }
 }
 
-/// A port lives in the right kind of place and is as long as what it is bound to.
+/// Returns whether a port is bound to the right kind of thing and has its length.
 fn port_is_sound(tables: &Tables, contract: &Contract, port: &PortRecord, side: Side) -> bool {
     let Source { kind, of } = port.source;
     let span = match port.place {
@@ -309,7 +311,7 @@ fn port_is_sound(tables: &Tables, contract: &Contract, port: &PortRecord, side: 
     }
 }
 
-/// Every call names what there is, and does what its event allows.
+/// Checks that every call names existing records and does only what its event allows.
 #[inline(never)]
 fn calls(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked {
     let mut first_of = [true; 4];
@@ -414,7 +416,7 @@ fn calls(tables: &Tables, contract: &Contract, sizes: &mut Sizes) -> Checked {
     Ok(())
 }
 
-/// Whether an event's calls may read a channel of a role.
+/// Returns whether an event's calls may read a channel of a role.
 fn event_reads(event: Event, role: Role) -> bool {
     match event {
         Event::Instruct => role == Role::Instruction,
@@ -424,7 +426,7 @@ fn event_reads(event: Event, role: Role) -> bool {
     }
 }
 
-/// Every state is bound to a port of an entry, or is the cache of one.
+/// Checks that every state is bound to a port of an entry, or is the cache of one.
 #[inline(never)]
 fn used(tables: &Tables) -> Checked {
     for i in 0..tables.states_len() as u32 {

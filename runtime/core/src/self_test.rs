@@ -9,14 +9,14 @@ use crate::errors::{InstructionError, StepError};
 use crate::golden::Golden;
 use crate::inputs::{self, Given};
 
-/// The hash of nothing, and the factor, of FNV-1a with 32 bits.
+/// Initial value, and the factor, of the 32-bit FNV-1a hash.
 const FNV_OFFSET: u32 = 0x811c_9dc5;
 const FNV_PRIME: u32 = 0x0100_0193;
 
-/// What a self-test that passed has measured.
+/// Measurements of a self-test that passed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SelfTest {
-    /// Control steps replayed.
+    /// Number of control steps replayed.
     pub steps: u32,
     /// Largest absolute difference of an action element.
     pub largest_error: f32,
@@ -25,7 +25,7 @@ pub struct SelfTest {
     pub digest: u32,
 }
 
-/// Why a self-test failed; steps count from 0.
+/// Reason why a self-test failed; steps count from 0.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum SelfTestError {
@@ -35,23 +35,24 @@ pub enum SelfTestError {
     Instruction(InstructionError),
     /// A step was refused.
     Step {
-        /// Which one.
+        /// Number of the step.
         step: u32,
-        /// Why.
+        /// Error of the step.
         error: StepError,
     },
-    /// The first step with another index in force than recorded.
+    /// The index in force differs from the recorded one; reports the first such step.
     Selected {
-        /// Which one.
+        /// Number of the step.
         step: u32,
         /// Recorded index.
         expected: u32,
         /// Index on this target.
         got: u32,
     },
-    /// The first step with an action further from the recorded one than the tolerance.
+    /// An action differs from the recorded one by more than the tolerance; reports the first such
+    /// step.
     Action {
-        /// Which one.
+        /// Number of the step.
         step: u32,
         /// Element of the action.
         index: u32,
@@ -63,9 +64,9 @@ pub enum SelfTestError {
 }
 
 impl Controller<'_, '_> {
-    /// Replays the recorded episode, open loop on its observations and noise and with argmax, and compares the indices in force and
-    /// the actions. Whatever the outcome, the controller is afterwards without an instruction, and sampling and noise start from
-    /// their seeds.
+    /// Replays the recorded episode, open loop on its observations and noise and with argmax, and
+    /// compares the indices in force and the actions. Afterwards, whatever the outcome, the
+    /// controller has no instruction, and sampling and noise start from their seeds.
     pub fn self_test(&mut self) -> Result<SelfTest, SelfTestError> {
         let (rule, noise) = (self.decision(), self.noise());
         self.renew(Decision::Argmax, Noise::Zero);
@@ -92,7 +93,8 @@ impl Controller<'_, '_> {
         Ok(measured)
     }
 
-    /// One step of the recorded episode. Out of line, so that what it reads takes no stack from the step itself twice.
+    /// Replays one step of the recorded episode. Out of line, so that its inputs do not add to the
+    /// stack of the step itself.
     #[inline(never)]
     fn replay_step(
         &mut self,

@@ -1,23 +1,28 @@
-//! How like a known instruction a sentence is, by their word embeddings alone.
+//! Measures how similar a sentence is to a known instruction, by their word embeddings alone.
 //!
-//! What the policy makes of words that it never heard is not known, and it follows any; so whoever passes `Instruction::Words` compares them with
-//! the known instructions first and asks for a similarity, which the bundle's contract states (`language.acceptance`). Pure functions on
-//! slices: they allocate nothing and cannot fail; what cannot be compared is as unlike as can be.
+//! A policy follows any words, and what it does with words that it was not trained on is not known;
+//! so a caller of `Instruction::Words` first compares them with the known instructions and requires
+//! the similarity that the bundle's contract states (`language.acceptance`). Pure functions on
+//! slices: they allocate nothing and cannot fail; invalid input has the lowest similarity.
 //!
 //! Words are compared, not meanings: "do not open the drawer" is much like "open the drawer".
 
 use lads_kernels::math::sqrt;
 
-/// The similarity of what cannot be compared: no word, a length that is no whole number of words, or an element that is no finite number.
+/// Similarity of input that cannot be compared: no word, a length that is not a multiple of the
+/// word dimension, or an element that is not finite.
 pub const UNLIKE: f32 = -1.0;
 
-/// How like a known instruction a sentence is, from -1 to 1; both are word embeddings `[n, dim]`, row by row.
+/// Returns the similarity of a sentence to a known instruction, from -1 to 1; both are word
+/// embeddings `[n, dim]`, row by row.
 ///
-/// Every word of the sentence is held against the word of the known instruction that is most like it, by the cosine; the result is the mean
-/// over the sentence's words. The last of several words is the encoder's end mark, which stands in every sentence, and is left out. Where a
-/// sentence is heard as one word, this is the cosine of the two.
+/// Every word of the sentence is compared with the word of the known instruction that is most like
+/// it, by the cosine; the result is the mean over the sentence's words. The last of several words
+/// is the encoder's end mark, which stands in every sentence, and is left out. For an encoder that
+/// maps a sentence to one word, this is the cosine of the two.
 ///
-/// The contract calls it `alignment`. It is not symmetric: what the sentence leaves out of the instruction does not count.
+/// The contract calls it `alignment`. It is not symmetric: words of the instruction that the
+/// sentence omits do not count.
 #[must_use]
 pub fn alignment(sentence: &[f32], known: &[f32], dim: usize) -> f32 {
     let (Some(sentence), Some(known)) = (spoken(sentence, dim), spoken(known, dim)) else {
@@ -32,7 +37,8 @@ pub fn alignment(sentence: &[f32], known: &[f32], dim: usize) -> f32 {
     sum / count
 }
 
-/// Place of the known instruction that a sentence is most like, the first of equal ones, and its [`alignment`]; `None` where none is known.
+/// Returns the position of the known instruction that a sentence is most similar to, the first of
+/// equal ones, and its [`alignment`]; `None` if none is known.
 #[must_use]
 pub fn nearest<'w>(
     sentence: &[f32],
@@ -49,7 +55,7 @@ pub fn nearest<'w>(
     best
 }
 
-/// The words without the end mark; `None` where they are no words.
+/// Returns the words without the end mark; `None` if they are invalid.
 fn spoken(words: &[f32], dim: usize) -> Option<&[f32]> {
     let whole = !words.is_empty() && words.len().checked_rem(dim) == Some(0);
     if !whole || words.iter().any(|x| !x.is_finite()) {
@@ -59,7 +65,7 @@ fn spoken(words: &[f32], dim: usize) -> Option<&[f32]> {
     words.get(..if end == 0 { dim } else { end })
 }
 
-/// The cosine of two vectors, 0 where one of them has no direction; within -1 and 1.
+/// Returns the cosine of two vectors, 0 if one of them is zero; within -1 and 1.
 fn cosine(a: &[f32], b: &[f32]) -> f32 {
     let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>();
     let lengths = sqrt(dot(a, a)) * sqrt(dot(b, b));

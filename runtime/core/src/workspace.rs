@@ -1,4 +1,4 @@
-//! The memory of a controller, which belongs to the caller.
+//! Memory of a controller, which belongs to the caller.
 
 use core::error::Error;
 use core::fmt;
@@ -7,7 +7,8 @@ use lads_kernels::{Isa, assign};
 
 use crate::policy::Policy;
 
-/// What a control step replaces as a whole: the plain states that last longer than a step, and the action.
+/// State that a control step replaces as a whole: the plain states that last longer than a step,
+/// and the action.
 #[derive(Debug)]
 pub(crate) struct Bank<'m> {
     pub plain: &'m mut [f32],
@@ -15,32 +16,34 @@ pub(crate) struct Bank<'m> {
 }
 
 impl Bank<'_> {
-    /// Takes over another bank's values.
+    /// Copies another bank's values.
     pub fn copy_from(&mut self, other: &Bank) {
         assign(self.plain, other.plain);
         assign(self.action, other.action);
     }
 }
 
-/// Memory for one controller: the arena, which holds nothing between two calls, and the state, which does.
+/// Memory for one controller: the arena, which is unused between two calls, and the state, which
+/// persists.
 #[derive(Debug)]
 pub struct Workspace<'m> {
-    /// What a program computes in.
+    /// Scratch memory of the running program.
     pub(crate) arena: &'m mut [f32],
-    /// Rings and KV caches.
+    /// Memory of rings and KV caches.
     pub(crate) rows: &'m mut [f32],
     /// The state in force.
     pub(crate) now: Bank<'m>,
-    /// What the step that is being computed would make of it.
+    /// The state that the running step computes.
     pub(crate) next: Bank<'m>,
-    /// What the programs of one step hand to each other.
+    /// Values that the programs of one step hand to each other.
     pub(crate) scratch: &'m mut [f32],
-    /// What the kernels run on.
+    /// Instruction set that the kernels run on.
     pub(crate) isa: Isa,
 }
 
 impl<'m> Workspace<'m> {
-    /// Takes [`Policy::arena_len`] and [`Policy::state_len`] elements and sets them to zero; what is longer is left alone.
+    /// Takes [`Policy::arena_len`] and [`Policy::state_len`] elements and sets them to zero;
+    /// elements past these are left alone.
     pub fn new(
         policy: &Policy,
         arena: &'m mut [f32],
@@ -68,7 +71,7 @@ impl<'m> Workspace<'m> {
         })
     }
 
-    /// Whether it was made for a policy of these sizes.
+    /// Returns whether the workspace was made for a policy of these sizes.
     pub(crate) fn fits(&self, policy: &Policy) -> bool {
         self.arena.len() >= policy.arena_len()
             && self.rows.len() == policy.sizes.rows_len
@@ -78,7 +81,7 @@ impl<'m> Workspace<'m> {
     }
 }
 
-/// The first `needed` elements, set to zero.
+/// Returns the first `needed` elements, set to zero.
 fn take(memory: &mut [f32], needed: usize) -> Result<&mut [f32], WorkspaceTooSmall> {
     let got = memory.len();
     let taken = memory
@@ -98,9 +101,9 @@ fn bank(memory: &mut [f32], plain: usize, action: usize) -> Option<(Bank<'_>, &m
 /// The arena or the state has too few elements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WorkspaceTooSmall {
-    /// Elements that there are.
+    /// Number of elements given.
     pub got: usize,
-    /// Elements that are needed.
+    /// Number of elements needed.
     pub needed: usize,
 }
 

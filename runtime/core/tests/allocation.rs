@@ -1,5 +1,5 @@
-//! Nothing is allocated once a controller exists: a counting global allocator over 1,000 steps, two instructions, a reset, an
-//! encoding and a self-test.
+//! Tests that nothing is allocated once a controller exists: a counting global allocator over 1,000
+//! steps, two instructions, a reset, an encoding and a self-test.
 
 mod support;
 

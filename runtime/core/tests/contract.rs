@@ -1,4 +1,5 @@
-//! Every rule about the frame of an image, its contract and its recorded episode, violated once.
+//! Tests of every rule about the frame of an image, its contract and its recorded episode, violated
+//! once.
 
 mod support;
 
@@ -14,7 +15,7 @@ fn lads() -> Parts {
     assemble::parts(&Model::random(Spec::TINY, 11)).with_golden(4)
 }
 
-/// Why a policy is refused after `edit`, which has to be its contract's fault.
+/// Returns why a policy is refused after `edit`, which has to be its contract's fault.
 fn fault(parts: &Parts, edit: impl FnOnce(&mut Parts)) -> Option<ContractError> {
     match parts.refused(edit) {
         Some(PolicyError::Contract(error)) => Some(error),

@@ -1,4 +1,4 @@
-//! The rules of the calls of a controller.
+//! Tests of the rules of a controller's calls.
 
 mod support;
 
@@ -160,7 +160,7 @@ fn what_was_executed_goes_into_the_context() {
     assert_eq!(plain, scores(Some(actions[0])).0);
 }
 
-/// The indices and actions of an episode with this decision rule.
+/// Returns the indices and actions of an episode with this decision rule.
 fn episode(image: &Image, decision: Decision) -> (Vec<u32>, Vec<f32>) {
     with_controller(image, |controller| {
         controller.set_decision(decision);

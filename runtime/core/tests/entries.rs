@@ -1,4 +1,5 @@
-//! Every rule about states, entries and ports, violated once in an image that is sound otherwise.
+//! Tests of every rule about states, entries and ports, violated once in an image that is sound
+//! otherwise.
 #![expect(
     clippy::unnecessary_wraps,
     reason = "what is refused is compared with nothing or an error"
@@ -169,7 +170,7 @@ fn fault_of_program(at: usize, expected: Fault) -> Option<ScheduleError> {
     })
 }
 
-/// Which op of the small policy's programs has the fault; `None` for the arena's.
+/// Returns which op of the small policy's programs has the fault; `None` for the arena's.
 fn expected_op(fault: Fault) -> Option<u32> {
     match fault {
         Fault::Tokens | Fault::Bounds => Some(6),

@@ -1,4 +1,5 @@
-//! A guard lets nothing out that is not finite, outside the limits or too fast, whatever comes in; and it says and counts what it did.
+//! Tests that a guard outputs only actions that are finite, inside the limits and slow enough,
+//! whatever comes in, and that it reports and counts what it did.
 
 mod support;
 
@@ -10,7 +11,7 @@ use support::assemble::parts;
 use support::guarding::{PERIOD, guarded, image};
 use support::{Memory, Model, Spec};
 
-/// Armed, with an instruction.
+/// Runs `f` on a guarded controller that is armed and has an instruction.
 fn ready<T>(config: &GuardConfig, f: impl FnOnce(&mut GuardedController) -> T) -> T {
     let run = |guarded: &mut GuardedController| {
         guarded.self_test().expect("the policy is sound");

@@ -1,4 +1,5 @@
-//! Whatever comes in, what a guard lets out is finite, inside the limits and no faster than it may be.
+//! Tests that a guard's output is finite, inside the limits and no faster than allowed, whatever
+//! comes in.
 
 mod support;
 
@@ -101,7 +102,7 @@ fn step(guarded: &mut GuardedController, observation: [f32; 3]) -> [f32; 2] {
     action
 }
 
-/// What a caller may do, well meant or not.
+/// Calls that a caller may make, well meant or not.
 #[derive(Debug, Clone)]
 enum Call {
     Step(Vec<f32>, Option<Tick>),

@@ -1,4 +1,5 @@
-//! Images that are broken, by accident or on purpose: opening them, and running what opens, gives `Ok` or `Err`, never a panic.
+//! Tests that opening images that are broken, by accident or on purpose, and running those that
+//! open, gives `Ok` or `Err`, never a panic.
 
 mod support;
 
@@ -15,7 +16,7 @@ use support::assemble::{self, RECORD};
 use support::writer::{Parts, section_row};
 use support::{Image, Model, Random, Spec, given, observe, shapes};
 
-/// The small LADS policy, smaller still: every byte of it is flipped.
+/// Makes a LADS policy even smaller than the small one, because every byte of it is flipped.
 fn lads() -> Parts {
     let spec = Spec {
         layers: 1,
@@ -39,13 +40,14 @@ fn all() -> Vec<(&'static str, Image)> {
         .collect()
 }
 
-/// A changed size may ask for more memory than these tests want to give; refusing it is the caller's part.
+/// Largest workspace that these tests give; a changed size may ask for more, and refusing that is
+/// the caller's part.
 const MOST: usize = 1 << 16;
 
-/// A changed number may ask for more work than these tests want to wait for.
+/// Largest work that these tests wait for; a changed number may ask for more.
 const WORK: u64 = 1 << 16;
 
-/// Uses whatever opens: every call may refuse, none may panic. Memory and time stay small.
+/// Uses an image that opens: every call may refuse, none may panic. Memory and time stay small.
 fn exercise(bytes: &[u8]) -> Result<(), PolicyError> {
     let policy = Policy::new_within(bytes, WORK)?;
     policy.checksum_matches();
@@ -163,7 +165,7 @@ fn every_flipped_byte_is_found_by_the_checksum_and_never_a_panic() {
     }
 }
 
-/// The most words of tables and ops that an image here has.
+/// Largest number of words of tables and ops of an image in these tests.
 const WORDS: usize = 4000;
 
 fn any_word() -> impl Strategy<Value = u32> {
@@ -220,7 +222,7 @@ proptest! {
     }
 }
 
-/// Changes one word of a record, where it still means something.
+/// Changes one word of a record, unless it then no longer decodes.
 fn change<T: Field>(record: &mut T, at: usize, value: u32) {
     let mut words = vec![0; T::WORDS];
     record.put(&mut Writer::new(&mut words));
@@ -230,7 +232,7 @@ fn change<T: Field>(record: &mut T, at: usize, value: u32) {
     }
 }
 
-/// One of a list, if it has any.
+/// Picks one record of a list, if it has any.
 fn pick<T>(list: &mut [T], which: usize) -> Option<&mut T> {
     let len = list.len().max(1);
     list.get_mut(which % len)

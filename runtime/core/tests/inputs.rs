@@ -1,4 +1,4 @@
-//! What is given for the channels of a step is what the contract says, or the step is refused.
+//! Tests that values given for the channels of a step match the contract, or the step is refused.
 
 mod support;
 

@@ -1,4 +1,4 @@
-//! The controller against the naive model, which computes everything anew in 64 bits.
+//! Compares the controller with the naive model, which computes everything anew in 64 bits.
 
 mod support;
 

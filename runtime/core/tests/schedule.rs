@@ -1,4 +1,5 @@
-//! Every rule about calls and the steps that they make, violated once in an image that is sound otherwise.
+//! Tests of every rule about calls and the steps that they make, violated once in an image that is
+//! sound otherwise.
 #![expect(
     clippy::unnecessary_wraps,
     reason = "what is refused is compared with nothing or an error"
@@ -18,7 +19,7 @@ fn lads() -> Parts {
     assemble::parts(&Model::random(Spec::TINY, 11))
 }
 
-/// Calls of [`lads`], by their number.
+/// Numbers of the calls of [`lads`].
 const FIRST: usize = 1;
 const LOOK: usize = 4;
 const LAST: usize = 5;
@@ -338,7 +339,8 @@ fn a_context_is_no_longer_than_can_be_gone_through() {
     );
 }
 
-/// The ops of an entry are counted once, not at each of the steps that run it: this takes no minutes.
+/// The ops of an entry are counted once, not at each of the steps that run it, so opening takes no
+/// minutes.
 #[test]
 fn long_programs_are_gone_through_once() {
     let many = shapes::memoryless().sealed_fault(|parts| {

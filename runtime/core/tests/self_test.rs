@@ -1,4 +1,5 @@
-//! The self-test passes on a sound image and names the first step that differs on one that is not.
+//! Tests that the self-test passes on a sound image and names the first step that differs on one
+//! that is not.
 
 mod support;
 

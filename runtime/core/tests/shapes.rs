@@ -1,5 +1,6 @@
-//! Each shape of a schedule against a few lines that say the same: KV caches that calls clear, repeated calls, noise, rings as
-//! windows and row by row, queues, recurrent states, images and integers. Where no attention is involved, bit for bit.
+//! Compares each shape of a schedule with a few lines of Rust that compute the same: KV caches that
+//! calls clear, repeated calls, noise, rings as windows and row by row, queues, recurrent states,
+//! images and integers. Without attention, the results agree bit for bit.
 
 mod support;
 
@@ -8,7 +9,7 @@ use lads_image::records::Fill;
 use support::shapes::{self, CODES, GEAR, LEANS, MEMORY, NOISE, PASSES, STEPS, WORDS};
 use support::{Random, attend, wide, with_controller};
 
-/// Actions that nothing clips.
+/// Returns random actions that nothing clips.
 fn small(random: &mut Random) -> [f32; 2] {
     [random.next() * 0.25, random.next() * 0.25]
 }
@@ -28,7 +29,7 @@ fn clip(x: [f32; 2]) -> [f32; 2] {
     x.map(|x| x.clamp(-1.0, 1.0))
 }
 
-/// Scores, and the first of the largest.
+/// Returns the scores, and the first of the largest.
 fn best(x: &[f64]) -> (Vec<f64>, u32) {
     let scores: Vec<f64> = (0..3)
         .map(|i| x[0] * f64::from(LEANS[0][i]) + x[1] * f64::from(LEANS[1][i]))
@@ -112,7 +113,7 @@ fn a_call_clears_one_of_two_caches() {
     });
 }
 
-/// What [`shapes::denoise`] does with the noise of one step.
+/// Computes in `f64` the action of [`shapes::denoise`] for the noise of one step.
 fn denoised(observation: &[f32], noise: &[f32]) -> [f32; 2] {
     let code = CODES[best(&wide(observation)).1 as usize];
     let mut x = [0, 1].map(|j| noise[j] * 0.5);
@@ -123,7 +124,8 @@ fn denoised(observation: &[f32], noise: &[f32]) -> [f32; 2] {
     clip([0, 1].map(|j| x[j] + observation[j]))
 }
 
-/// The first numbers of a seed's stream, from the table that both implementations are tested against.
+/// Returns the first numbers of a seed's stream, from the table that both implementations are
+/// tested against.
 fn normals(seed: u64) -> Vec<f32> {
     let head = format!("draws {seed} ");
     let row = include_str!("normals.txt")

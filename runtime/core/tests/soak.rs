@@ -1,4 +1,5 @@
-//! A million guarded steps with random instructions, resets and faults: nothing that is not finite comes out, and no memory is taken.
+//! Runs a million guarded steps with random instructions, resets and faults: every output is
+//! finite, and no memory is taken.
 //!
 //! `cargo test --release -p lads-core --test soak -- --ignored`
 
@@ -10,7 +11,7 @@ use support::{Memory, Model, Random, Spec};
 
 const STEPS: u64 = 1_000_000;
 
-/// Pages that the process holds, where the system tells.
+/// Returns the number of pages that the process holds, if the system tells.
 fn resident() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/self/statm").ok()?;
     text.split(' ').nth(1)?.parse().ok()

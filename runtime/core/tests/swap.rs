@@ -1,4 +1,5 @@
-//! Another policy takes the place of the one at work: it has to fit, and nothing jumps.
+//! Tests that another policy takes the place of the running one: it has to fit, and no action
+//! jumps.
 
 mod support;
 
@@ -31,7 +32,8 @@ fn config() -> GuardConfig<'static> {
     }
 }
 
-/// Memory, and a controller in it that has passed its self-test and follows instruction 0, as far as that was asked for.
+/// Makes memory, and a controller in it that has passed its self-test and follows instruction 0, as
+/// far as that was asked for.
 fn controller<'a, 'm>(
     policy: &Policy<'a>,
     memory: &'m mut Memory,

@@ -1,4 +1,5 @@
-//! A call that is refused leaves the controller as it was: its answers are, bit for bit, those of one that was never asked.
+//! Tests that a refused call leaves the controller unchanged: its answers are, bit for bit, those
+//! of a controller that was never asked.
 
 mod support;
 
@@ -19,7 +20,8 @@ fn tiny() -> Parts {
     parts(&Model::random(Spec::TINY, 11))
 }
 
-/// All shapes and the small LADS policy, as they are and with a last call that overflows when an observation is above one.
+/// Returns all shapes and the small LADS policy, unchanged and with a last call that overflows when
+/// an observation is above one.
 fn all(fused: bool) -> Vec<(&'static str, Parts)> {
     let mut all = shapes::all();
     all.push(("lads", tiny()));
@@ -56,7 +58,7 @@ fn with_fuse(mut parts: Parts) -> Parts {
     parts.sealed()
 }
 
-/// What a controller says and shows over an episode in which `between` is called before every step.
+/// Reports, actions and scores of an episode.
 type Seen = Vec<(StepReport, Vec<u32>, Vec<u32>)>;
 
 fn bits(values: &[f32]) -> Vec<u32> {
@@ -98,7 +100,7 @@ fn episode(image: &Image, mut between: impl FnMut(&mut Controller, &Policy, usiz
     seen
 }
 
-/// Observations that burn no fuse.
+/// Halves the observations, so that the last call does not overflow.
 fn halve(inputs: &mut [(ChannelId, support::Values)]) {
     for (_, values) in inputs {
         if let support::Values::F32(values) = values {
@@ -205,8 +207,9 @@ fn a_refused_instruction_leaves_the_old_one() {
     assert_eq!(episode(&image, |_, _, _| ()), disturbed);
 }
 
-/// The last call of a step fails, after caches were cleared and appended to, rings appended to, states written, noise drawn and an
-/// index sampled; at ordinary steps and at those where a context starts again.
+/// Undoes a step whose last call fails, after caches were cleared and appended to, rings appended
+/// to, states written, noise drawn and an index sampled; at ordinary steps and at those where a
+/// context starts again.
 #[test]
 fn a_step_that_fails_at_its_end_is_undone() {
     for (name, parts) in all(true) {
@@ -230,7 +233,8 @@ fn a_step_that_fails_at_its_end_is_undone() {
     }
 }
 
-/// A call beside the episode reads a ring that a failed step has cleared and appended to, at a restart and at a call that clears.
+/// Reads, by a call beside the episode, a ring that a failed step has cleared and appended to, at a
+/// restart and at a call that clears.
 #[test]
 fn a_ring_is_as_it_was_after_a_failed_step() {
     let mut cleared = shapes::history();
@@ -276,7 +280,7 @@ fn a_ring_is_as_it_was_after_a_failed_step() {
     }
 }
 
-/// Sets the rows of the cache in every attention.
+/// Sets the number of rows of the cache in every attention.
 fn resize(parts: &mut Parts, rows: u32) {
     for op in parts.entries.iter_mut().flat_map(|entry| &mut entry.ops) {
         if let op::Op::Attention(attention) = op {
@@ -316,7 +320,8 @@ fn an_instruction_that_fails_leaves_none() {
     assert_eq!(fresh, disturbed);
 }
 
-/// Words so large that nothing can be computed fill the cache with what is not finite; the next instruction does not see it.
+/// Fills the cache with non-finite values, by words too large to compute with, which the next
+/// instruction does not see.
 #[test]
 fn what_a_hopeless_instruction_left_in_the_cache_is_not_read() {
     let image = tiny().image();

@@ -1,4 +1,5 @@
-//! Warming changes nothing, whatever the state of the context, and runs what only later steps run.
+//! Tests that warming changes nothing, whatever the state of the context, and runs code that only
+//! later steps run.
 
 mod support;
 
@@ -8,7 +9,7 @@ use support::assemble::parts;
 use support::draft::kv_len;
 use support::{Image, Memory, Model, Random, Spec, given, observe, shapes};
 
-/// The bits of what an episode gives, with or without warming before every step.
+/// Returns the bits of an episode's results, with or without warming before every step.
 fn episode(image: &Image, warms: bool) -> Vec<u32> {
     let policy = image.policy();
     let mut memory = Memory::for_policy(&policy);
@@ -62,7 +63,8 @@ fn nothing_changes() {
     }
 }
 
-/// A full context that refuses has no step to come; the instruction's rows of the cache stay what they are.
+/// A full context that refuses has no next step; the instruction's rows of the cache stay
+/// unchanged.
 #[test]
 fn a_full_context_keeps_its_instruction() {
     let mut parts = parts(&Model::random(Spec::TINY, 11));
@@ -92,7 +94,8 @@ fn a_full_context_keeps_its_instruction() {
     assert_eq!(second_episode(true), second_episode(false));
 }
 
-/// Before the first step, the programs of later steps have run too: a step appends two rows, and the first step one.
+/// Before the first step, warming has run the programs of later steps too: a step appends two rows,
+/// and the first step one.
 #[test]
 fn before_the_first_step_later_programs_run() {
     let spec = Spec::TINY;

@@ -1,4 +1,4 @@
-//! The memory of a controller: how much, whose, and what lies in it beforehand.
+//! Tests of a controller's memory: its size, its owner, and its contents beforehand.
 
 mod support;
 
@@ -86,7 +86,7 @@ fn what_lies_in_the_memory_beforehand_does_not_matter() {
     assert_eq!(run(0.0), run(1e30));
 }
 
-/// One kitchen-sized episode, bit for bit.
+/// Runs one kitchen-sized episode on every instruction set and compares the actions bit for bit.
 #[test]
 fn every_instruction_set_gives_the_same_actions() {
     let image = parts(&Model::random(Spec::KITCHEN, 5)).image();

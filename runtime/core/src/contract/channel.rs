@@ -1,4 +1,5 @@
-//! Channels: the values at a policy's edge, with the names, units and limits of their elements.
+//! Channels: the inputs and outputs of a policy, with the names, units and limits of their
+//! elements.
 
 use lads_image::codec::{Field, Reader};
 use lads_image::records::{self, ChannelRecord, ElementRecord};
@@ -8,14 +9,16 @@ use super::{ContractError, same_text};
 use crate::errors::InputError;
 use crate::inputs;
 
-/// The most elements that a channel may have: an image of 4,096 by 4,096 pixels of four colours is within it.
+/// Largest number of elements that a channel may have: an image of 4,096 by 4,096 pixels of four
+/// colours is within it.
 const MAX_CHANNEL_LEN: u64 = 1 << 26;
 
-/// Which channel of a policy: its position among [`Contract::channels`](super::Contract::channels).
+/// Number of a channel of a policy: its position among
+/// [`Contract::channels`](super::Contract::channels).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct ChannelId(pub u32);
 
-/// What a channel is for.
+/// Purpose of a channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Role {
     /// Given by the caller in every control step.
@@ -30,7 +33,7 @@ pub enum Role {
     Demonstration,
 }
 
-/// The type of a channel's elements.
+/// Type of a channel's elements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum DType {
     /// 32-bit floats.
@@ -44,7 +47,7 @@ pub enum DType {
 /// Order of the components of the quaternions in a channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum QuaternionOrder {
-    /// There are none.
+    /// No quaternions.
     None,
     /// Scalar first.
     Wxyz,
@@ -52,7 +55,7 @@ pub enum QuaternionOrder {
     Xyzw,
 }
 
-/// One channel: a value at the policy's edge.
+/// One channel: an input or output of the policy.
 #[derive(Debug, Clone, Copy)]
 pub struct Channel<'a> {
     tables: Tables<'a>,
@@ -63,21 +66,22 @@ pub struct Channel<'a> {
 /// One element of a channel.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Element<'a> {
-    /// Name.
+    /// Name of the element.
     pub name: &'a str,
-    /// Unit, `1` for none.
+    /// Unit of the element; `1` for a dimensionless one.
     pub unit: &'a str,
-    /// Joint that it belongs to; empty for none.
+    /// Joint that the element belongs to; empty for none.
     pub joint: &'a str,
-    /// What of the joint: `position`, `velocity`, `effort`; empty where the bundle does not say.
+    /// Quantity of the joint: `position`, `velocity`, `effort`; empty where the bundle does not
+    /// say.
     pub interface: &'a str,
     /// Unit of the physical value that the element stands for; empty where the bundle does not say.
     pub physical_unit: &'a str,
     /// Physical value of one unit of the element: physical = reference + offset + scale * value.
     pub scale: f32,
-    /// Physical value of zero, on top of the channel's reference.
+    /// Physical value for an element of zero, without the channel's reference.
     pub offset: f32,
-    /// What the contract allows.
+    /// Limits that the contract sets.
     pub limits: Interval,
 }
 
@@ -91,7 +95,7 @@ pub struct Interval {
 }
 
 impl Interval {
-    /// The value, or the limit beyond which it lies. What is not a number stays so.
+    /// Returns the value, or the nearest limit if it lies outside. NaN stays NaN.
     #[inline]
     pub fn clamp(self, value: f32) -> f32 {
         // `f32::clamp` without its panic on limits in the wrong order, which a checked contract does not have; two selections and
@@ -109,7 +113,7 @@ pub(crate) struct Bounds<'a> {
     pub(super) len: usize,
 }
 
-/// The limits in an element's record: its last two words.
+/// Returns the limits in an element's record: its last two words.
 fn interval(&[.., min, max]: &[u32; ElementRecord::WORDS]) -> Interval {
     Interval {
         min: f32::from_bits(min),
@@ -146,7 +150,7 @@ impl<'a> Bounds<'a> {
         }
     }
 
-    /// As many values as there are elements, each finite and inside its limits.
+    /// Checks that there are as many values as elements, each finite and inside its limits.
     #[inline]
     pub fn check(self, channel: ChannelId, values: &[f32]) -> Result<(), InputError> {
         let (got, needed) = (values.len(), self.len);
@@ -165,7 +169,7 @@ impl<'a> Bounds<'a> {
     }
 }
 
-/// Stands for a channel that is not there, which no checked contract asks for.
+/// Placeholder for a missing channel, which no checked contract asks for.
 pub(super) const EMPTY: ChannelRecord = ChannelRecord {
     name: records::Text { offset: 0, len: 0 },
     role: records::Role::Observation,
@@ -181,7 +185,7 @@ pub(super) const EMPTY: ChannelRecord = ChannelRecord {
 };
 
 impl Element<'_> {
-    /// Whether another element means the same, limits included.
+    /// Returns whether another element has the same meaning and the same limits.
     pub(crate) fn is_like(&self, other: &Element) -> bool {
         fn texts<'e>(element: &Element<'e>) -> [&'e str; 4] {
             [element.name, element.unit, element.joint, element.interface]
@@ -200,7 +204,8 @@ impl<'a> Channel<'a> {
         Self { tables, record, id }
     }
 
-    /// Whether another channel means the same to those who give observations and execute actions.
+    /// Returns whether another channel has the same meaning to those who give observations and
+    /// execute actions.
     pub(crate) fn is_like(&self, other: &Channel) -> bool {
         let (mut mine, mut theirs) = (self.elements(), other.elements());
         let elements = loop {
@@ -222,7 +227,8 @@ impl<'a> Channel<'a> {
             && (min == their_min && max == their_max)
     }
 
-    /// `elements` is the number of element records of the channels before this one.
+    /// Checks the channel's record; `elements` is the number of element records of the channels
+    /// before this one.
     pub(super) fn check(&self, elements: u32) -> Result<(), ContractError> {
         let c = &self.record;
         let shape = self.shape();
@@ -262,17 +268,17 @@ impl<'a> Channel<'a> {
         Ok(())
     }
 
-    /// Its number.
+    /// Returns the number of the channel.
     pub fn id(&self) -> ChannelId {
         self.id
     }
 
-    /// Name.
+    /// Returns the name of the channel.
     pub fn name(&self) -> &'a str {
         self.tables.text(self.record.name)
     }
 
-    /// What it is for.
+    /// Returns the purpose of the channel.
     pub fn role(&self) -> Role {
         match self.record.role {
             records::Role::Observation => Role::Observation,
@@ -283,7 +289,7 @@ impl<'a> Channel<'a> {
         }
     }
 
-    /// Type of its elements.
+    /// Returns the type of the channel's elements.
     pub fn dtype(&self) -> DType {
         match self.record.dtype {
             records::DType::F32 => DType::F32,
@@ -292,13 +298,13 @@ impl<'a> Channel<'a> {
         }
     }
 
-    /// Lengths of its axes, one to four.
+    /// Returns the lengths of the channel's axes, one to four.
     pub fn shape(&self) -> &[u32] {
         let rank = self.record.rank as usize;
         self.record.dims.get(..rank).unwrap_or(&self.record.dims)
     }
 
-    /// Elements.
+    /// Returns the number of elements of the channel.
     #[inline]
     #[expect(
         clippy::len_without_is_empty,
@@ -309,7 +315,7 @@ impl<'a> Channel<'a> {
         a.saturating_mul(b).saturating_mul(c).saturating_mul(d)
     }
 
-    /// Order of the components of its quaternions.
+    /// Returns the order of the components of the channel's quaternions.
     pub fn quaternion_order(&self) -> QuaternionOrder {
         match self.record.quaternions {
             records::QuaternionOrder::None => QuaternionOrder::None,
@@ -318,12 +324,14 @@ impl<'a> Channel<'a> {
         }
     }
 
-    /// What the values are relative to, in words; empty where the bundle does not say.
+    /// Returns the description of the reference that the values are relative to; empty where the
+    /// bundle does not say.
     pub fn reference(&self) -> &'a str {
         self.tables.text(self.record.reference)
     }
 
-    /// Its elements with names and units; none for images and the like, whose [`limits`](Self::limits) are alike.
+    /// Returns the channel's elements with names and units; none for images and the like, whose
+    /// [`limits`](Self::limits) are alike.
     pub fn elements(&self) -> impl Iterator<Item = Element<'a>> + use<'a> {
         let tables = self.tables;
         tables.elements(&self.record).iter().filter_map(move |row| {
@@ -344,18 +352,18 @@ impl<'a> Channel<'a> {
         })
     }
 
-    /// Element `i`.
+    /// Returns element `i` of the channel.
     pub fn element(&self, i: usize) -> Option<Element<'a>> {
         self.elements().nth(i)
     }
 
-    /// The limits of its elements. Reads no text, so it is what a control step looks at.
+    /// Returns the limits of the channel's elements. It reads no text, so a control step uses it.
     #[inline]
     pub fn limits(&self) -> impl Iterator<Item = Interval> + use<'a> {
         self.bounds().iter()
     }
 
-    /// Whether no byte is outside its limits.
+    /// Returns whether the limits admit every byte.
     #[inline]
     pub(crate) fn takes_every_byte(&self) -> bool {
         let bounds = self.bounds();

@@ -1,4 +1,5 @@
-//! What leaves the episode alone: warming up, an action for an index that the caller chose, encoding a demonstration.
+//! Calls that leave the episode unchanged: warming up, an action for an index that the caller
+//! chose, encoding a demonstration.
 
 use lads_image::records::{self, Event};
 use lads_image::{ExecError, Tables};
@@ -12,8 +13,9 @@ use crate::run::{Counters, Run};
 use crate::workspace::Workspace;
 
 impl Controller<'_, '_> {
-    /// Brings code, weights and KV caches into the processor's caches, so that the next step, whichever kind it is, is as fast as
-    /// the ones after it: for right before the first step, or after a pause. Costs two to three control steps and changes nothing.
+    /// Brings code, weights and KV caches into the processor's caches, so that the next step,
+    /// whichever kind it is, is as fast as the ones after it; call it right before the first step,
+    /// or after a pause. Costs two to three control steps and changes nothing.
     pub fn warm(&mut self) {
         if !self.workspace.fits(&self.policy) {
             return;
@@ -47,8 +49,8 @@ impl Controller<'_, '_> {
         }
     }
 
-    /// The action for what is observed and an index that the caller chose, clipped to the contract's limits. Changes nothing in
-    /// the episode under way, and needs no instruction.
+    /// Writes the action for an observation and an index that the caller chose, clipped to the
+    /// contract's limits. Changes nothing in the episode under way, and needs no instruction.
     pub fn follow(
         &mut self,
         inputs: &[(ChannelId, Data)],
@@ -83,8 +85,8 @@ impl Controller<'_, '_> {
         Ok(())
     }
 
-    /// The index that a piece of a demonstration follows, from the values of all demonstration channels. Changes nothing in the
-    /// episode under way.
+    /// Returns the index of the plan that a piece of a demonstration follows, from the values of
+    /// all demonstration channels. Changes nothing in the episode under way.
     pub fn encode(&mut self, inputs: &[(ChannelId, Data)]) -> Result<u32, EncodeError> {
         if !self.policy.encodes() {
             return Err(EncodeError::NoEncoder);
@@ -94,7 +96,8 @@ impl Controller<'_, '_> {
         Ok(selected.unwrap_or(0))
     }
 
-    /// Runs the calls of an event that leaves the episode alone: the second bank holds nothing between two steps.
+    /// Runs the calls of an event that leaves the episode unchanged: the second bank is unused
+    /// between two steps.
     fn aside(
         &mut self,
         event: Event,
@@ -114,7 +117,7 @@ impl Controller<'_, '_> {
     }
 }
 
-/// Whether a program can append to its KV cache behind the rows that count.
+/// Returns whether a program can append to its KV cache past the valid rows.
 fn has_room(tables: &Tables, entry: &records::EntryRecord, counters: &Counters) -> bool {
     let rows = tables
         .state(entry.cache as usize)

@@ -1,4 +1,4 @@
-//! Taking in an instruction.
+//! Setting the instruction of a controller.
 
 use lads_image::ExecError;
 use lads_image::records::Event;
@@ -10,7 +10,8 @@ use crate::inputs::Data;
 use crate::run::{Counters, Run};
 
 impl Controller<'_, '_> {
-    /// Follows an instruction from the next step on: a new episode, `t = 0`. Sampling and noise go on where they were.
+    /// Sets the instruction to follow from the next step on and starts a new episode at `t = 0`.
+    /// Sampling and noise continue where they were.
     ///
     /// A refused instruction changes nothing. [`InstructionError::Run`], which a sound image never causes, leaves the
     /// controller without an instruction.
@@ -52,7 +53,8 @@ impl Controller<'_, '_> {
         Ok(())
     }
 
-    /// Runs the calls of a new instruction; what they leave in KV caches and plain states is kept over resets.
+    /// Runs the calls of a new instruction; the KV caches and plain states that they fill are kept
+    /// over resets.
     fn take_in(&mut self, given: &[(ChannelId, Data)], words: u32) -> Result<(), RunError> {
         if !self.workspace.fits(&self.policy) {
             return Err(RunError::Program(ExecError::Span));

@@ -1,4 +1,4 @@
-//! One control step: what was observed in, the action out.
+//! One control step: observation in, action out.
 
 use lads_image::ExecError;
 use lads_image::records::{self, Event};
@@ -13,8 +13,8 @@ use crate::run::{Counters, Draws, Run};
 use crate::workspace::Workspace;
 
 impl Controller<'_, '_> {
-    /// One control step of a policy with a single observation channel of floats: writes the action for an observation, both in
-    /// the contract's units.
+    /// Runs one control step of a policy with a single observation channel of floats: writes the
+    /// action for an observation, both in the contract's units.
     pub fn step(
         &mut self,
         observation: &[f32],
@@ -29,8 +29,10 @@ impl Controller<'_, '_> {
         Ok(report)
     }
 
-    /// One control step of any policy: writes the action for the values of all observation channels, in any order. Values for
-    /// the noise channel, [`Policy::noise_len`](crate::Policy::noise_len) of them in the order in which they are used, take the place of the generator's.
+    /// Runs one control step of any policy: writes the action for the values of all observation
+    /// channels, given in any order. Values for the noise channel,
+    /// [`Policy::noise_len`](crate::Policy::noise_len) of them in the order in which they are used,
+    /// take the place of the generator's.
     pub fn step_with(
         &mut self,
         inputs: &[(ChannelId, Data)],
@@ -44,8 +46,9 @@ impl Controller<'_, '_> {
         Ok(report)
     }
 
-    /// Tells the controller what was really executed since the last step, where that is not the action it returned; the next
-    /// step sees it as the previous action, clipped to the contract's limits.
+    /// Tells the controller which action was executed since the last step, if it is not the one
+    /// that the step returned; the next step sees it as the previous action, clipped to the
+    /// contract's limits.
     pub fn executed(&mut self, action: &[f32]) -> Result<(), StepError> {
         self.fits(action)?;
         let contract = self.policy.contract();
@@ -64,7 +67,7 @@ impl Controller<'_, '_> {
         Ok(())
     }
 
-    /// A control step that leaves its action in the state. What is given was checked.
+    /// Runs a control step whose action stays in the state. The inputs were checked before.
     pub(crate) fn advance(
         &mut self,
         given: &[(ChannelId, Data)],
@@ -129,9 +132,10 @@ impl Controller<'_, '_> {
         })
     }
 
-    /// The timestep after this one. In a context without end it goes back, before it would overflow, to one of the same phase.
+    /// Returns the timestep after this one. In a context without end it goes back, before it would
+    /// overflow, to one of the same phase.
     fn following(&self, timestep: u32) -> u32 {
-        /// Some 24 days at a kilohertz.
+        /// Timestep at which an unbounded context goes back: some 24 days at a kilohertz.
         const FAR: u32 = 1 << 31;
         let next = timestep.saturating_add(1);
         let period = self.policy.sizes.period;

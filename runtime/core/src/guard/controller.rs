@@ -16,11 +16,13 @@ use crate::self_test::{SelfTest, SelfTestError};
 
 /// A [`Controller`] whose inputs are watched and whose output is limited.
 ///
-/// In every control period it writes an action that is finite, inside the limits, and no further from the last one than the rate
-/// allows, whatever the observation, the clock or the policy do. When the policy's action cannot be used (an [`Intervention`]) the
-/// [`Fallback`] decides what is written instead. Before the self-test has passed and an instruction is set there is nothing but the
-/// safe action. What can fail is [`GuardedController::new`], when the configuration contradicts the contract ([`GuardError`]), and a
-/// step only when the caller's action has the wrong length, so that nothing can be written.
+/// In every control period it writes an action that is finite, inside the limits, and no further
+/// from the last one than the rate allows, whatever the observation, the clock or the policy do.
+/// When the policy's action cannot be used (an [`Intervention`]) the [`Fallback`] decides what is
+/// written instead. Before the self-test has passed and an instruction is set only the safe action
+/// is written. What can fail is [`GuardedController::new`], when the configuration contradicts the
+/// contract ([`GuardError`]), and a step only when the caller's action has the wrong length, so
+/// that nothing can be written.
 ///
 /// ```no_run
 /// # use lads_core::{Controller, GuardConfig, GuardedController, Instruction, Tick};
@@ -40,7 +42,7 @@ pub struct GuardedController<'a, 'm> {
     controller: Controller<'a, 'm>,
     limiter: Limiter<'m>,
     fallback: Fallback,
-    /// Of what is left, per period, when decaying.
+    /// Fraction of the remaining distance that a decay removes per period.
     share: f32,
     late_after: u32,
     coast: u32,
@@ -48,21 +50,22 @@ pub struct GuardedController<'a, 'm> {
     stop_after: u32,
     armed: bool,
     stopped: bool,
-    /// Interventions since the last action of the policy.
+    /// Number of interventions since the last action of the policy.
     in_a_row: u32,
-    /// Periods in a row in which the last action was repeated.
+    /// Number of periods in a row in which the last action was repeated.
     coasted: u32,
     timestamp: Option<u64>,
     counters: Counters,
 }
 
 impl<'a, 'm> GuardedController<'a, 'm> {
-    /// Elements of memory that the guard needs besides the controller's workspace.
+    /// Returns the number of elements of memory that the guard needs besides the controller's
+    /// workspace.
     pub fn memory_len(policy: &Policy) -> usize {
         Limiter::memory_len(policy.contract().action_len())
     }
 
-    /// Puts a guard before a controller. It is not armed.
+    /// Wraps a controller in a guard. It is not armed.
     pub fn new(
         controller: Controller<'a, 'm>,
         config: &GuardConfig,
@@ -89,7 +92,7 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         })
     }
 
-    /// The controller behind the guard.
+    /// Returns the guarded controller.
     pub fn controller(&self) -> &Controller<'a, 'm> {
         &self.controller
     }
@@ -106,7 +109,7 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         self.armed = true;
     }
 
-    /// Whether the policy's actions are let through.
+    /// Returns whether the policy's actions are let through.
     pub fn is_armed(&self) -> bool {
         self.armed
     }
@@ -116,48 +119,50 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         self.stopped = true;
     }
 
-    /// Whether it is stopped.
+    /// Returns whether the guard is stopped.
     pub fn is_stopped(&self) -> bool {
         self.stopped
     }
 
-    /// Ends a stop. The episode goes on where it was; [`reset`](Self::reset) starts a new one.
+    /// Ends a stop. The episode continues where it was; [`reset`](Self::reset) starts a new one.
     pub fn resume(&mut self) {
         self.stopped = false;
         self.in_a_row = 0;
     }
 
-    /// What the guard has done so far.
+    /// Returns the counts since the guard was made.
     pub fn counters(&self) -> Counters {
         self.counters
     }
 
-    /// As [`Controller::set_instruction`].
+    /// Sets the instruction, like [`Controller::set_instruction`].
     pub fn set_instruction(&mut self, instruction: Instruction) -> Result<(), InstructionError> {
         self.controller.set_instruction(instruction)
     }
 
-    /// As [`Controller::set_decision`].
+    /// Changes the rule that picks an index, like [`Controller::set_decision`].
     pub fn set_decision(&mut self, decision: Decision) {
         self.controller.set_decision(decision);
     }
 
-    /// Changes where noise comes from, as [`Controller::set_noise`] does.
+    /// Changes the source of noise, like [`Controller::set_noise`].
     pub fn set_noise(&mut self, noise: Noise) {
         self.controller.set_noise(noise);
     }
 
-    /// Starts a new episode, as [`Controller::reset`] does; timestamps may start anew. A stop stays a stop.
+    /// Starts a new episode, like [`Controller::reset`]; timestamps may start anew. A stop stays a
+    /// stop.
     pub fn reset(&mut self) {
         self.controller.reset();
         self.timestamp = None;
         self.coasted = 0;
     }
 
-    /// Puts another policy in the place of this one, between two steps; the old controller is given back. The other policy has to
-    /// have the same channels and the same control period. Limits, rates and the last executed action stay, so the first
-    /// action of the new policy is no further from it than the rate allows. The guard stays armed if the new controller
-    /// has passed its self-test. Refused, the old policy goes on as if nothing had been asked.
+    /// Replaces the policy by another one, between two steps, and returns the old controller. The
+    /// other policy has to have the same channels and the same control period. Limits, rates and
+    /// the last executed action stay, so the first action of the new policy is no further from it
+    /// than the rate allows. The guard stays armed if the new controller has passed its self-test.
+    /// If the swap is refused, nothing changes.
     #[expect(
         clippy::result_large_err,
         reason = "nothing is allocated: both controllers are moved"
@@ -173,10 +178,11 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         Ok(core::mem::replace(&mut self.controller, controller))
     }
 
-    /// Takes the place of another guarded controller, between two steps, with a policy and memory of its own; the other is idle
-    /// afterwards. The other's limits, rates, fallback, counters, clock and last executed action go on here, so the first action
-    /// is no further from that one than the rate allows. It is armed if both were. Refused, nothing changes on either side, for the
-    /// reasons of [`swap`](Self::swap).
+    /// Takes over from another guarded controller, between two steps, with a policy and memory of
+    /// its own; the other is idle afterwards. The other's limits, rates, fallback, counters, clock
+    /// and last executed action continue here, so the first action is no further from that one than
+    /// the rate allows. It is armed if both were. It is refused for the reasons of
+    /// [`swap`](Self::swap); then nothing changes on either side.
     pub fn take_over(&mut self, running: &GuardedController) -> Result<(), SwapError> {
         replaceable(&running.controller, &self.controller)?;
         self.limiter.copy_from(&running.limiter);
@@ -195,13 +201,14 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         Ok(())
     }
 
-    /// As [`Controller::warm`].
+    /// Brings code, weights and KV caches into the processor's caches, like [`Controller::warm`].
     pub fn warm(&mut self) {
         self.controller.warm();
     }
 
-    /// One control period of a policy with any observation channels: writes an action that may be executed, whatever the report
-    /// says. Without a tick, an observation is neither stale nor late.
+    /// Runs one control period of a policy with any observation channels: writes an action that may
+    /// be executed, whatever the report says. Without a tick, an observation is neither stale nor
+    /// late.
     pub fn step_with(
         &mut self,
         inputs: &[(ChannelId, Data)],
@@ -216,15 +223,16 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         Ok(self.conclude(outcome, action))
     }
 
-    /// As [`Controller::executed`]; the rate counts from there. What the guard itself has changed it has told the controller.
+    /// Tells the controller which action was executed, like [`Controller::executed`]; the rate
+    /// limit counts from there. Changes by the guard itself need no such call.
     pub fn executed(&mut self, action: &[f32]) -> Result<(), StepError> {
         self.controller.executed(action)?;
         self.limiter.executed(action);
         Ok(())
     }
 
-    /// One control period: writes an action that may be executed, whatever the report says. Without a tick, an observation is
-    /// neither stale nor late.
+    /// Runs one control period: writes an action that may be executed, whatever the report says.
+    /// Without a tick, an observation is neither stale nor late.
     pub fn step(
         &mut self,
         observation: &[f32],
@@ -238,12 +246,13 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         Ok(self.conclude(outcome, action))
     }
 
-    /// One control period without an observation.
+    /// Runs one control period without an observation.
     pub fn step_blind(&mut self, action: &mut [f32]) -> Result<GuardReport, ActionLength> {
         self.step_blind_after(0, action)
     }
 
-    /// One control period without an observation, after periods that have passed without a step.
+    /// Runs one control period without an observation, after periods that have passed without a
+    /// step.
     pub fn step_blind_after(
         &mut self,
         missed: u32,
@@ -264,7 +273,7 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         }
     }
 
-    /// Everything that can be wrong before the observation is looked at.
+    /// Checks everything that can be wrong before the observation is examined.
     fn watch(&mut self, tick: Option<Tick>) -> Result<(), Intervention> {
         let missed = tick.map_or(0, |tick| tick.missed);
         self.counters.missed = self.counters.missed.saturating_add(u64::from(missed));
@@ -303,7 +312,8 @@ impl<'a, 'm> GuardedController<'a, 'm> {
             .map_err(Intervention::Refused)
     }
 
-    /// Writes what goes out, counts, and tells the controller what really happens.
+    /// Writes the final action, updates the counters, and tells the controller which action is
+    /// executed.
     fn conclude(
         &mut self,
         outcome: Result<StepReport, Intervention>,
@@ -334,7 +344,8 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         report
     }
 
-    /// Whether the last action is repeated instead of falling back: the observation is at fault, nothing else, and not for long.
+    /// Returns whether the last action is repeated instead of falling back: only the observation is
+    /// at fault, and not for too long.
     fn coasts(&self, intervention: Intervention) -> bool {
         let observation = matches!(
             intervention,
@@ -368,7 +379,7 @@ impl<'a, 'm> GuardedController<'a, 'm> {
     }
 }
 
-/// Whether a controller may take the place of another one between two steps.
+/// Checks whether one controller may take the place of another between two steps.
 fn replaceable(old: &Controller, new: &Controller) -> Result<(), SwapError> {
     let (before, after) = (old.policy().contract(), new.policy().contract());
     if before.control_period_s().to_bits() != after.control_period_s().to_bits() {
@@ -383,7 +394,8 @@ fn replaceable(old: &Controller, new: &Controller) -> Result<(), SwapError> {
     Ok(())
 }
 
-/// The first channel in which two contracts differ for those who give observations and execute actions.
+/// Returns the first channel in which two contracts differ for those who give observations and
+/// execute actions.
 fn difference(old: &Contract, new: &Contract) -> Option<u32> {
     let count = old.channels().count().max(new.channels().count());
     (0_u32..)
@@ -396,18 +408,18 @@ fn difference(old: &Contract, new: &Contract) -> Option<u32> {
         .map(|(i, ..)| i)
 }
 
-/// Why another policy did not take the place of this one.
+/// Reason why another policy did not take the place of this one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum SwapError {
-    /// It has another control period.
+    /// The control periods differ.
     ControlPeriod,
-    /// It has other channels.
+    /// The channels differ.
     Channels {
-        /// The first that differs.
+        /// Number of the first channel that differs.
         channel: u32,
     },
-    /// It has no instruction yet, and the old one has.
+    /// The new policy has no instruction yet, and the old one has.
     NoInstruction,
 }
 

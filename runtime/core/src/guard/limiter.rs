@@ -1,4 +1,4 @@
-//! The arithmetic of a guard: limits, rates, the way to the safe action.
+//! Arithmetic of a guard: limits, rates, the approach to the safe action.
 //!
 //! Invariants of a [`Limiter`]: its last action is finite and inside the limits; the safe action too. [`Limiter::write`] keeps
 //! both, and the distance to the last action, compared exactly (in `f64`), never exceeds rate times period.
@@ -8,38 +8,38 @@ use lads_kernels::assign;
 use super::GuardError;
 use crate::contract::{Contract, Interval};
 
-/// What a guard keeps an action inside of; each list has one value per element of the action.
+/// Limits that a guard enforces on an action; each list has one value per element of the action.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Limits<'c> {
-    /// Smallest values, where the contract's are not narrower.
+    /// Smallest values; the contract's apply where they are narrower.
     pub min: Option<&'c [f32]>,
-    /// Largest values, where the contract's are not narrower.
+    /// Largest values; the contract's apply where they are narrower.
     pub max: Option<&'c [f32]>,
-    /// Largest change, in units of the action per second; none unless given.
+    /// Largest change, in units of the action per second; unlimited if `None`.
     pub max_rate: Option<&'c [f32]>,
-    /// Where to go when nothing else is known, and where the first action starts from; unless given, zero or the limit nearest
-    /// to it.
+    /// Action to move to when nothing else is known, and from which the first action starts; if
+    /// `None`, zero or the limit nearest to it.
     pub safe_action: Option<&'c [f32]>,
 }
 
-/// How an action was changed on its way out.
+/// Changes made to an action before it is executed.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Changed {
     pub saturated: bool,
     pub rate_limited: bool,
 }
 
-/// One element of the action.
+/// Limits and last value of one element of the action.
 struct Slot<'s> {
     min: f32,
     max: f32,
-    /// The farthest from one action to the next; infinite for no limit.
+    /// Largest change from one action to the next; infinite for no limit.
     max_step: f32,
     safe: f32,
     last: &'s mut f32,
 }
 
-/// Limits at work, in memory of the caller.
+/// Limits in use, in memory of the caller.
 #[derive(Debug)]
 pub(super) struct Limiter<'m> {
     min: &'m mut [f32],
@@ -50,7 +50,7 @@ pub(super) struct Limiter<'m> {
 }
 
 impl<'m> Limiter<'m> {
-    /// Intervals of memory for actions of `action_len` elements.
+    /// Returns the number of elements of memory for actions of `action_len` elements.
     pub const fn memory_len(action_len: usize) -> usize {
         action_len.saturating_mul(5)
     }
@@ -101,7 +101,7 @@ impl<'m> Limiter<'m> {
         Ok(())
     }
 
-    /// Takes over another limiter's values, the last action included; both are as long.
+    /// Copies another limiter's values, the last action included; both have the same length.
     pub fn copy_from(&mut self, other: &Limiter) {
         assign(self.min, other.min);
         assign(self.max, other.max);
@@ -110,12 +110,12 @@ impl<'m> Limiter<'m> {
         assign(self.last, other.last);
     }
 
-    /// The last action that was written.
+    /// Returns the last action that was written.
     pub fn last(&self) -> &[f32] {
         self.last
     }
 
-    /// Takes an action that somebody else has executed for the last one, as far as the limits allow.
+    /// Records an action that was executed elsewhere as the last one, as far as the limits allow.
     pub fn executed(&mut self, action: &[f32]) {
         for (slot, &value) in self.slots().zip(action) {
             if value.is_finite() {
@@ -140,7 +140,8 @@ impl<'m> Limiter<'m> {
         changed
     }
 
-    /// The way from the last action to the safe one: `share` of what is left, from 0 (none) to 1 (all).
+    /// Writes the point on the way from the last action to the safe one at `share` of the distance,
+    /// from 0 (none) to 1 (all).
     pub fn write_towards_safe(&mut self, share: f32, action: &mut [f32]) -> Changed {
         for (slot, value) in self.slots().zip(action.iter_mut()) {
             *value = if share < 1.0 {
@@ -175,7 +176,7 @@ impl<'m> Limiter<'m> {
     }
 }
 
-/// What an element of the action is kept inside of.
+/// Limits of one element of the action.
 struct Row {
     min: f32,
     max: f32,
@@ -183,7 +184,7 @@ struct Row {
     safe: f32,
 }
 
-/// Whether limits can be those of a policy.
+/// Checks whether limits are valid for a policy.
 pub(super) fn check(contract: &Contract, limits: &Limits) -> Result<(), GuardError> {
     let needed = contract.action_len();
     for list in [limits.min, limits.max, limits.max_rate, limits.safe_action] {
@@ -195,7 +196,7 @@ pub(super) fn check(contract: &Contract, limits: &Limits) -> Result<(), GuardErr
     rows(contract, limits).try_for_each(|row| row.map(|_| ()))
 }
 
-/// The elements of the action, as limits that are long enough leave them.
+/// Returns the limits of each element of the action; the given limits are long enough.
 fn rows<'l>(
     contract: &Contract<'l>,
     limits: &'l Limits,
@@ -241,7 +242,7 @@ fn within(value: f32, min: f32, max: f32) -> f32 {
     }
 }
 
-/// The value nearest to `wanted` that is no further than `step` from `last`.
+/// Returns the value nearest to `wanted` that is no further than `step` from `last`.
 fn near(wanted: f32, last: f32, step: f32) -> f32 {
     let (wide, from, step) = (f64::from(wanted), f64::from(last), f64::from(step));
     if (wide - from).abs() <= step {
@@ -253,7 +254,7 @@ fn near(wanted: f32, last: f32, step: f32) -> f32 {
     }
 }
 
-/// The largest `f32` that is not above `x`.
+/// Returns the largest `f32` that is not above `x`.
 fn down(x: f64) -> f32 {
     let rounded = x as f32;
     if f64::from(rounded) > x {

@@ -1,68 +1,69 @@
-//! Why a schedule is refused.
+//! Errors of a schedule.
 
 use core::error::Error;
 use core::fmt;
 
 use lads_image::ProgramError;
 
-/// Why the parts of an image make no policy. Indices count the image's records.
+/// Reason why the parts of an image do not form a valid policy. Indices count the image's records.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum ScheduleError {
-    /// More states, or more steps of a context, than an image may have.
+    /// There are more states, or more steps of a context, than an image may have.
     TooMany,
-    /// A state is of no use, has a name twice, lies in the wrong place or lasts as its kind cannot.
+    /// A state is unused, has a name twice, lies in the wrong place or has a lifetime that its kind
+    /// does not allow.
     State {
-        /// Which one.
+        /// Number of the state.
         state: u32,
     },
-    /// An entry has no ops, or a KV cache that is none.
+    /// An entry has no ops, or names a KV cache that is not one.
     Entry {
-        /// Which one.
+        /// Number of the entry.
         entry: u32,
     },
     /// The program of an entry is not well formed.
     Program {
-        /// Which one.
+        /// Number of the entry.
         entry: u32,
-        /// What is wrong with it.
+        /// Fault of the program.
         error: ProgramError,
     },
-    /// A port is bound to nothing, or is not as long as what it is bound to.
+    /// A port is unbound, or its length differs from what it is bound to.
     Port {
-        /// Of which entry.
+        /// Number of the entry.
         entry: u32,
-        /// Its number among the inputs or outputs.
+        /// Number of the port among the inputs or outputs.
         port: u32,
-        /// Whether it is an output.
+        /// True if the port is an output.
         output: bool,
     },
-    /// A call names what is not there, or does what its event does not allow.
+    /// A call names a record that does not exist, or does what its event does not allow.
     Call {
-        /// Which one.
+        /// Number of the call.
         call: u32,
     },
-    /// An index is read and none has been selected.
+    /// An index is read before one has been selected.
     NothingSelected,
     /// A control step writes no action.
     NoAction {
-        /// At this timestep.
+        /// Timestep of the control step.
         timestep: u32,
     },
-    /// A KV cache has not the rows that the longest context needs.
+    /// A KV cache does not have the rows that the longest context needs.
     Rows {
-        /// Which state.
+        /// Number of the state.
         state: u32,
-        /// Rows that it has.
+        /// Rows that the image states.
         stated: u32,
         /// Rows that are needed.
         needed: u32,
     },
-    /// The image states another amount of work than its worst step has.
+    /// The work that the image states differs from that of its worst step.
     Work {
-        /// Multiply-adds stated.
+        /// Multiply-adds that the image states.
         stated: u64,
-        /// Multiply-adds counted.
+        /// Multiply-adds that were counted.
         counted: u64,
     },
 }

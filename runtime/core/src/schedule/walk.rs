@@ -1,4 +1,4 @@
-//! The schedule gone through step by step, as a context goes by.
+//! Walks the schedule step by step through a context.
 
 use lads_image::records::{
     self, CallRecord, EntryRecord, Event, MAX_ROW_STATES, PortRecord, Repeat, Scope, SourceKind,
@@ -9,7 +9,7 @@ use lads_image::{Chain, Tables};
 use super::{Checked, MAX_STEPS, ScheduleError, Sizes, Work};
 use crate::contract::{Contract, Role};
 
-/// The schedule on its way through a context.
+/// A walk of the schedule through a context.
 #[expect(
     clippy::struct_excessive_bools,
     reason = "facts about a step, independent of each other"
@@ -21,10 +21,10 @@ struct Walk<'t, 'a> {
     bounded: bool,
     /// Valid rows of rings and KV caches.
     rows: [u32; MAX_ROW_STATES],
-    /// The most that there were.
+    /// Largest number of valid rows so far.
     most: [u32; MAX_ROW_STATES],
     selected: bool,
-    /// Of one step, one bit per state.
+    /// States written in the current step, one bit per state.
     written: u64,
     cleared: u64,
     appended: u64,
@@ -79,7 +79,8 @@ impl Walk<'_, '_> {
         Ok(())
     }
 
-    /// How often a call runs: at least, at most at this step of a context, at most at any step.
+    /// Returns how often a call runs: at least, at most at this step of a context, at most at any
+    /// step.
     fn runs(&mut self, call: &CallRecord) -> Option<(u32, u32, u32)> {
         if call.repeat == Repeat::Times {
             return Some((call.count, call.count, call.count));
@@ -91,7 +92,7 @@ impl Walk<'_, '_> {
         Some((rows, if known { rows } else { ring.rows }, ring.rows))
     }
 
-    /// What an entry reads is there.
+    /// Checks that everything that an entry reads has been written.
     fn reads(&mut self, entry: &EntryRecord, times: u32, refused: ScheduleError) -> Checked {
         for PortRecord { source, .. } in self.tables.inputs(entry) {
             match source.kind {
@@ -118,7 +119,7 @@ impl Walk<'_, '_> {
         Ok(())
     }
 
-    /// The KV cache has room for all runs.
+    /// Checks that the KV cache has room for all runs.
     fn append(
         &mut self,
         entry: &EntryRecord,
@@ -177,7 +178,7 @@ impl Walk<'_, '_> {
         Ok(())
     }
 
-    /// The calls of one event, at a timestep.
+    /// Walks the calls of one event, at a timestep.
     fn event(&mut self, event: Event, timestep: u32) -> Checked {
         self.begin();
         let mut chain = Chain::default();
@@ -191,7 +192,7 @@ impl Walk<'_, '_> {
     }
 }
 
-/// Goes through every kind of event, and through every step of a context.
+/// Walks every kind of event, and every step of a context.
 #[inline(never)]
 pub(super) fn go_through(
     tables: &Tables,

@@ -9,7 +9,7 @@ use super::model::Model;
 use super::programs::{self, Kind};
 use super::writer::{Call, Entry, Parts};
 
-/// Entries of the image, by their number.
+/// Numbers of the image's entries.
 pub const INSTRUCT: usize = 0;
 pub const START: usize = 1;
 pub const DECIDE: usize = 2;
@@ -18,19 +18,19 @@ pub const LOOKUP: usize = 4;
 pub const ACT: usize = 5;
 pub const ENCODE: usize = 6;
 
-/// States of the image, by their number.
+/// Numbers of the image's states.
 pub const CONTEXT: u32 = 0;
 pub const LOGITS: u32 = 1;
 pub const PLAN: u32 = 2;
 
-/// Channels of the image, by their number.
+/// Numbers of the image's channels.
 pub const OBSERVATION: u32 = 0;
 pub const WORDS: u32 = 1;
 pub const OBSERVATIONS: u32 = 2;
 pub const ACTIONS: u32 = 3;
 pub const ACTION: u32 = 4;
 
-/// The entries in their order, with the programs that they are.
+/// Entries in their order, with their programs.
 const ENTRIES: [(&str, Kind); 7] = [
     ("high_level/instruct", Kind::Instruct),
     ("high_level/start", Kind::Start),
@@ -41,7 +41,7 @@ const ENTRIES: [(&str, Kind); 7] = [
     ("trajectory_encoder/encode", Kind::Encode),
 ];
 
-/// The parts of an image of a model.
+/// Returns the parts of an image of a model.
 pub fn parts(model: &Model) -> Parts {
     let spec = model.spec;
     let assembled = programs::assemble(model);
@@ -91,7 +91,8 @@ pub fn parts(model: &Model) -> Parts {
     parts.sealed()
 }
 
-/// What a port of the programs is bound to; `None` for the encoder's latent, which no image keeps.
+/// Returns the source that a port of the programs is bound to; `None` for the encoder's latent,
+/// which no image keeps.
 fn source(port: &str) -> Option<Source> {
     let (kind, of) = match port {
         "observation" => (SourceKind::Channel, OBSERVATION),

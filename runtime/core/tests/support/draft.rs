@@ -1,4 +1,4 @@
-//! A program under construction: arena is never used twice, weights go into the parts of the image.
+//! A program under construction: arena is never reused, weights go into the parts of the image.
 
 use lads_image::op::{
     self, BinaryKind, CacheFormat, IntSlot, Op, Operand, Place, Span, StateSpan, WeightSpan,
@@ -8,12 +8,12 @@ use lads_kernels::{attention_scratch_len, keys_len};
 
 use super::writer::Entry;
 
-/// A channel or a state as what a port is bound to.
+/// Makes the source of a port that is bound to a channel or a state.
 pub const fn bound(kind: SourceKind, of: u32) -> Source {
     Source { kind, of }
 }
 
-/// Words of a KV cache of `rows` rows.
+/// Returns the number of words of a KV cache of `rows` rows.
 pub fn kv_len(rows: u32, width: u32) -> u32 {
     keys_len(rows as usize, width as usize) as u32 + rows * width
 }
@@ -33,7 +33,7 @@ impl Draft {
         })
     }
 
-    /// A run appends `tokens` rows to a KV cache.
+    /// Starts a program that appends `tokens` rows to a KV cache.
     pub fn appending(name: &str, cache: u32, tokens: u32) -> Self {
         let mut draft = Self::new(name);
         (draft.0.cache, draft.0.tokens) = (cache, tokens);
@@ -68,7 +68,7 @@ impl Draft {
         span
     }
 
-    /// An integer in the slot of this number.
+    /// Binds an integer to the slot of this number.
     pub fn int(&mut self, kind: SourceKind, of: u32, slot: u8) -> IntSlot {
         self.input(bound(kind, of), Place::Int(IntSlot(slot)));
         IntSlot(slot)
@@ -90,7 +90,7 @@ impl Draft {
         self.0.ops.push(op.into());
     }
 
-    /// Element by element; an operand of one element stands for all.
+    /// Adds an op on two operands, element by element; an operand of one element is broadcast.
     pub fn binary(
         &mut self,
         kind: BinaryKind,
@@ -121,7 +121,7 @@ impl Draft {
         self.binary(BinaryKind::Mul, a, b)
     }
 
-    /// Values one behind the other.
+    /// Concatenates values.
     pub fn join(&mut self, parts: &[Span]) -> Span {
         let all = self.span(parts.iter().map(|part| part.len).sum());
         let mut offset = all.offset;
@@ -142,7 +142,7 @@ impl Draft {
         all
     }
 
-    /// Row `index + shift` of a table.
+    /// Copies row `index + shift` of a table.
     pub fn gather(
         &mut self,
         table: impl Into<Operand>,
@@ -163,7 +163,7 @@ impl Draft {
         y
     }
 
-    /// `x W` for weights that lie row-major, as a product of two operands.
+    /// Multiplies by weights, `x W`, that are stored row-major, as a product of two operands.
     pub fn product(&mut self, x: Span, w: WeightSpan) -> Span {
         let (k, n) = (x.len, w.len / x.len);
         let y = self.span(n);
@@ -181,8 +181,8 @@ impl Draft {
         y
     }
 
-    /// One head of attention in which every token is its own key, value and query; the last one's result. Without `queries` it
-    /// only records.
+    /// Adds one head of attention in which every token is its own key, value and query, and returns
+    /// the last one's result. Without `queries` it only appends to the cache.
     pub fn attend(&mut self, tokens: Span, rows: u32, queries: bool) -> Span {
         let width = tokens.len / self.0.tokens;
         let keys = keys_len(rows as usize, width as usize) as u32;

@@ -5,17 +5,17 @@ use lads_core::{GuardConfig, GuardError, GuardedController};
 use super::assemble::parts;
 use super::{Image, Memory, Model, Spec};
 
-/// In seconds, as the test policy's contract has it.
+/// Control period of the test policy's contract, in seconds.
 pub const PERIOD: f32 = 0.08;
 
-/// The policy with a recorded episode.
+/// Returns an image of the policy with a recorded episode.
 pub fn image() -> Image {
     parts(&Model::random(Spec::TINY, 11))
         .with_golden(12)
         .image()
 }
 
-/// Runs `f` on a guarded controller in memory full of what must not matter.
+/// Runs `f` on a guarded controller in memory full of garbage that must not matter.
 pub fn guarded<T>(
     config: &GuardConfig,
     f: impl FnOnce(&mut GuardedController) -> T,

@@ -17,7 +17,7 @@ use lads_core::{ChannelId, Controller, DType, Data, Instruction, Policy, PolicyE
 #[allow(unused_imports, reason = "as above")]
 pub use model::{Model, Spec};
 
-/// An image in memory that is aligned as images have to be.
+/// An image in memory with the alignment that images need.
 #[derive(Clone)]
 pub struct Image(pub Vec<u32>);
 
@@ -30,7 +30,7 @@ impl Image {
         Policy::new_checked(self.bytes()).expect("the image is sound")
     }
 
-    /// Why it is refused, if it is.
+    /// Returns why the image is refused, if it is.
     pub fn refused(&self) -> Option<PolicyError> {
         Policy::new_checked(self.bytes()).err()
     }
@@ -43,7 +43,7 @@ pub struct Memory {
 }
 
 impl Memory {
-    /// As much as the policy needs, filled with what must not matter.
+    /// Makes as much memory as the policy needs, filled with garbage that must not matter.
     pub fn for_policy(policy: &Policy) -> Self {
         Self {
             arena: vec![f32::NAN; policy.arena_len()],
@@ -88,7 +88,7 @@ impl Values {
         }
     }
 
-    /// The values as an image stores them.
+    /// Returns the values in the words that an image stores.
     pub fn words(&self) -> Vec<u32> {
         match self {
             Self::F32(values) => values.iter().map(|x| x.to_bits()).collect(),
@@ -105,7 +105,8 @@ impl Values {
     }
 }
 
-/// Random values inside the limits of every observation channel, no larger than one where the limits are wider.
+/// Returns random values inside the limits of every observation channel, no larger than one where
+/// the limits are wider.
 pub fn observe(policy: &Policy, random: &mut Random) -> Vec<(ChannelId, Values)> {
     let values = policy.contract().observations().map(|channel| {
         let floats = channel.limits().map(|limits| match channel.dtype() {
@@ -122,12 +123,13 @@ pub fn observe(policy: &Policy, random: &mut Random) -> Vec<(ChannelId, Values)>
     values.collect()
 }
 
-/// Values as a call takes them.
+/// Borrows values in the form that a call takes.
 pub fn given(values: &[(ChannelId, Values)]) -> Vec<(ChannelId, Data<'_>)> {
     values.iter().map(|(id, x)| (*id, x.data())).collect()
 }
 
-/// The softmax-weighted sum of rows, the last one being the query and each its own key and value.
+/// Returns the softmax-weighted sum of rows, the last one being the query and each its own key and
+/// value.
 pub fn attend(rows: &[Vec<f64>]) -> Vec<f64> {
     let query = rows.last().expect("there is a row");
     let scale = 1.0 / (query.len() as f64).sqrt();
@@ -156,7 +158,7 @@ pub fn wide(values: &[f32]) -> Vec<f64> {
 pub struct Random(pub u64);
 
 impl Random {
-    /// Uniform in -1..1.
+    /// Returns a number that is uniform in -1..1.
     pub fn next(&mut self) -> f32 {
         self.0 = self
             .0

@@ -1,17 +1,18 @@
-//! The smallest image of each shape that a schedule can have. Their weights are the constants here, which the twins read too.
+//! The smallest image of each shape that a schedule can have. Their weights are constants, which
+//! the reference implementations in `tests/shapes.rs` read too.
 
 use lads_image::records::{DType, Event, Fill, Role, Scope, SourceKind};
 
 use super::draft::{Draft, bound, kv_len};
 use super::writer::{Call, Parts};
 
-/// Rows of two elements for three indices.
+/// Weights with rows of two elements for three indices.
 pub const CODES: [[f32; 2]; 3] = [[0.5, -0.25], [-0.75, 0.125], [0.25, 0.875]];
 
-/// Scores of three indices are `observation · LEANS`.
+/// Weights of the scores of three indices, `observation · LEANS`.
 pub const LEANS: [[f32; 3]; 2] = [[0.5, -1.0, 0.25], [-0.5, 0.75, 1.0]];
 
-/// Rows of two elements for timesteps, passes and phases.
+/// Weights with rows of two elements for timesteps, passes and phases.
 pub const STEPS: [[f32; 2]; 6] = [
     [0.125, 0.25],
     [-0.25, 0.5],
@@ -21,10 +22,10 @@ pub const STEPS: [[f32; 2]; 6] = [
     [0.625, 0.0],
 ];
 
-/// Two words of two elements, and one.
+/// Word embeddings of two instructions: two words of two elements, and one.
 pub const WORDS: [&[f32]; 2] = [&[0.5, -1.0, 0.25, 0.75], &[-0.5, 0.25]];
 
-/// A name and an image for every shape.
+/// Returns a name and an image for every shape.
 pub fn all() -> Vec<(&'static str, Parts)> {
     vec![
         ("chunks", chunks()),
@@ -64,7 +65,7 @@ fn words(parts: &mut Parts) -> u32 {
     channel
 }
 
-/// observation -> scores
+/// Adds the entry that computes scores from the observation.
 fn score(parts: &mut Parts, logits: u32) -> u32 {
     let leans = parts.weights(LEANS.as_flattened());
     let mut score = Draft::new("high_level/step");
@@ -74,11 +75,12 @@ fn score(parts: &mut Parts, logits: u32) -> u32 {
     parts.entry(score.finish())
 }
 
-/// Two KV caches, the second of which is cleared with every selection.
+/// Makes a policy with two KV caches, the second of which is cleared with every selection.
 ///
-/// The first sees the words and one token a step, `observation + STEPS[t]`; scores are what it attends to times `LEANS`. The
-/// second sees `[code, observation]` at a selection and `[previous action, code, observation]` else; the action is what it
-/// attends to. Selections are two steps apart, contexts have four steps.
+/// The first cache sees the words and one token a step, `observation + STEPS[t]`; scores are what
+/// it attends to times `LEANS`. The second cache sees `[code, observation]` at a selection and
+/// `[previous action, code, observation]` else; the action is what it attends to. Selections are
+/// two steps apart, contexts have four steps.
 pub fn chunks() -> Parts {
     let mut parts = parts("chunks");
     let words = words(&mut parts);
@@ -150,14 +152,14 @@ pub fn chunks() -> Parts {
     parts.sealed()
 }
 
-/// How often the action is denoised.
+/// Number of times that the action is denoised.
 pub const PASSES: u32 = 3;
 
 /// Noise channel of [`denoise`].
 pub const NOISE: u32 = 2;
 
-/// Selects at every step, then denoises: `x = 0.5 n_0`, three times `x = (0.5 x + STEPS[pass]) + (0.25 n_i + CODES[index])`; the
-/// action is `x + observation`.
+/// Makes a policy that selects at every step, then denoises: `x = 0.5 n_0`, three times
+/// `x = (0.5 x + STEPS[pass]) + (0.25 n_i + CODES[index])`; the action is `x + observation`.
 pub fn denoise() -> Parts {
     let mut parts = parts("denoise");
     parts.channel("noise", Role::Noise, DType::F32, &[2], [-9.0, 9.0]);
@@ -204,7 +206,8 @@ pub fn denoise() -> Parts {
     parts.sealed()
 }
 
-/// The last three observations: the action is `(0.5 r_0 + 0.25 r_1) + r_2`, the oldest first.
+/// Makes a policy that sees the last three observations: the action is
+/// `(0.5 r_0 + 0.25 r_1) + r_2`, the oldest first.
 pub fn window(fill: Fill) -> Parts {
     let mut parts = parts("window");
     let stack = parts.ring("stack", 2, 3, fill);
@@ -230,11 +233,12 @@ pub fn window(fill: Fill) -> Parts {
     parts.sealed()
 }
 
-/// Rows of the ring of [`history`].
+/// Number of rows of the ring of [`history`].
 pub const MEMORY: u32 = 3;
 
-/// Every second step of six, a KV cache is cleared and filled with `CODES[index]` and, for every row of a ring, the row and
-/// `STEPS[pass]`. Every step appends `[previous action, observation + STEPS[phase]]` to it, and its attention is the action; then
+/// Makes a policy in which every second step of six clears a KV cache and fills it with
+/// `CODES[index]` and, for every row of a ring, the row and `STEPS[pass]`. Every step appends
+/// `[previous action, observation + STEPS[phase]]` to it, and its attention is the action; then
 /// `previous action + observation` goes into the ring.
 pub fn history() -> Parts {
     let mut parts = parts("history");
@@ -288,7 +292,8 @@ pub fn history() -> Parts {
     parts.sealed()
 }
 
-/// Every third step fills a queue, `queue[i] = observation * STEPS[i]`; the action is the row of the phase.
+/// Makes a policy in which every third step fills a queue, `queue[i] = observation * STEPS[i]`; the
+/// action is the row of the phase.
 pub fn queue() -> Parts {
     let mut parts = parts("queue");
     let queue = parts.plain("queue", Scope::Episode, 6);
@@ -310,13 +315,14 @@ pub fn queue() -> Parts {
     parts.sealed()
 }
 
-/// States of [`recurrent`].
+/// Numbers of the states of [`recurrent`].
 pub const HIDDEN: u32 = 0;
 pub const GOAL: u32 = 1;
 pub const COUNT: u32 = 2;
 
-/// `goal` is the sum of the two words; `h = (0.5 h + observation) + goal` is forgotten with the episode and the context of five
-/// steps, `count = count + 1` with the instruction; the action is `0.25 h + 0.125 count`.
+/// Makes a policy with recurrent states: `goal` is the sum of the two words;
+/// `h = (0.5 h + observation) + goal` is forgotten with the episode and the context of five steps,
+/// `count = count + 1` with the instruction; the action is `0.25 h + 0.125 count`.
 pub fn recurrent() -> Parts {
     let mut parts = parts("recurrent");
     let words = words(&mut parts);
@@ -356,7 +362,8 @@ pub fn recurrent() -> Parts {
     parts.sealed()
 }
 
-/// No memory, no instruction, contexts of three steps: the action is `observation + STEPS[t]`.
+/// Makes a policy without memory or instruction and with contexts of three steps: the action is
+/// `observation + STEPS[t]`.
 pub fn memoryless() -> Parts {
     let mut parts = parts("memoryless");
     parts.contract.context_steps = 3;
@@ -372,13 +379,13 @@ pub fn memoryless() -> Parts {
     parts.sealed()
 }
 
-/// Channels of [`camera`] besides the first two.
+/// Numbers of the channels of [`camera`] besides the first two.
 pub const CAMERA: u32 = 2;
 pub const GEAR: u32 = 3;
 pub const TICKS: u32 = 4;
 
-/// A camera of two by two pixels, a gear in an integer slot, ticks as numbers: the action is
-/// `(observation + STEPS[gear]) + (upper pixels / 256 + 0.125 ticks)`.
+/// Makes a policy with a camera of two by two pixels, a gear in an integer slot and ticks as
+/// numbers: the action is `(observation + STEPS[gear]) + (upper pixels / 256 + 0.125 ticks)`.
 pub fn camera() -> Parts {
     let mut parts = parts("camera");
     parts.channel(

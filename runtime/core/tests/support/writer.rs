@@ -1,4 +1,5 @@
-//! Writes images of version 5: a policy is described by its parts, and [`Parts::image`] lays them out as `lads_image` says.
+//! Writes images of version 5: a policy is described by its parts, and [`Parts::image`] lays them
+//! out in the format of `lads_image`.
 
 use lads_core::{Policy, PolicyError, ScheduleError};
 use lads_image::codec::{Field, Reader, Writer};
@@ -13,7 +14,7 @@ use lads_image::records::{
 
 use super::{Image, Memory, Random, Values, given, observe};
 
-/// A program and what its ports are bound to.
+/// A program and the sources that its ports are bound to.
 #[derive(Clone)]
 pub struct Entry {
     pub name: String,
@@ -92,7 +93,7 @@ impl Call {
     }
 }
 
-/// A recorded episode: what each observation channel was over all steps, in words.
+/// A recorded episode: the values of each observation channel over all steps, in words.
 #[derive(Clone)]
 pub struct Episode {
     pub record: GoldenRecord,
@@ -118,7 +119,7 @@ pub struct Parts {
 }
 
 impl Parts {
-    /// Without channels, states and calls, of a policy whose context has no end.
+    /// Makes the parts of a policy without channels, states and calls, whose context is unbounded.
     pub fn new(family: &str) -> Self {
         let none = Text::default();
         let contract = ContractRecord {
@@ -176,7 +177,8 @@ impl Parts {
         }
     }
 
-    /// Adds a channel whose values lie within `limits`. Those of floats with one axis get elements with names.
+    /// Adds a channel whose values lie within `limits`. Channels of floats with one axis get
+    /// elements with names.
     pub fn channel(
         &mut self,
         name: &str,
@@ -219,7 +221,7 @@ impl Parts {
         self.channels.len() as u32 - 1
     }
 
-    /// Adds a known instruction of whole words.
+    /// Adds a known instruction, given as whole words.
     pub fn instruction(&mut self, word_dim: usize, words: &[f32]) {
         let number = self.instructions.len();
         let record = InstructionRecord {
@@ -260,7 +262,7 @@ impl Parts {
         self.state(name, StateKind::Ring, Scope::Episode, [width, rows], fill)
     }
 
-    /// Keys and values of `words` words in all.
+    /// Adds a KV cache of keys and values of `words` words in all.
     pub fn kv(&mut self, name: &str, words: u32, rows: u32) -> u32 {
         self.state(
             name,
@@ -276,7 +278,7 @@ impl Parts {
         self.entries.len() as u32 - 1
     }
 
-    /// Puts the states one behind the other and states the work of the worst step.
+    /// Places the states consecutively and states the work of the worst step.
     pub fn sealed(mut self) -> Self {
         let cleared: Vec<u32> = self
             .calls
@@ -303,7 +305,8 @@ impl Parts {
         self
     }
 
-    /// With a recorded episode of `steps` control steps of the last known instruction, made by the policy itself.
+    /// Adds a recorded episode of `steps` control steps of the last known instruction, made by the
+    /// policy itself.
     pub fn with_golden(mut self, steps: usize) -> Self {
         self.golden = None;
         let image = self.image();
@@ -457,14 +460,14 @@ impl Parts {
         image
     }
 
-    /// Why the image is refused after `edit`, if it is.
+    /// Returns why the image is refused after `edit`, if it is.
     pub fn refused(&self, edit: impl FnOnce(&mut Self)) -> Option<PolicyError> {
         let mut parts = self.clone();
         edit(&mut parts);
         parts.image().refused()
     }
 
-    /// The same of the schedule, which has to be what is at fault.
+    /// Returns the fault of the schedule after `edit`; another fault is a panic.
     pub fn fault(&self, edit: impl FnOnce(&mut Self)) -> Option<ScheduleError> {
         match self.refused(edit) {
             None => None,
@@ -473,7 +476,7 @@ impl Parts {
         }
     }
 
-    /// The fault that is left when states and work are put right after `edit`.
+    /// Returns the fault that is left when states and work are corrected after `edit`.
     pub fn sealed_fault(&self, edit: impl FnOnce(&mut Self)) -> Option<ScheduleError> {
         let mut parts = self.clone();
         edit(&mut parts);
@@ -481,7 +484,7 @@ impl Parts {
     }
 }
 
-/// A record whose words are all zero.
+/// Makes a record whose words are all zero.
 fn zeros<T: Field>() -> T {
     T::take(&mut Reader::new(&vec![0; T::WORDS])).expect("zeros mean something")
 }
@@ -492,7 +495,7 @@ fn put<T: Field>(out: &mut Vec<u32>, value: &T) {
     value.put(&mut Writer::new(&mut out[start..]));
 }
 
-/// The words of the header that hold a section's offset and length.
+/// Returns the words of the header that hold a section's offset and length.
 pub fn section_row(tag: Tag) -> [usize; 2] {
     let row = Tag::ALL
         .iter()
@@ -501,7 +504,7 @@ pub fn section_row(tag: Tag) -> [usize; 2] {
     [TABLE_WORD + 3 * row + 1, TABLE_WORD + 3 * row + 2]
 }
 
-/// Opens with whatever work it takes.
+/// Counts the work of the worst step, by opening the image without a limit.
 pub fn counted_work(parts: &Parts) -> u64 {
     let image = parts.image();
     Policy::new_within(image.bytes(), u64::MAX)
