@@ -1,40 +1,40 @@
-//! Which elements of the arena an op reads and writes: what a memory plan is proven with.
+//! Arena elements that an op reads and writes, from which a memory plan is proven.
 //!
-//! An [`Access`] is exact: gaps between strided elements are no part of it. The order of an op's accesses and of their elements
-//! depends on the op's shape alone, so the accesses of an op before and after its spans were moved pair off. Numbers saturate;
-//! nothing here can fail.
+//! An [`Access`] is exact: gaps between strided elements are not part of it. The order of an op's
+//! accesses and of their elements depends on the op's shape alone, so the accesses of an op before
+//! and after its spans were moved pair off. Numbers saturate; nothing here can fail.
 
 use crate::place::{Operand, Span};
 
-/// What an op does to the elements of an [`Access`].
+/// Use that an op makes of the elements of an [`Access`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum AccessKind {
-    /// Reads them, before it writes anything.
+    /// The op reads the elements before it writes anything.
     Read,
-    /// Writes them; scratch is written.
+    /// The op writes the elements; scratch counts as written.
     Write,
 }
 
-/// Strided elements: `offset + i * strides[0] + ..` for all indices below `dims`.
+/// Strided elements of the arena: `offset + i * strides[0] + ..` for all indices below `dims`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Access {
-    /// What is done to them.
+    /// Use of the elements.
     pub kind: AccessKind,
-    /// The first element.
+    /// Offset of the first element.
     pub offset: u32,
-    /// How many there are in each dimension.
+    /// Number of elements in each dimension.
     pub dims: [u32; 4],
-    /// Elements from one to the next in each dimension.
+    /// Distance from one element to the next in each dimension.
     pub strides: [u32; 4],
 }
 
 impl Access {
-    /// All elements of a span.
+    /// Makes an access to all elements of a span.
     pub const fn all(kind: AccessKind, span: Span) -> Self {
         Self::strided(kind, span, [1, 1, 1, span.len], [0, 0, 0, 1])
     }
 
-    /// Elements from the start of a span.
+    /// Makes an access to strided elements from the start of a span.
     pub const fn strided(kind: AccessKind, span: Span, dims: [u32; 4], strides: [u32; 4]) -> Self {
         Self {
             kind,
@@ -44,14 +44,14 @@ impl Access {
         }
     }
 
-    /// Rows that start `stride` elements apart, the last of which ends the span.
+    /// Makes an access to rows that start `stride` elements apart, the last of which ends the span.
     pub const fn rows(kind: AccessKind, span: Span, rows: u32, stride: u32) -> Self {
         let before = rows.saturating_sub(1).saturating_mul(stride);
         let width = span.len.saturating_sub(before);
         Self::strided(kind, span, [1, 1, rows, width], [0, 0, stride, 1])
     }
 
-    /// The elements, in row-major order.
+    /// Returns the indices of the elements, in row-major order.
     pub fn elements(self) -> impl Iterator<Item = usize> {
         let [a, b, c, d] = self.dims;
         let [sa, sb, sc, sd] = self.strides;
@@ -62,19 +62,19 @@ impl Access {
     }
 }
 
-/// `dim` elements from `start`.
+/// Returns `dim` indices, `stride` apart, from `start`.
 fn steps(start: usize, dim: u32, stride: u32) -> impl Iterator<Item = usize> {
     (0..dim as usize).map(move |i| start.saturating_add(i.saturating_mul(stride as usize)))
 }
 
-/// Reads all of an operand that lies in the arena.
+/// Reports a read of all of an operand that lies in the arena.
 pub(crate) fn read(operand: Operand, see: &mut dyn FnMut(Access)) {
     if let Some(span) = operand.arena() {
         see(Access::all(AccessKind::Read, span));
     }
 }
 
-/// Reads strided elements of an operand that lies in the arena.
+/// Reports a read of strided elements of an operand that lies in the arena.
 pub(crate) fn read_strided(
     operand: Operand,
     dims: [u32; 4],
@@ -86,12 +86,12 @@ pub(crate) fn read_strided(
     }
 }
 
-/// Writes all of a span.
+/// Reports a write of all of a span.
 pub(crate) fn write(span: Span, see: &mut dyn FnMut(Access)) {
     see(Access::all(AccessKind::Write, span));
 }
 
-/// Visits a span that is not empty.
+/// Visits a span unless it is empty.
 pub(crate) fn visit_span(span: &mut Span, visit: &mut dyn FnMut(&mut Span)) {
     if span.len > 0 {
         visit(span);

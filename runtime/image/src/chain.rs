@@ -1,16 +1,17 @@
-//! Which calls of an event run at a timestep: if, else if, else.
+//! Selects the calls of an event that run at a timestep: if, else if, else.
 
 use crate::records::{CallRecord, Event, When};
 use crate::tables::Tables;
 
-/// The calls of one event, gone through in order at one timestep.
+/// State of one pass over the calls of an event, in order, at one timestep.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Chain {
     taken: bool,
 }
 
 impl Chain {
-    /// Whether the next call of the event runs at a timestep. One that is to run every 0 steps, which no sound image has, runs at 0.
+    /// Returns whether the next call of the event runs at a timestep. A period of 0 steps, which no
+    /// sound image has, means timestep 0 only.
     #[inline]
     pub fn runs(&mut self, call: &CallRecord, timestep: u32) -> bool {
         let due = match call.when {
@@ -25,8 +26,8 @@ impl Chain {
 }
 
 impl<'a> Tables<'a> {
-    /// The calls of an event that run at a timestep, in order. The calls of each event stand together in a sound image; what does not
-    /// is left out.
+    /// Returns the calls of an event that run at a timestep, in order. In a sound image the calls
+    /// of each event are consecutive; others are left out.
     #[inline]
     pub fn due(&self, event: Event, timestep: u32) -> impl Iterator<Item = CallRecord> + use<'a> {
         let mut chain = Chain::default();

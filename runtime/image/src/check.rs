@@ -1,7 +1,9 @@
-//! What the checks of the ops are made of: spans inside their spaces, lengths as the shape says, nothing written that is also read.
+//! Building blocks of the op checks: spans inside their spaces, lengths that match the shape, no
+//! written element that is also read.
 //!
-//! Numbers come from an image that may be hostile, so products are taken in 128 bits, where four 32-bit factors fit. Every check
-//! ends in a [`Fault`] or in nothing; [`Checker`] also keeps how much of the arena and of the cache is used.
+//! Numbers come from an image that may be hostile, so products are taken in 128 bits, where four
+//! 32-bit factors fit. Every check returns a [`Fault`] or nothing; [`Checker`] also tracks how much
+//! of the arena and of the cache is used.
 
 use core::cell::Cell;
 use core::error::Error;
@@ -9,35 +11,36 @@ use core::fmt;
 
 use crate::place::{INT_SLOTS, Operand, Place, Space, Span, StateSpan, WeightSpan};
 
-/// The spaces that a program's spans point into.
+/// Sizes of the spaces that a program's spans point into.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Spaces {
-    /// Words of weights in the image.
+    /// Number of 4-byte words of weights in the image.
     pub weights_len: usize,
-    /// Words of the entry's KV state.
+    /// Number of 4-byte words of the entry's KV state.
     pub cache_len: usize,
-    /// Rows that the KV state holds: tokens of the longest context.
+    /// Number of rows that the KV state holds: tokens of the longest context.
     pub rows: usize,
 }
 
-/// What is wrong with a program or one of its ops.
+/// Fault of a program or of one of its ops.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fault {
-    /// Words that mean no op.
+    /// The words do not decode to an op.
     Encoding,
-    /// An op, or a format of its numbers, that this build was made without.
+    /// The op, or a format of its numbers, was left out of this build.
     LeftOut,
     /// A span is empty or reaches beyond its space, or an integer slot does not exist.
     Bounds,
-    /// A span is not as long as the shape says, or a dimension is zero.
+    /// A span does not have the length of the shape, or a dimension is zero.
     Shape,
-    /// What is written overlaps what is read.
+    /// A written span overlaps one that is read.
     Overlap,
-    /// An attention takes the KV state for one of another number of rows, or appends more rows than there are.
+    /// An attention assumes another number of rows than the KV state has, or appends more rows than
+    /// there are.
     Capacity,
-    /// An attention appends another number of tokens than its program.
+    /// An attention appends another number of tokens than its program states.
     Tokens,
-    /// The arena is larger than what lies in it.
+    /// The arena is larger than the spans in it need.
     Arena,
 }
 
@@ -64,13 +67,13 @@ pub(crate) fn require(condition: bool, fault: Fault) -> Checked {
     if condition { Ok(()) } else { Err(fault) }
 }
 
-/// `len` is the product of `dims`, none of which is zero.
+/// Checks that `len` is the product of `dims`, none of which is zero.
 pub(crate) fn exactly<const N: usize>(len: u32, dims: [u32; N]) -> Checked {
     let product: u128 = dims.into_iter().map(u128::from).product();
     require(product != 0 && product == u128::from(len), Fault::Shape)
 }
 
-/// A strided layout stays inside `len` elements.
+/// Checks that a strided layout stays inside `len` elements.
 pub(crate) fn reaches<const N: usize>(len: u32, dims: [u32; N], strides: [u32; N]) -> Checked {
     let last: u128 = dims
         .into_iter()
@@ -80,13 +83,13 @@ pub(crate) fn reaches<const N: usize>(len: u32, dims: [u32; N], strides: [u32; N
     require(last < u128::from(len), Fault::Shape)
 }
 
-/// `offset..offset + len` lies inside `0..space` and is not empty.
+/// Checks that `offset..offset + len` lies inside `0..space` and is not empty.
 fn inside(offset: u32, len: u32, space: usize) -> Checked {
     let end = u64::from(offset).saturating_add(u64::from(len));
     require(len != 0 && end <= space as u64, Fault::Bounds)
 }
 
-/// Moves `end` to the end of a span that lies behind it.
+/// Extends `end` to cover the span `offset..offset + len`.
 fn reach(end: &Cell<u64>, offset: u32, len: u32) {
     end.set(
         end.get()
@@ -99,7 +102,7 @@ pub(crate) fn overlap(a: [u32; 2], b: [u32; 2]) -> bool {
     u64::from(a[0]) < end(b) && u64::from(b[0]) < end(a)
 }
 
-/// `y` overlaps none of the spans.
+/// Checks that `y` overlaps none of the spans.
 pub(crate) fn apart<const N: usize>(y: Span, xs: [Span; N]) -> Checked {
     let clash = xs
         .into_iter()
@@ -107,7 +110,8 @@ pub(crate) fn apart<const N: usize>(y: Span, xs: [Span; N]) -> Checked {
     require(!clash, Fault::Overlap)
 }
 
-/// Checks ops against the spaces of one program, and keeps how much of the spaces in memory they use.
+/// Checks ops against the spaces of one program, and tracks how much of the spaces in memory they
+/// use.
 #[derive(Debug)]
 pub struct Checker {
     pub(crate) spaces: Spaces,
@@ -118,7 +122,7 @@ pub struct Checker {
 }
 
 impl Checker {
-    /// Nothing is used yet of a program with this arena, whose run appends so many tokens.
+    /// Makes a checker for a program with this arena, a run of which appends `tokens` tokens.
     pub fn new(spaces: Spaces, arena_len: u32, tokens: u32) -> Self {
         Self {
             spaces,
@@ -129,8 +133,9 @@ impl Checker {
         }
     }
 
-    /// The end of what is used of the cache, once every op and port was checked. Every element of the arena belongs to something:
-    /// an image cannot ask for memory that it does not use.
+    /// Returns the end of the used part of the cache, once every op and port was checked. Fails
+    /// unless the last used element is the arena's last: an image cannot ask for memory that it
+    /// does not use.
     pub fn finish(&self) -> Result<u64, Fault> {
         require(
             self.arena_end.get() == u64::from(self.arena_len),
@@ -139,7 +144,7 @@ impl Checker {
         Ok(self.cache_end.get())
     }
 
-    /// Checks where a value at the edge of a program lives.
+    /// Checks the place of a program's input or output.
     pub fn place(&self, place: Place) -> Result<(), Fault> {
         match place {
             Place::Span(span) => self.arena(span),
@@ -173,7 +178,7 @@ impl Checker {
         }
     }
 
-    /// `y` lies in the arena and apart from the operand.
+    /// Checks that `y` lies in the arena and apart from the operand.
     pub(crate) fn result(&self, y: Span, x: Operand) -> Checked {
         self.operand(x)?;
         self.arena(y)?;

@@ -1,16 +1,16 @@
-//! Fixed-size records as little-endian `u32` words: how ops and the tables of an image are written and read.
+//! Encoding of fixed-size records as little-endian `u32` words, for ops and the tables of an image.
 //!
-//! A record is a struct whose fields are put one after the other, each in a fixed number of words. Writing cannot fail (the
-//! sizes are compared at compile time); reading fails with `None` on a discriminant that means nothing, so that what was
-//! read can be written again bit for bit.
+//! A record is a struct whose fields are written one after the other, each in a fixed number of
+//! words. Writing cannot fail (the sizes are compared at compile time); reading fails with `None`
+//! on an unknown discriminant, so a record that was read is written again bit for bit.
 
 use core::slice;
 
-/// The words of one record still to be written.
+/// Writer over the words of one record that are not yet written.
 pub struct Writer<'b>(slice::IterMut<'b, u32>);
 
 impl<'b> Writer<'b> {
-    /// Writes into `words` from the first on.
+    /// Writes into `words` from the first word on.
     pub fn new(words: &'b mut [u32]) -> Self {
         Self(words.iter_mut())
     }
@@ -23,21 +23,21 @@ impl<'b> Writer<'b> {
     }
 }
 
-/// The words of one record still to be read.
+/// Reader over the words of one record that are not yet read.
 pub struct Reader<'b>(slice::Iter<'b, u32>);
 
 impl<'b> Reader<'b> {
-    /// Reads `words` from the first on.
+    /// Reads `words` from the first word on.
     pub fn new(words: &'b [u32]) -> Self {
         Self(words.iter())
     }
 
-    /// The next word, or `None` at the end.
+    /// Returns the next word, or `None` at the end.
     pub fn word(&mut self) -> Option<u32> {
         self.0.next().copied()
     }
 
-    /// True when every word that is left is zero, as a record leaves the words that it does not use.
+    /// Returns true if every remaining word is zero, as records leave their unused words.
     pub fn rest_is_zero(self) -> bool {
         self.0.into_iter().all(|&word| word == 0)
     }
@@ -45,13 +45,13 @@ impl<'b> Reader<'b> {
 
 /// A value with a fixed number of words.
 pub trait Field: Copy {
-    /// How many words the value takes.
+    /// Number of words that the value takes.
     const WORDS: usize;
 
     /// Appends the value.
     fn put(&self, out: &mut Writer);
 
-    /// Reads the value; `None` when the words mean nothing.
+    /// Reads the value; `None` if the words are not a valid encoding.
     fn take(from: &mut Reader) -> Option<Self>;
 }
 
@@ -116,7 +116,7 @@ impl Field for bool {
     }
 }
 
-/// A flag word, then the value; all zero when there is none.
+/// Encoded as a flag word, then the value; all zero for `None`.
 impl<T: Field> Field for Option<T> {
     const WORDS: usize = 1 + T::WORDS;
     fn put(&self, out: &mut Writer) {
@@ -189,7 +189,7 @@ macro_rules! word_enum {
         pub enum $name { $($(#[$variant_meta])* $variant = $value,)* }
 
         impl $name {
-            /// Every value, in the order of the discriminants.
+            /// All values, in the order of the discriminants.
             pub const ALL: &'static [Self] = &[$(Self::$variant,)*];
         }
 

@@ -1,7 +1,8 @@
 //! The frame of an image: header, table of sections, checksum.
 //!
-//! An image is little-endian, starts on a 4-byte boundary (64 is better: weight panels then never straddle cache lines) and
-//! is a whole number of 4-byte words. It needs no relocation: it may lie in flash, in a mapped file or in a `static`.
+//! An image is little-endian, starts on a 4-byte boundary (64 is better: weight panels then never
+//! straddle cache lines) and is a whole number of 4-byte words. It needs no relocation: it may be
+//! in flash, in a mapped file or in a `static`.
 //!
 //! ```text
 //! word 0   MAGIC
@@ -17,8 +18,9 @@
 //! [`Tag`] and skips tags that it does not know, so that a later version can add one. What the sections hold is described in
 //! [`records`](crate::records).
 //!
-//! [`Layout`] computes offsets, [`Layout::header`] the header and [`crc32`] the checksum, so a writer only fills records.
-//! What can fail: [`Sections::new`], on a header or a table that makes no sense ([`FormatError`]).
+//! [`Layout`] computes offsets, [`Layout::header`] the header and [`crc32`] the checksum, so a
+//! writer only fills records. What can fail: [`Sections::new`], on an invalid header or table
+//! ([`FormatError`]).
 
 use core::error::Error;
 use core::fmt;
@@ -31,19 +33,19 @@ pub const MAGIC: u32 = u32::from_le_bytes(*b"LADS");
 /// Version of the format that this crate describes.
 pub const VERSION: u32 = 5;
 
-/// Words of the header, the table of sections included.
+/// Number of words of the header, the table of sections included.
 pub const HEADER_WORDS: usize = 64;
 
-/// Header word of the checksum.
+/// Index of the header word that holds the checksum.
 pub const CRC_WORD: usize = 3;
 
-/// Header word of the number of sections.
+/// Index of the header word that holds the number of sections.
 pub const COUNT_WORD: usize = 4;
 
-/// Header word of the first row of the section table.
+/// Index of the header word that starts the section table.
 pub const TABLE_WORD: usize = 8;
 
-/// The most sections that the header has room for.
+/// Largest number of sections that the header has room for.
 pub const MAX_SECTIONS: usize = (HEADER_WORDS - TABLE_WORD) / 3;
 
 /// Alignment of the weights inside the image, in bytes.
@@ -51,13 +53,13 @@ pub const WEIGHTS_ALIGN: usize = 64;
 
 macro_rules! tags {
     ($($(#[$meta:meta])* $name:ident = $text:literal,)*) => {
-        /// The name of a section: four ASCII letters.
+        /// Name of a section: four ASCII letters.
         #[derive(Debug, Clone, Copy, PartialEq, Eq)]
         #[repr(u32)]
         pub enum Tag { $($(#[$meta])* $name = u32::from_le_bytes(*$text),)* }
 
         impl Tag {
-            /// Every tag, in the order in which a writer lays the sections.
+            /// Every tag, in the order in which a writer places the sections.
             pub const ALL: &'static [Self] = &[$(Self::$name,)*];
         }
     };
@@ -82,29 +84,31 @@ tags! {
     Ports = b"PORT",
     /// [`CallRecord`](crate::records::CallRecord)s: the schedule.
     Calls = b"CALL",
-    /// Indices of states, one word each: what the calls clear.
+    /// Indices of the states that calls clear, one word each.
     Clears = b"CLRS",
-    /// [`OP_WORDS`](crate::OP_WORDS) words per op, the entries' ops one after the other.
+    /// Encoded ops, [`OP_WORDS`](crate::OP_WORDS) words each, the entries' ops one after the other.
     Ops = b"OPS ",
-    /// Packed panels in the format that their ops say, biases, tables, words of the known instructions.
+    /// Packed panels in the format that their ops state, biases, tables, words of the known
+    /// instructions.
     Weights = b"WGTS",
-    /// Empty, or a [`GoldenRecord`](crate::records::GoldenRecord) and what it describes.
+    /// Empty, or a [`GoldenRecord`](crate::records::GoldenRecord) and the episode that it
+    /// describes.
     Golden = b"GOLD",
 }
 
-/// How many sections this version has.
+/// Number of sections of this version.
 pub const SECTIONS: usize = Tag::ALL.len();
 
-/// Where a section lies: `offset` and `len` in bytes, both whole words.
+/// Location of a section: `offset` and `len` in bytes, both whole words.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct SectionSpan {
-    /// First byte.
+    /// Offset of the section's first byte.
     pub offset: usize,
-    /// Bytes.
+    /// Length of the section in bytes.
     pub len: usize,
 }
 
-/// Where the sections of an image lie.
+/// Locations of the sections of an image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Layout {
     sections: [SectionSpan; SECTIONS],
@@ -112,8 +116,9 @@ pub struct Layout {
 }
 
 impl Layout {
-    /// Lays sections of these lengths, in bytes, whole words and in the order of [`Tag::ALL`], one after the other. `None` when
-    /// a length is no whole number of words or the image would not fit 32-bit offsets.
+    /// Places sections of these lengths, in bytes, whole words and in the order of [`Tag::ALL`],
+    /// one after the other. Returns `None` if a length is not a multiple of 4 or the image would
+    /// not fit 32-bit offsets.
     pub fn new(lens: [usize; SECTIONS]) -> Option<Self> {
         let mut sections = [SectionSpan::default(); SECTIONS];
         let mut end = HEADER_WORDS * 4;
@@ -137,7 +142,7 @@ impl Layout {
         })
     }
 
-    /// Where a section lies.
+    /// Returns the location of a section.
     pub fn section(&self, tag: Tag) -> SectionSpan {
         Tag::ALL
             .iter()
@@ -146,12 +151,13 @@ impl Layout {
             .map_or_else(SectionSpan::default, |(_, span)| span)
     }
 
-    /// Bytes of the image.
+    /// Returns the length of the image in bytes.
     pub fn total_bytes(&self) -> usize {
         self.total_bytes
     }
 
-    /// The header, its checksum still zero: write [`crc32`] of the whole image to word [`CRC_WORD`] last.
+    /// Returns the header with a checksum of zero: write [`crc32`] of the whole image to word
+    /// [`CRC_WORD`] last.
     pub fn header(&self) -> [u32; HEADER_WORDS] {
         let mut words = [0; HEADER_WORDS];
         let mut out = Writer::new(&mut words);
@@ -176,7 +182,7 @@ impl Layout {
     }
 }
 
-/// The sections of an image whose header is what it should be.
+/// The sections of an image whose header was checked.
 #[derive(Debug, Clone, Copy)]
 pub struct Sections<'a> {
     image: &'a [u32],
@@ -184,7 +190,7 @@ pub struct Sections<'a> {
 }
 
 impl<'a> Sections<'a> {
-    /// Checks the table of sections: whole words, inside the image, one behind the other.
+    /// Checks the table of sections: whole words, inside the image, in order, without overlaps.
     pub fn new(image: &'a [u32]) -> Result<Self, FormatError> {
         let count = image.get(COUNT_WORD).copied().unwrap_or(0) as usize;
         if count > MAX_SECTIONS {
@@ -213,7 +219,7 @@ impl<'a> Sections<'a> {
         Ok(Self { image, table })
     }
 
-    /// The words of a section; empty when the image has none of this tag.
+    /// Returns the words of a section; empty when the image has none of this tag.
     pub fn get(&self, tag: Tag) -> &'a [u32] {
         let row = self.table.iter().find(|[found, ..]| *found == tag as u32);
         let Some(&[_, offset, len]) = row else {
@@ -226,7 +232,7 @@ impl<'a> Sections<'a> {
     }
 }
 
-/// The image's own length in bytes, from a header that begins as it should.
+/// Reads the image's own length in bytes from its header, whose magic and version are checked.
 pub fn total_bytes(image: &[u8]) -> Result<usize, FormatError> {
     let short = FormatError::Truncated {
         got: image.len(),
@@ -248,24 +254,24 @@ pub fn total_bytes(image: &[u8]) -> Result<usize, FormatError> {
     Ok(total)
 }
 
-/// Why the frame of an image was refused.
+/// Reason why the frame of an image was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum FormatError {
     /// The image ends too early.
     Truncated {
-        /// Bytes that there are.
+        /// Number of bytes given.
         got: usize,
-        /// Bytes that there should be.
+        /// Number of bytes needed.
         needed: usize,
     },
-    /// The first word is another one: this is no program image.
+    /// The first word is not [`MAGIC`]: the bytes are not a program image.
     Magic,
-    /// The image has another version.
+    /// The image has another version than [`VERSION`].
     Version(u32),
-    /// The length in the header makes no sense.
+    /// The length in the header is invalid.
     Length,
-    /// The table of sections makes no sense.
+    /// The table of sections is invalid.
     Table,
 }
 
@@ -288,7 +294,7 @@ impl fmt::Display for FormatError {
 
 impl Error for FormatError {}
 
-/// What each value of a byte does to the checksum: the reflected polynomial, bit by bit.
+/// Checksum contribution of each value of a byte: the reflected polynomial, bit by bit.
 const CRC_TABLE: [u32; 256] = {
     let mut table = [0; 256];
     let mut rest: &mut [u32] = &mut table;
@@ -307,7 +313,8 @@ const CRC_TABLE: [u32; 256] = {
     table
 };
 
-/// CRC-32 (IEEE 802.3, the one of zip and PNG) of an image, its checksum word taken as zero.
+/// Computes the CRC-32 (IEEE 802.3, the one of zip and PNG) of an image, its checksum word taken as
+/// zero.
 #[inline]
 pub fn crc32(image: &[u8]) -> u32 {
     let byte_in = |crc: u32, byte: u8| {

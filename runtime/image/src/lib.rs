@@ -1,12 +1,14 @@
-//! The program image's format and its operations: what the compiler writes and `lads-core` runs.
+//! The program image's format and its operations: the compiler writes images, `lads-core` runs
+//! them.
 //!
 //! - [`codec`] writes and reads records of 32-bit words, [`place`] says where the values of a program live.
 //! - [`op`] is the table of operations, one file each behind [`Operation`]: record, check, run, accesses, work.
 //! - [`Program::new_checked`] checks a list of encoded ops once; [`Program::run`] runs them on a [`Machine`].
 //! - [`Access`] tells the verifier of memory plans which elements an op touches.
 //!
-//! Invariants: no `std`, no allocation, no unsafe code, no panic, whatever the words of an image say. What was checked can fail
-//! on two accounts when it runs: an index outside its table and a full KV cache ([`ExecError`]).
+//! Invariants: no `std`, no allocation, no unsafe code, no panic, whatever the words of an image
+//! say. A checked program can fail in two ways when it runs: by an index outside its table and by a
+//! full KV cache ([`ExecError`]).
 #![no_std]
 #![forbid(unsafe_code)]
 #![cfg_attr(

@@ -1,7 +1,8 @@
-//! The memory that a program runs in, and what can go wrong there.
+//! Memory that a program runs in, and the errors of a run.
 //!
-//! Running is blind: bounds, shapes and overlaps were checked by [`Program::new_checked`](crate::Program::new_checked). Slices are
-//! still taken with `get`, because this crate has no unsafe code; a span that is not there ends the run with [`ExecError::Span`],
+//! A run checks nothing again: bounds, shapes and overlaps were checked by
+//! [`Program::new_checked`](crate::Program::new_checked). Slices are still taken with `get`,
+//! because this crate has no unsafe code; a missing span ends the run with [`ExecError::Span`],
 //! which a checked program in memory of the right size never does.
 
 use core::error::Error;
@@ -11,21 +12,21 @@ use lads_kernels::Isa;
 
 use crate::place::{INT_SLOTS, IntSlot, Operand, Space, Span};
 
-/// Why a run ended early.
+/// Reason why a run ended early.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ExecError {
-    /// A table has no row of this index: the timestep or an index is outside what the policy was made for.
+    /// An index is outside its table: the timestep or an index is outside the range of the policy.
     Index {
-        /// The row that was asked for.
+        /// Row that was asked for.
         row: i64,
-        /// Rows of the table.
+        /// Number of rows of the table.
         rows: u32,
     },
     /// The KV cache has no room for the tokens of another run.
     Full {
-        /// Rows of the cache.
+        /// Number of rows of the cache.
         rows: usize,
-        /// Rows that it had to have.
+        /// Number of rows needed.
         needed: usize,
     },
     /// A span lies outside the memory that was given.
@@ -49,26 +50,26 @@ impl Error for ExecError {}
 /// The memory that programs run in.
 #[derive(Debug)]
 pub struct Machine<'m> {
-    /// At least as many elements as the program's arena.
+    /// Scratch memory, at least as many elements as the program's arena.
     pub arena: &'m mut [f32],
     /// The KV cache of the entry that runs: spans of attention are relative to it.
     pub cache: &'m mut [f32],
-    /// Timesteps and indices.
+    /// Integer slots: timesteps and indices.
     pub ints: [u32; INT_SLOTS],
-    /// Valid rows of `cache` before the run.
+    /// Number of valid rows of `cache` before the run.
     pub past: usize,
-    /// What the kernels run on.
+    /// Instruction set that the kernels run on.
     pub isa: Isa,
 }
 
 impl Machine<'_> {
-    /// An integer.
+    /// Returns the integer in a slot.
     #[inline]
     pub fn int(&self, slot: IntSlot) -> u32 {
         self.ints.get(usize::from(slot.0)).copied().unwrap_or(0)
     }
 
-    /// Sets an integer.
+    /// Sets the integer in a slot.
     #[inline]
     pub fn set_int(&mut self, slot: IntSlot, value: u32) {
         if let Some(int) = self.ints.get_mut(usize::from(slot.0)) {
@@ -77,7 +78,7 @@ impl Machine<'_> {
     }
 }
 
-/// What an op reads: the weights, and the arena without the span that the op writes.
+/// Memory that an op may read: the weights, and the arena without the span that the op writes.
 pub(crate) struct Readable<'r> {
     weights: &'r [f32],
     below: &'r [f32],
@@ -86,7 +87,7 @@ pub(crate) struct Readable<'r> {
 }
 
 impl<'r> Readable<'r> {
-    /// Cuts the result out of the arena.
+    /// Splits the result's span from the arena.
     #[inline]
     pub fn cut(
         weights: &'r [f32],
@@ -111,7 +112,7 @@ impl<'r> Readable<'r> {
         ))
     }
 
-    /// The elements of an operand; an error when they are not there, or are the result's.
+    /// Returns the elements of an operand; an error if they are missing, or belong to the result.
     #[inline]
     pub fn get(&self, operand: Operand) -> Result<&'r [f32], ExecError> {
         let range = operand.range();

@@ -1,17 +1,20 @@
-//! The operations of a program: what each computes, on which elements, and how it is written into an image.
+//! Operations of a program: what each computes, on which elements, and how it is encoded in an
+//! image.
 //!
-//! A program is a list of [`Op`]s over one arena of `f32` elements. Every shape is static but one: the number of tokens
-//! already in the KV cache, `P`, which only [`Attention`] sees. Every offset and length counts elements.
+//! A program is a list of [`Op`]s over one arena of `f32` elements. Every dimension is static but
+//! one: the number of tokens already in the KV cache, `P`, which only [`Attention`] sees. Every
+//! offset and length counts elements.
 //!
 //! Invariants, all checked once by [`Program::new_checked`](crate::Program::new_checked):
-//! - each span lies inside its space, and is exactly as long as the shape says (strided operands: at least as long as the
-//!   last element that the strides reach);
-//! - what an op writes overlaps nothing that it reads, except where the op says *in place*;
+//! - each span lies inside its space, and has exactly the length of its shape (strided operands: at
+//!   least as long as the last element that the strides reach);
+//! - a written span overlaps none that is read, except where the op says *in place*;
 //! - no length is zero.
 //!
-//! One file per operation, behind the trait [`Operation`]; the table at the end of this file says their opcodes and dispatches to
-//! them. An op is [`OP_WORDS`] words: the opcode, the fields in the order of declaration, zeros. [`Op::decode`] refuses everything
-//! that [`Op::encode`] would not write, and what the crate's features leave out.
+//! One file per operation, behind the trait [`Operation`]; the table at the end of this file lists
+//! their opcodes and dispatches to them. An op is [`OP_WORDS`] words: the opcode, the fields in the
+//! order of declaration, zeros. [`Op::decode`] refuses everything that [`Op::encode`] would not
+//! write, and ops that the crate's features leave out.
 
 mod arg;
 mod attention;
@@ -57,55 +60,58 @@ pub use resize::Resize;
 pub use softmax::Softmax;
 pub use unary::{Unary, UnaryKind};
 
-/// Words of an encoded op.
+/// Number of words of an encoded op.
 pub const OP_WORDS: usize = 24;
 
-/// What every operation says of itself: its record is the op.
+/// Behaviour of one operation: its record, check, run, memory accesses and cost.
 pub trait Operation: Field {
-    /// Checks that spans lie inside their spaces and are as long as the shape says, and that nothing is written that is also read.
+    /// Checks that spans lie inside their spaces and have the length of the shape, and that no
+    /// written span is also read.
     fn check(&self, checker: &Checker) -> Result<(), Fault>;
 
-    /// Runs the op. It was checked, so spans are not looked at again; one that is not there is [`ExecError::Span`].
+    /// Runs the op. The op was checked, so spans are not checked again; a missing one is
+    /// [`ExecError::Span`].
     fn run(&self, weights: &[f32], machine: &mut Machine) -> Result<(), ExecError>;
 
-    /// Shows the elements of the arena that the op reads before it writes, then those that it writes, scratch included.
-    /// The order depends on the shape alone.
+    /// Reports the arena elements that the op reads before it writes, then those that it writes,
+    /// scratch included. The order depends on the shape alone.
     fn accesses(&self, see: &mut dyn FnMut(Access));
 
-    /// Shows every span of the arena that is not empty, to be moved.
+    /// Visits every span of the arena that is not empty, so that it can be moved.
     fn each_span(&mut self, visit: &mut dyn FnMut(&mut Span));
 
-    /// The integers that the op reads and writes.
+    /// Returns the integer slots that the op reads and writes.
     fn slots(&self) -> Slots {
         Slots::default()
     }
 
-    /// What the op costs at the largest context.
+    /// Returns the cost of the op at the largest context.
     fn work(&self) -> Work;
 }
 
-/// The integers of an op.
+/// Integer slots of an op.
 #[derive(Debug, Clone, core::marker::Copy, PartialEq, Eq, Default)]
 pub struct Slots {
-    /// The one that it reads.
+    /// Slot that the op reads.
     pub read: Option<IntSlot>,
-    /// The one that it writes.
+    /// Slot that the op writes.
     pub written: Option<IntSlot>,
 }
 
-/// What an op or a program costs. Sums and products saturate.
+/// Cost of an op or a program. Sums and products saturate.
 #[derive(Debug, Clone, core::marker::Copy, PartialEq, Eq, Default)]
 pub struct Work {
-    /// Multiply-adds of products; an op that goes over elements one by one counts one for each; copies count none.
+    /// Number of multiply-adds of products; an op that works element by element counts one for
+    /// each; copies count none.
     pub multiply_adds: u64,
-    /// 4-byte words of weights that are read.
+    /// Number of 4-byte words of weights that are read.
     pub weight_words: u64,
-    /// 4-byte words of the KV cache that are read or written.
+    /// Number of 4-byte words of the KV cache that are read or written.
     pub state_words: u64,
 }
 
 impl Work {
-    /// The work of two ops.
+    /// Adds the work of two ops.
     #[must_use]
     pub const fn and(self, other: Self) -> Self {
         Self {
@@ -147,7 +153,7 @@ impl Work {
     }
 }
 
-/// The table's enum, and every dispatch to the operations.
+/// Defines [`Op`] from the table of operations, with every dispatch to them.
 macro_rules! ops {
     ($($name:ident = $code:literal $(if $feature:literal)?,)*) => {
         /// One operation of a program.
@@ -156,10 +162,10 @@ macro_rules! ops {
         pub enum Op { $($(#[cfg(feature = $feature)])? $name($name),)* }
 
         impl Op {
-            /// The names of all operations, in the order of their opcodes.
+            /// Names of all operations, in the order of their opcodes.
             pub const NAMES: &'static [&'static str] = &[$(stringify!($name),)*];
 
-            /// The op as words of an image.
+            /// Encodes the op as words of an image.
             pub fn encode(&self) -> [u32; OP_WORDS] {
                 let mut words = [0; OP_WORDS];
                 let mut out = Writer::new(&mut words);
@@ -180,7 +186,7 @@ macro_rules! ops {
                 from.rest_is_zero().then_some(op)
             }
 
-            /// Reads an op and leaves the zeros behind it. Inlined: a run reads every op again.
+            /// Reads an op without the zeros after it. Inlined: a run reads every op again.
             #[inline(always)]
             pub(crate) fn take(from: &mut Reader) -> Option<Self> {
                 Some(match from.word()? {
@@ -189,13 +195,14 @@ macro_rules! ops {
                 })
             }
 
-            /// Whether words mean an op that this build was made without: see the crate's features.
+            /// Returns whether words encode an op that this build leaves out: see the crate's
+            /// features.
             pub fn is_left_out(words: &[u32; OP_WORDS]) -> bool {
                 let [code, ..] = *words;
                 [$($((!cfg!(feature = $feature)).then_some($code),)?)*].contains(&Some(code))
             }
 
-            /// The op's name.
+            /// Returns the op's name.
             pub const fn name(&self) -> &'static str {
                 match self { $($(#[cfg(feature = $feature)])? Self::$name(_) => stringify!($name),)* }
             }
@@ -211,22 +218,23 @@ macro_rules! ops {
                 match self { $($(#[cfg(feature = $feature)])? Self::$name(op) => op.run(weights, machine),)* }
             }
 
-            /// Shows what the op reads, then what it writes, see [`Operation::accesses`].
+            /// Reports the arena elements that the op reads, then those that it writes, see
+            /// [`Operation::accesses`].
             pub fn accesses(&self, see: &mut dyn FnMut(Access)) {
                 match self { $($(#[cfg(feature = $feature)])? Self::$name(op) => op.accesses(see),)* }
             }
 
-            /// Shows every span of the arena that is not empty, see [`Operation::each_span`].
+            /// Visits every span of the arena that is not empty, see [`Operation::each_span`].
             pub fn each_span(&mut self, visit: &mut dyn FnMut(&mut Span)) {
                 match self { $($(#[cfg(feature = $feature)])? Self::$name(op) => op.each_span(visit),)* }
             }
 
-            /// The integers that the op reads and writes.
+            /// Returns the integer slots that the op reads and writes.
             pub fn slots(&self) -> Slots {
                 match self { $($(#[cfg(feature = $feature)])? Self::$name(op) => op.slots(),)* }
             }
 
-            /// What the op costs at the largest context.
+            /// Returns the cost of the op at the largest context.
             pub fn work(&self) -> Work {
                 match self { $($(#[cfg(feature = $feature)])? Self::$name(op) => op.work(),)* }
             }
@@ -272,7 +280,7 @@ pub(crate) mod tests {
     use crate::place::Span;
     use crate::{Checker, Isa, Spaces};
 
-    /// Checks an op and runs it on an arena and weights that are there for it alone.
+    /// Checks an op and runs it on an arena and weights of its own.
     pub fn run(
         op: impl Into<Op>,
         arena: &[f32],
@@ -300,7 +308,7 @@ pub(crate) mod tests {
         Ok((arena, ints))
     }
 
-    /// The arena after a run that cannot fail and knows no integers.
+    /// Returns the arena after a run that cannot fail and uses no integers.
     pub fn computed(op: impl Into<Op>, arena: &[f32], weights: &[f32]) -> Vec<f32> {
         let (arena, _) = run(op, arena, weights, [0; INT_SLOTS]).expect("the op runs");
         arena

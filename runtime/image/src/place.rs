@@ -1,20 +1,21 @@
-//! Where the values of a program live: spans of the three spaces and integer slots.
+//! Places of a program's values: spans of the three spaces and integer slots.
 //!
-//! Every offset and length counts elements, 4-byte words where elements are smaller. A span that was read from an image may say
-//! anything; [`Program::new_checked`](crate::Program::new_checked) checks that it lies inside its space.
+//! Every offset and length counts elements, 4-byte words where elements are smaller. A span that
+//! was read from an image is not trusted; [`Program::new_checked`](crate::Program::new_checked)
+//! checks that it lies inside its space.
 
 use core::ops::Range;
 
 use crate::codec::{Field, Reader, Writer, record, word_enum};
 
-/// How many integer slots a program has.
+/// Number of integer slots of a program.
 pub const INT_SLOTS: usize = 8;
 
 record! {
     /// Elements `offset..offset + len` of the arena.
     #[derive(Eq, Default)]
     pub struct Span {
-        /// First element.
+        /// Offset of the first element.
         pub offset: u32,
         /// Number of elements.
         pub len: u32,
@@ -25,7 +26,7 @@ record! {
     /// 4-byte words `offset..offset + len` of the weights: as many `f32` elements, or more of a smaller format.
     #[derive(Eq, Hash, Default)]
     pub struct WeightSpan {
-        /// First word.
+        /// Offset of the first word.
         pub offset: u32,
         /// Number of words.
         pub len: u32,
@@ -37,7 +38,7 @@ record! {
     /// smaller format.
     #[derive(Eq, Default)]
     pub struct StateSpan {
-        /// First word.
+        /// Offset of the first word.
         pub offset: u32,
         /// Number of words.
         pub len: u32,
@@ -45,11 +46,11 @@ record! {
 }
 
 word_enum! {
-    /// Where an operand that is only read lies.
+    /// Space that holds an operand that is only read.
     pub enum Space {
-        /// In the image.
+        /// Weights in the image.
         Weights = 0,
-        /// In the workspace.
+        /// Arena in the workspace.
         Arena = 1,
     }
 }
@@ -58,9 +59,9 @@ record! {
     /// Elements `offset..offset + len` of either space, read only.
     #[derive(Eq)]
     pub struct Operand {
-        /// The space.
+        /// Space of the operand.
         pub space: Space,
-        /// First element.
+        /// Offset of the first element.
         pub offset: u32,
         /// Number of elements.
         pub len: u32,
@@ -88,7 +89,7 @@ impl From<WeightSpan> for Operand {
 }
 
 impl Operand {
-    /// The span of an operand that lies in the arena.
+    /// Returns the span of an operand that lies in the arena.
     #[inline]
     pub fn arena(self) -> Option<Span> {
         matches!(self.space, Space::Arena).then_some(Span {
@@ -104,11 +105,11 @@ fn range(offset: u32, len: u32) -> Range<usize> {
     start..start.saturating_add(len as usize)
 }
 
-/// Gives a kind of span its range.
+/// Implements `range` for a kind of span.
 macro_rules! ranges {
     ($($name:ident)*) => {
         $(impl $name {
-            /// Where it lies in the slice of its space.
+            /// Returns the indices of the span in the slice of its space.
             #[inline]
             pub fn range(self) -> Range<usize> {
                 range(self.offset, self.len)
@@ -119,7 +120,7 @@ macro_rules! ranges {
 
 ranges! { Span WeightSpan StateSpan Operand }
 
-/// One of the [`INT_SLOTS`] integers of a program: a timestep, an index. Set by the caller or
+/// One of the [`INT_SLOTS`] integers of a program: a timestep, an index. It is set by the caller or
 /// by [`ArgMin`](crate::op::ArgMin) and [`ArgMax`](crate::op::ArgMax).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct IntSlot(pub u8);
@@ -138,12 +139,12 @@ impl Field for IntSlot {
     }
 }
 
-/// Where a value at the edge of a program lives while the program runs.
+/// Place of a program's input or output while the program runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Place {
-    /// In the arena.
+    /// A span of the arena.
     Span(Span),
-    /// In an integer slot.
+    /// An integer slot.
     Int(IntSlot),
 }
 

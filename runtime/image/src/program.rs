@@ -1,9 +1,10 @@
-//! One compiled entry graph: a list of ops over spans, checked once, then run without looking back.
+//! One compiled entry graph: a list of ops over spans, checked once, then run without further
+//! checks.
 //!
-//! Invariants of a [`Program`]: every op decodes, every span lies inside its space, every length is what the shape says, what
-//! an op writes overlaps nothing that it reads (see [`op`](crate::op)), and every port lies inside the arena. Only
-//! [`Program::new_checked`] makes one, so running can fail on two accounts alone: an index that the caller or the data chose, and a
-//! KV cache without room.
+//! Invariants of a [`Program`]: every op decodes, every span lies inside its space, every length
+//! matches the shape, no written span overlaps one that is read (see [`op`](crate::op)), and every
+//! port lies inside the arena. Only [`Program::new_checked`] makes one, so a run can fail in two
+//! ways only: by an index that the caller or the data chose, and by a KV cache without room.
 
 use core::error::Error;
 use core::fmt;
@@ -27,7 +28,8 @@ pub struct Program<'a> {
 }
 
 impl<'a> Program<'a> {
-    /// Checks the ops of a program and the places of its ports. A run appends `tokens` rows to the KV cache.
+    /// Checks the ops of a program and the places of its ports. A run of the program appends
+    /// `tokens` rows to the KV cache.
     pub fn new_checked(
         ops: &'a [[u32; OP_WORDS]],
         arena_len: u32,
@@ -65,7 +67,8 @@ impl<'a> Program<'a> {
         })
     }
 
-    /// A view without the checks, for ops that [`new_checked`](Self::new_checked) has already seen in these spaces.
+    /// Makes a view without checks, for ops that [`new_checked`](Self::new_checked) has already
+    /// checked in these spaces.
     #[inline]
     pub fn trusted(ops: &'a [[u32; OP_WORDS]], arena_len: u32, tokens: u32, rows: usize) -> Self {
         Self {
@@ -77,8 +80,8 @@ impl<'a> Program<'a> {
         }
     }
 
-    /// Runs the ops, subnormal numbers taken as zero. The ports' values lie in the machine: what is read is set before the run,
-    /// results are there afterwards.
+    /// Runs the ops, treating subnormal numbers as zero. The ports' values are in the machine: set
+    /// the inputs before the run, read the results afterwards.
     pub fn run(&self, weights: &[f32], machine: &mut Machine) -> Result<(), ExecError> {
         let needed = machine.past.saturating_add(self.tokens());
         if self.cache_end > 0 && needed > self.rows {
@@ -98,31 +101,32 @@ impl<'a> Program<'a> {
         })
     }
 
-    /// Words of the KV cache up to the end of what the program reads or appends; 0 for a program that knows no cache.
+    /// Returns the number of words of the KV cache up to the end of the part that the program reads
+    /// or appends; 0 for a program without a cache.
     #[inline]
     pub fn cache_end(&self) -> u64 {
         self.cache_end
     }
 
-    /// Elements of arena that a run needs.
+    /// Returns the number of elements of arena that a run needs.
     #[inline]
     pub fn arena_len(&self) -> usize {
         self.arena_len as usize
     }
 
-    /// Tokens that a run appends to the KV cache.
+    /// Returns the number of tokens that a run appends to the KV cache.
     #[inline]
     pub fn tokens(&self) -> usize {
         self.tokens as usize
     }
 
-    /// True for a program without ops.
+    /// Returns true for a program without ops.
     #[inline]
     pub fn is_empty(&self) -> bool {
         self.ops.is_empty()
     }
 
-    /// The ops, in the order in which they run.
+    /// Returns the ops, in the order in which they run.
     #[inline]
     pub fn ops(&self) -> impl Iterator<Item = Op> + 'a {
         // Decoded once already, with the zeros behind each.
@@ -131,19 +135,19 @@ impl<'a> Program<'a> {
             .filter_map(|words| Op::take(&mut Reader::new(words)))
     }
 
-    /// What a run costs at the largest context.
+    /// Returns the cost of a run at the largest context.
     pub fn work(&self) -> Work {
         self.ops()
             .fold(Work::default(), |sum, op| sum.and(op.work()))
     }
 }
 
-/// Why a program was refused.
+/// Reason why a program was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ProgramError {
-    /// The op, counted from the program's first; `None` for its ports and the length of its arena.
+    /// Index of the op in the program; `None` for its ports and the length of its arena.
     pub op: Option<u32>,
-    /// What is wrong.
+    /// Fault of the op or program.
     pub fault: Fault,
 }
 

@@ -1,4 +1,4 @@
-//! The records of an image: what a policy expects and promises, and how it is put together.
+//! Records of an image: the policy's contract, programs, states and schedule.
 //!
 //! ```text
 //! channel   a value at the policy's edge: an observation, the action, an instruction, noise, a demonstration
@@ -7,55 +7,57 @@
 //! call      one line of the schedule: at which event and when an entry runs, how often, what it selects and clears
 //! ```
 //!
-//! A record is the words of its fields in the order of declaration. What lengths and indices have to satisfy is said at the
-//! fields and checked once by the core when an image is opened; nothing here is trusted.
+//! A record is the words of its fields in the order of declaration. The fields state what lengths
+//! and indices have to satisfy; the core checks it once when an image is opened, and trusts nothing
+//! before.
 
 use crate::codec::{Field, Reader, Writer, record, word_enum};
 use crate::place::{Place, WeightSpan};
 
-/// The most states with rows (rings and KV caches) that an image may have; they come first among the states.
+/// Largest number of states with rows (rings and KV caches) that an image may have; they come first
+/// among the states.
 pub const MAX_ROW_STATES: usize = 8;
 
-/// The index that means none, such as the instruction of a policy without instructions.
+/// Index that stands for none, such as the instruction of a policy without instructions.
 pub const NONE: u32 = u32::MAX;
 
 record! {
-    /// A text: `len` bytes from `offset` in the string section.
+    /// Text of `len` bytes from `offset` in the string section.
     #[derive(Eq, Default)]
     pub struct Text {
-        /// First byte.
+        /// Offset of the first byte.
         pub offset: u32,
-        /// Bytes.
+        /// Number of bytes.
         pub len: u32,
     }
 }
 
 word_enum! {
-    /// How an index is picked from the scores that a call selects from.
+    /// Rule by which an index is picked from the scores that a call selects from.
     pub enum SelectionRule {
-        /// The largest score, the first of equal ones.
+        /// The index with the largest score, the first of equal ones.
         Argmax = 0,
-        /// At random with the softmax of the scores over the temperature.
+        /// An index drawn at random with the softmax of the scores over the temperature.
         Sample = 1,
     }
 }
 
 word_enum! {
-    /// Where the values of noise channels come from.
+    /// Source of the values of noise channels.
     pub enum NoiseRule {
-        /// Zeros: the mean of what is drawn.
+        /// Zeros, the mean of the standard normal distribution.
         Zero = 0,
-        /// Standard normals of a seeded generator.
+        /// Standard normal numbers of a seeded generator.
         Seeded = 1,
     }
 }
 
 word_enum! {
-    /// What happens when a context has seen as many control steps as the policy was trained on.
+    /// Behaviour once a context has seen as many control steps as the policy was trained on.
     pub enum Beyond {
-        /// States of the episode are cleared, the instruction stays, the timestep starts again at 0.
+        /// Clear the states of the episode, keep the instruction, restart the timestep at 0.
         Restart = 0,
-        /// The step is refused.
+        /// Refuse the step.
         Refuse = 1,
     }
 }
@@ -63,7 +65,7 @@ word_enum! {
 word_enum! {
     /// Order of the components of the quaternions in a channel.
     pub enum QuaternionOrder {
-        /// There are none.
+        /// No quaternions.
         None = 0,
         /// Scalar first.
         Wxyz = 1,
@@ -73,53 +75,55 @@ word_enum! {
 }
 
 record! {
-    /// The contract's fixed part.
+    /// Fixed part of the contract.
     pub struct ContractRecord {
-        /// Name of the family that the bundle belongs to, such as `lads`: to be shown, nothing depends on it.
+        /// Name of the family that the bundle belongs to, such as `lads`; informational, nothing
+        /// depends on it.
         pub family: Text,
-        /// Environment, for example `franka-kitchen`.
+        /// Name of the environment, for example `franka-kitchen`.
         pub environment_id: Text,
-        /// The environment's version.
+        /// Version of the environment.
         pub environment_version: Text,
-        /// Time from one control step to the next, in seconds.
+        /// Control period, the time from one control step to the next, in seconds.
         pub control_period_s: f32,
-        /// How an index is picked, unless the caller says otherwise.
+        /// Rule that picks an index unless the caller sets another one.
         pub selection: SelectionRule,
-        /// Divides the scores when sampling.
+        /// Divisor of the scores when sampling.
         pub temperature: f32,
         /// Seed of the sampling.
         pub selection_seed: u64,
-        /// Where noise comes from, unless the caller says otherwise.
+        /// Source of noise unless the caller sets another one.
         pub noise: NoiseRule,
         /// Seed of the noise.
         pub noise_seed: u64,
-        /// Control steps that a context holds; 0 when there is no such bound.
+        /// Number of control steps that a context holds; 0 if it is unbounded.
         pub context_steps: u32,
-        /// What happens then.
+        /// Behaviour after `context_steps` control steps.
         pub beyond: Beyond,
         /// Language encoder that made the word embeddings; empty without instructions.
         pub encoder: Text,
-        /// SHA-256 of its weights, hexadecimal.
+        /// SHA-256 of the language encoder's weights, hexadecimal.
         pub encoder_sha256: Text,
-        /// Similarity to a known instruction from which other sentences are followed; above 1 when none are.
+        /// Smallest similarity to a known instruction at which another sentence is followed; above
+        /// 1 if none is.
         pub acceptance: f32,
         /// SHA-256 of the bundle that was compiled, hexadecimal.
         pub bundle_sha256: Text,
-        /// Most multiply-adds of a control step, and of the calls of any other event.
+        /// Largest number of multiply-adds of a control step, and of the calls of any other event.
         pub worst_work: u64,
     }
 }
 
 word_enum! {
-    /// What a channel is for.
+    /// Purpose of a channel.
     pub enum Role {
         /// Given by the caller in every control step.
         Observation = 0,
-        /// Written by every control step; as an input of an entry, what was last executed.
+        /// Written by every control step; as an input of an entry, the action executed last.
         Action = 1,
         /// Word embeddings, `[words, elements]`, zero-padded to the longest instruction.
         Instruction = 2,
-        /// Random numbers: each run of an entry that reads the channel draws anew.
+        /// Random numbers: each run of an entry that reads the channel draws new ones.
         Noise = 3,
         /// A piece of a demonstration, given by the caller to be encoded.
         Demonstration = 4,
@@ -127,7 +131,7 @@ word_enum! {
 }
 
 word_enum! {
-    /// The type of a channel's elements.
+    /// Type of a channel's elements.
     pub enum DType {
         /// 32-bit floats.
         F32 = 0,
@@ -141,23 +145,24 @@ word_enum! {
 record! {
     /// One channel.
     pub struct ChannelRecord {
-        /// Name, no two alike.
+        /// Name of the channel, unique in the image.
         pub name: Text,
-        /// What it is for.
+        /// Purpose of the channel.
         pub role: Role,
-        /// Type of its elements.
+        /// Type of the channel's elements.
         pub dtype: DType,
-        /// How many of `dims` count, `1..=4`.
+        /// Number of `dims` in use, `1..=4`.
         pub rank: u32,
-        /// Shape; ones behind the rank.
+        /// Lengths of the axes; ones past the rank.
         pub dims: [u32; 4],
-        /// Order of quaternions.
+        /// Order of the components of the channel's quaternions.
         pub quaternions: QuaternionOrder,
-        /// What the values are relative to, in words; empty for nothing.
+        /// Description of the reference that the values are relative to; empty for none.
         pub reference: Text,
-        /// First of its records in the element section.
+        /// Index of the channel's first record in the element section.
         pub first_element: u32,
-        /// As many as the channel has elements, or none: then `min` and `max` are the limits of all of them.
+        /// Number of the channel's element records: one for each element, or none: then `min` and
+        /// `max` are the limits of all elements.
         pub elements_len: u32,
         /// Smallest value of any element.
         pub min: f32,
@@ -169,23 +174,24 @@ record! {
 record! {
     /// One element of a channel.
     pub struct ElementRecord {
-        /// Name.
+        /// Name of the element.
         pub name: Text,
-        /// Unit, `1` for none.
+        /// Unit of the element; `1` for a dimensionless one.
         pub unit: Text,
-        /// Joint that it belongs to; empty for none.
+        /// Joint that the element belongs to; empty for none.
         pub joint: Text,
-        /// What of the joint: position, velocity, effort; empty where nobody said.
+        /// Quantity of the joint: position, velocity, effort; empty where the bundle does not say.
         pub interface: Text,
-        /// Unit of the physical value that the element stands for; empty where nobody said.
+        /// Unit of the physical value that the element stands for; empty where the bundle does not
+        /// say.
         pub physical_unit: Text,
         /// Physical value of one unit of the element: physical = reference + offset + scale * value.
         pub scale: f32,
-        /// Physical value of zero, on top of the channel's reference.
+        /// Physical value for an element of zero, without the channel's reference.
         pub offset: f32,
-        /// Smallest value in the contract.
+        /// Smallest value that the contract allows.
         pub min: f32,
-        /// Largest value in the contract.
+        /// Largest value that the contract allows.
         pub max: f32,
     }
 }
@@ -193,35 +199,36 @@ record! {
 record! {
     /// One known instruction.
     pub struct InstructionRecord {
-        /// Short name.
+        /// Short name of the instruction.
         pub id: Text,
-        /// What the person says.
+        /// The instruction as a person says it.
         pub text: Text,
-        /// Words, from 1 to the first dimension of the instruction channel.
+        /// Number of words, from 1 to the first dimension of the instruction channel.
         pub words_len: u32,
-        /// `[words_len, E]` word embeddings.
+        /// Word embeddings `[words_len, E]`.
         pub words: WeightSpan,
     }
 }
 
 word_enum! {
-    /// How a state is kept.
+    /// Way in which a state is stored.
     pub enum StateKind {
-        /// As a whole, taken over at the end of a control step.
+        /// Values replaced as a whole at the end of a control step.
         Plain = 0,
-        /// The last rows that were appended.
+        /// Ring of the last rows that were appended.
         Ring = 1,
-        /// Rows appended behind the valid ones: the keys and values of attention.
+        /// Rows appended after the valid ones: the keys and values of attention.
         Kv = 2,
     }
 }
 
 word_enum! {
-    /// How long a state lasts.
+    /// Lifetime of a state.
     pub enum Scope {
         /// Until another instruction is set.
         Instruction = 0,
-        /// Until the episode ends or the context starts again; what the instruct event appended stays.
+        /// Until the episode ends or the context starts again; rows that the instruct event
+        /// appended stay.
         Episode = 1,
         /// Until the control step ends.
         Step = 2,
@@ -229,38 +236,39 @@ word_enum! {
 }
 
 word_enum! {
-    /// What stands in the rows that a ring does not have yet, where it is read as a whole.
+    /// Content of the rows that a ring does not have yet, when it is read as a whole.
     pub enum Fill {
         /// Zeros.
         Zero = 0,
-        /// The oldest row.
+        /// Copies of the oldest row.
         First = 1,
     }
 }
 
 record! {
-    /// One state. Rings and KV caches come first, [`MAX_ROW_STATES`] at most.
+    /// One state of the policy. Rings and KV caches come first, [`MAX_ROW_STATES`] at most.
     pub struct StateRecord {
-        /// Name, no two alike.
+        /// Name of the state, unique in the image.
         pub name: Text,
-        /// How it is kept.
+        /// Way in which the state is stored.
         pub kind: StateKind,
-        /// How long it lasts; KV caches last an episode.
+        /// Lifetime of the state; KV caches last an episode.
         pub scope: Scope,
-        /// Elements of a plain state or of a ring's row; words of a whole KV cache.
+        /// Number of elements of a plain state or of a ring's row; number of words of a whole KV
+        /// cache.
         pub width: u32,
-        /// Rows of a ring or of a KV cache; 1 for a plain state.
+        /// Number of rows of a ring or of a KV cache; 1 for a plain state.
         pub rows: u32,
-        /// What a ring's missing rows are; `Zero` for others.
+        /// Content of a ring's missing rows; `Zero` for other states.
         pub fill: Fill,
-        /// Where it lies, one state behind the other: rings and KV caches in words of the row memory, plain states in elements of
-        /// a bank, those of a step in elements of scratch.
+        /// Offset of the state, one state after the other: rings and KV caches in words of the row
+        /// memory, plain states in elements of a bank, those of a step in elements of scratch.
         pub offset: u32,
     }
 }
 
 word_enum! {
-    /// What a port is bound to.
+    /// Kind of thing that a port is bound to.
     pub enum SourceKind {
         /// A channel, by its index.
         Channel = 0,
@@ -272,24 +280,24 @@ word_enum! {
         Timestep = 3,
         /// As an integer: the timestep modulo the parameter.
         Phase = 4,
-        /// As an integer: how many runs of the same call came before.
+        /// As an integer: the number of earlier runs of the same call.
         Pass = 5,
-        /// As an integer: the index in force.
+        /// As an integer: the selected index in force.
         Selected = 6,
     }
 }
 
-/// What a port is bound to, with the index or number that belongs to it (zero where none does).
+/// Binding of a port, with the index or number that belongs to it (zero where none does).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Source {
-    /// What it is.
+    /// Kind of thing that the port is bound to.
     pub kind: SourceKind,
     /// Index of the channel or state, or the period of a phase.
     pub of: u32,
 }
 
 impl Source {
-    /// True for an integer, which lives in a slot.
+    /// Returns true for an integer, which lives in a slot.
     pub const fn is_int(self) -> bool {
         matches!(
             self.kind,
@@ -316,11 +324,11 @@ impl Field for Source {
 record! {
     /// One port of an entry.
     pub struct PortRecord {
-        /// Name, no two alike among an entry's inputs or outputs.
+        /// Name of the port, unique among an entry's inputs or outputs.
         pub name: Text,
-        /// What it is bound to.
+        /// Binding of the port.
         pub source: Source,
-        /// Where it lives while the entry runs.
+        /// Place of the port's value while the entry runs.
         pub place: Place,
     }
 }
@@ -328,37 +336,38 @@ record! {
 record! {
     /// One entry.
     pub struct EntryRecord {
-        /// Name, such as `low_level/act`; no two alike.
+        /// Name of the entry, such as `low_level/act`, unique in the image.
         pub name: Text,
-        /// Index of its first op in the op section.
+        /// Index of the entry's first op in the op section.
         pub first_op: u32,
         /// Number of ops.
         pub ops_len: u32,
-        /// Elements of arena that it needs.
+        /// Number of elements of arena that the entry needs.
         pub arena_len: u32,
-        /// The KV cache that its attentions read and append to; [`NONE`] for none.
+        /// Index of the KV cache that the entry's attentions read and append to; [`NONE`] for none.
         pub cache: u32,
-        /// Rows that a run appends to the KV cache.
+        /// Number of rows that a run appends to the KV cache.
         pub tokens: u32,
-        /// First of its inputs in the port section.
+        /// Index of the entry's first input in the port section.
         pub first_input: u32,
-        /// Values that are set before a run. Ops may overwrite them once they are read.
+        /// Number of inputs, whose values are set before a run. Ops may overwrite inputs once they
+        /// are read.
         pub inputs_len: u32,
-        /// First of its outputs in the port section.
+        /// Index of the entry's first output in the port section.
         pub first_output: u32,
-        /// Values that are valid after a run.
+        /// Number of outputs, whose values are valid after a run.
         pub outputs_len: u32,
     }
 }
 
 word_enum! {
-    /// What makes a call run.
+    /// Event that makes a call run.
     pub enum Event {
         /// An instruction is set.
         Instruct = 0,
         /// A control step.
         Step = 1,
-        /// An action is asked for with an index that the caller chose.
+        /// An action is requested for an index that the caller chose.
         Follow = 2,
         /// A demonstration is to be encoded.
         Encode = 3,
@@ -366,9 +375,9 @@ word_enum! {
 }
 
 word_enum! {
-    /// At which control steps of a context a call runs.
+    /// Control steps of a context at which a call runs.
     pub enum When {
-        /// At all.
+        /// Every control step.
         Always = 0,
         /// At timestep 0.
         First = 1,
@@ -378,11 +387,11 @@ word_enum! {
 }
 
 word_enum! {
-    /// How often a call runs its entry.
+    /// Number of times that a call runs its entry.
     pub enum Repeat {
-        /// As often as the number says.
+        /// A fixed number of times, `count`.
         Times = 0,
-        /// Once per valid row of the ring of this index.
+        /// Once per valid row of the ring with index `count`.
         Rows = 1,
     }
 }
@@ -390,40 +399,44 @@ word_enum! {
 record! {
     /// One line of the schedule. The calls of an event run in the order of their records.
     pub struct CallRecord {
-        /// What makes it run.
+        /// Event that makes the call run.
         pub event: Event,
-        /// At which steps; `Always` for events other than a step.
+        /// Control steps at which the call runs; `Always` for events other than a step.
         pub when: When,
         /// Period of `Every`, above 0; 0 for the others.
         pub every: u32,
-        /// Whether it runs only if no call of its chain has run before it: a chain is a call and all such calls that follow it.
+        /// True if the call runs only if no call of its chain has run before it: a chain is a call
+        /// and all following calls with this flag.
         pub otherwise: bool,
-        /// The entry.
+        /// Index of the entry to run.
         pub entry: u32,
-        /// How often it runs.
+        /// Rule for the number of runs.
         pub repeat: Repeat,
         /// Number of runs, or index of the ring.
         pub count: u32,
-        /// The plain state whose elements are the scores of what is selected after the runs; [`NONE`] for none.
+        /// Index of the plain state whose elements are the scores of the selection after the runs;
+        /// [`NONE`] for no selection.
         pub select: u32,
-        /// First of the states that are cleared before the runs, in the section of clears.
+        /// Position, in the section of clears, of the first state that is cleared before the runs.
         pub first_clear: u32,
-        /// How many are cleared.
+        /// Number of states that are cleared.
         pub clears_len: u32,
     }
 }
 
 record! {
-    /// Start of a golden section that is not empty. Behind it, each in whole words: for every observation channel in their order
-    /// `[T, elements]` values; with `selects` the indices in force `u32 [T]`; noise `f32 [T, noise_len]`; actions `f32 [T, A]`.
+    /// Start of a golden section that is not empty. After it follow, each in whole words: for every
+    /// observation channel in their order `[T, elements]` values; with `selects` the indices in
+    /// force `u32 [T]`; noise `f32 [T, noise_len]`; actions `f32 [T, A]`.
     pub struct GoldenRecord {
-        /// Which instruction was followed; [`NONE`] without instructions.
+        /// Number of the instruction that was followed; [`NONE`] without instructions.
         pub instruction: u32,
-        /// Control steps, `T`.
+        /// Number of control steps, `T`.
         pub steps: u32,
-        /// Whether an index is in force.
+        /// True if an index is in force.
         pub selects: bool,
-        /// All draws of a step in the order in which they are used, zeros behind.
+        /// Number of draws of noise of a step, in the order in which they are used, padded with
+        /// zeros.
         pub noise_len: u32,
         /// Largest absolute difference of an action that the self-test accepts.
         pub tolerance: f32,

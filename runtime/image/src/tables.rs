@@ -1,8 +1,9 @@
-//! The tables of an image: every section as records of its kind.
+//! Tables of an image: every section as records of its kind.
 //!
-//! Invariant of [`Tables`]: the frame is sound, every record decodes, every text lies inside the strings, and every range that a
-//! record points with lies inside its section. Whether the records make a policy is for the core to say. What can fail: [`Tables::new`]
-//! ([`TablesError`]); afterwards an accessor gives `None` only for an index beyond the end.
+//! Invariant of [`Tables`]: the frame is sound, every record decodes, every text lies inside the
+//! strings, and every range that a record holds lies inside its section. The core checks whether
+//! the records form a valid policy. What can fail: [`Tables::new`] ([`TablesError`]); afterwards an
+//! accessor returns `None` only for an index past the end.
 
 use core::error::Error;
 use core::fmt;
@@ -35,7 +36,7 @@ pub struct Tables<'a> {
     golden: &'a [u32],
 }
 
-/// The words of a section as records of `N` words.
+/// Splits the words of a section into records of `N` words.
 fn rows<const N: usize>(words: &[u32], tag: Tag) -> Result<&[[u32; N]], TablesError> {
     let (rows, rest) = words.as_chunks::<N>();
     if rest.is_empty() {
@@ -45,19 +46,20 @@ fn rows<const N: usize>(words: &[u32], tag: Tag) -> Result<&[[u32; N]], TablesEr
     }
 }
 
-/// One record of a table.
+/// Decodes one record of a table.
 #[inline]
 fn take<T: Field, const N: usize>(rows: &[[u32; N]], index: usize) -> Option<T> {
     rows.get(index)
         .and_then(|row| T::take(&mut Reader::new(row)))
 }
 
-/// Every record of a table; `None` for one that does not decode.
+/// Decodes every record of a table; `None` for one that does not decode.
 fn all<T: Field, const N: usize>(rows: &[[u32; N]]) -> impl Iterator<Item = Option<T>> + '_ {
     rows.iter().map(|row| T::take(&mut Reader::new(row)))
 }
 
-/// `first..first + len` of `table`; empty for a range outside, which checked tables do not have.
+/// Returns `first..first + len` of `table`; empty for a range outside, which checked tables do not
+/// have.
 fn part<T>(table: &[T], first: u32, len: u32) -> &[T] {
     let start = first as usize;
     table
@@ -194,111 +196,111 @@ impl<'a> Tables<'a> {
         )
     }
 
-    /// The image, without what lies behind it.
+    /// Returns the image, without the bytes after it.
     pub fn image(&self) -> &'a [u8] {
         self.image
     }
 
-    /// True when not a bit of the image has changed since it was written: reads all of it.
+    /// Reads the whole image and returns true if no bit has changed since it was written.
     #[inline]
     pub fn checksum_matches(&self) -> bool {
         let stored = self.image.as_chunks::<4>().0.get(CRC_WORD);
         stored.map(|&bytes| u32::from_le_bytes(bytes)) == Some(format::crc32(self.image))
     }
 
-    /// The contract's fixed part.
+    /// Returns the fixed part of the contract.
     pub fn contract(&self) -> Option<ContractRecord> {
         ContractRecord::take(&mut Reader::new(self.contract))
     }
 
-    /// How many channels there are.
+    /// Returns the number of channels.
     pub fn channels_len(&self) -> usize {
         self.channels.len()
     }
 
-    /// Channel `i`.
+    /// Returns channel `i`.
     #[inline]
     pub fn channel(&self, i: usize) -> Option<ChannelRecord> {
         take(self.channels, i)
     }
 
-    /// The records of a channel's elements.
+    /// Returns the records of a channel's elements.
     #[inline]
     pub fn elements(&self, channel: &ChannelRecord) -> &'a [[u32; ElementRecord::WORDS]] {
         part(self.elements, channel.first_element, channel.elements_len)
     }
 
-    /// How many elements all channels have records of.
+    /// Returns the number of element records of all channels.
     pub fn elements_len(&self) -> usize {
         self.elements.len()
     }
 
-    /// How many instructions are known.
+    /// Returns the number of known instructions.
     pub fn instructions_len(&self) -> usize {
         self.instructions.len()
     }
 
-    /// Known instruction `i`.
+    /// Returns known instruction `i`.
     pub fn instruction(&self, i: usize) -> Option<InstructionRecord> {
         take(self.instructions, i)
     }
 
-    /// How many states there are.
+    /// Returns the number of states.
     pub fn states_len(&self) -> usize {
         self.states.len()
     }
 
-    /// State `i`.
+    /// Returns state `i`.
     #[inline]
     pub fn state(&self, i: usize) -> Option<StateRecord> {
         take(self.states, i)
     }
 
-    /// How many entries there are.
+    /// Returns the number of entries.
     pub fn entries_len(&self) -> usize {
         self.entries.len()
     }
 
-    /// Entry `i`.
+    /// Returns entry `i`.
     #[inline]
     pub fn entry(&self, i: usize) -> Option<EntryRecord> {
         take(self.entries, i)
     }
 
-    /// The inputs of an entry.
+    /// Returns the inputs of an entry.
     #[inline]
     pub fn inputs(&self, entry: &EntryRecord) -> impl Iterator<Item = PortRecord> + use<'a> {
         ports(part(self.ports, entry.first_input, entry.inputs_len))
     }
 
-    /// The outputs of an entry.
+    /// Returns the outputs of an entry.
     #[inline]
     pub fn outputs(&self, entry: &EntryRecord) -> impl Iterator<Item = PortRecord> + use<'a> {
         ports(part(self.ports, entry.first_output, entry.outputs_len))
     }
 
-    /// How many ports all entries have.
+    /// Returns the number of ports of all entries.
     pub fn ports_len(&self) -> usize {
         self.ports.len()
     }
 
-    /// The ops of an entry.
+    /// Returns the ops of an entry.
     #[inline]
     pub fn ops(&self, entry: &EntryRecord) -> &'a [[u32; OP_WORDS]] {
         part(self.ops, entry.first_op, entry.ops_len)
     }
 
-    /// How many ops all entries have.
+    /// Returns the number of ops of all entries.
     pub fn ops_len(&self) -> usize {
         self.ops.len()
     }
 
-    /// How many calls the schedule has.
+    /// Returns the number of calls of the schedule.
     pub fn calls_len(&self) -> usize {
         self.calls.len()
     }
 
-    /// The schedule, in order.
+    /// Returns the calls of the schedule, in order.
     #[inline]
     pub fn calls(&self) -> impl Iterator<Item = CallRecord> + use<'a> {
         self.calls
@@ -306,34 +308,34 @@ impl<'a> Tables<'a> {
             .filter_map(|row| CallRecord::take(&mut Reader::new(row)))
     }
 
-    /// The states that a call clears.
+    /// Returns the states that a call clears.
     #[inline]
     pub fn clears(&self, call: &CallRecord) -> &'a [u32] {
         part(self.clears, call.first_clear, call.clears_len)
     }
 
-    /// How many states all calls clear.
+    /// Returns the number of states that all calls clear.
     pub fn clears_len(&self) -> usize {
         self.clears.len()
     }
 
-    /// All weights.
+    /// Returns all weights.
     #[inline]
     pub fn weights(&self) -> &'a [f32] {
         self.weights
     }
 
-    /// A part of the weights; empty for a span outside.
+    /// Returns a part of the weights; empty for a span outside.
     pub fn span(&self, span: WeightSpan) -> &'a [f32] {
         part(self.weights, span.offset, span.len)
     }
 
-    /// The words of the golden section.
+    /// Returns the words of the golden section.
     pub fn golden(&self) -> &'a [u32] {
         self.golden
     }
 
-    /// A text; empty for one outside the strings.
+    /// Returns a text; empty for one outside the strings.
     pub fn text(&self, text: Text) -> &'a str {
         self.find(text).unwrap_or("")
     }
@@ -351,17 +353,17 @@ fn ports(rows: &[[u32; PortRecord::WORDS]]) -> impl Iterator<Item = PortRecord> 
         .filter_map(|row| PortRecord::take(&mut Reader::new(row)))
 }
 
-/// Why the tables of an image were refused.
+/// Reason why the tables of an image were refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum TablesError {
-    /// This processor stores the most significant byte first; images do not.
+    /// This processor is big-endian; images are little-endian.
     BigEndian,
     /// The image does not start on a 4-byte boundary.
     Alignment,
-    /// The frame makes no sense.
+    /// The frame of the image is invalid.
     Format(FormatError),
-    /// A section is no whole number of its records, or text that is not UTF-8.
+    /// A section is not a multiple of the size of its records, or text that is not UTF-8.
     Section(Tag),
     /// A record of the section does not decode, or points outside the image.
     Record(Tag),

@@ -1,4 +1,5 @@
-//! The frame of an image and its records: what is written is read back, bit for bit.
+//! Tests that the frame of an image and its records are read back as they were written, bit for
+//! bit.
 
 use lads_image::codec::{Field, Reader, Writer};
 use lads_image::format::{self, HEADER_WORDS, Layout, SECTIONS, Sections, Tag};
@@ -8,7 +9,7 @@ use lads_image::records::{
 };
 use proptest::prelude::*;
 
-/// Lengths of all sections, none of them zero.
+/// Returns the lengths of all sections, none of them zero.
 fn lens() -> [usize; SECTIONS] {
     std::array::from_fn(|i| 4 * (i + 1))
 }

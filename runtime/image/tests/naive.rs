@@ -1,12 +1,12 @@
-//! Programs against the naive model, which computes everything anew in 64 bits.
+//! Compares programs with the naive model, which computes everything anew in 64 bits.
 
 mod support;
 
 use support::assemble::assemble;
 use support::{Kind, Model, Random, Runner, Spec};
 
-/// Runs control steps beside the naive model, whatever was executed being told to both, and returns the largest difference of
-/// an action.
+/// Runs control steps beside the naive model, telling both which action was executed, and returns
+/// the largest difference of an action.
 fn compare(
     model: &Model,
     words: &[f32],

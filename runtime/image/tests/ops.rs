@@ -1,4 +1,5 @@
-//! What is written into an image is read back, bit for bit: any op, and any words that decode.
+//! Tests that any op, and any words that decode, are read back from an image as they were written,
+//! bit for bit.
 
 use lads_image::codec::{Field, Reader, Writer};
 use lads_image::op::{

@@ -1,4 +1,5 @@
-//! Programs that are broken, by accident or on purpose: checking them, and running what passes, gives `Ok` or `Err`, never a panic.
+//! Tests that checking programs that are broken, by accident or on purpose, and running those that
+//! pass, gives `Ok` or `Err`, never a panic.
 
 mod support;
 
@@ -172,7 +173,7 @@ fn memory_that_is_too_small_is_an_error_of_the_run() {
     assert_eq!(run(arena, cache, 9), Err(ExecError::Span));
 }
 
-/// Runs whatever passes the check, in memory of its size: it may refuse, it may not panic.
+/// Runs a program that passes the check, in memory of its size: it may refuse, it may not panic.
 fn exercise(policy: &Assembled, draft: &Draft, words: &[[u32; OP_WORDS]]) -> bool {
     let ports = draft.inputs.iter().chain(&draft.outputs);
     let places = ports.map(|&(_, place)| place);

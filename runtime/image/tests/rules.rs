@@ -1,4 +1,4 @@
-//! Each rule of each op, broken once in a program that is sound otherwise.
+//! Tests of each rule of each op, broken once in a program that is sound otherwise.
 
 mod support;
 
@@ -6,7 +6,7 @@ use lads_image::Fault;
 use lads_image::op::{Activation, BinaryKind, CacheFormat, Op, Span};
 use support::{Kind, sound};
 
-/// The fault that checking reports after `edit` has changed a program.
+/// Returns the fault that checking reports after `edit` has changed a program.
 fn fault(kind: Kind, edit: impl FnOnce(&mut Vec<Op>)) -> Option<Fault> {
     let mut policy = sound();
     edit(&mut policy.draft_mut(kind).ops);

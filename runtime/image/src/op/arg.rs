@@ -10,26 +10,26 @@ use crate::machine::{ExecError, Machine};
 use crate::place::{IntSlot, Span};
 
 record! {
-    /// `out = ` index of the smallest element, the first of equal ones.
+    /// Index of the smallest element, `out = argmin(x)`, the first of equal ones.
     pub struct ArgMin {
-        /// What is searched.
+        /// Elements to search.
         pub x: Span,
-        /// Where the index goes.
+        /// Slot of the resulting index.
         pub out: IntSlot,
     }
 }
 
 record! {
-    /// `out = ` index of the largest element, the first of equal ones.
+    /// Index of the largest element, `out = argmax(x)`, the first of equal ones.
     pub struct ArgMax {
-        /// What is searched.
+        /// Elements to search.
         pub x: Span,
-        /// Where the index goes.
+        /// Slot of the resulting index.
         pub out: IntSlot,
     }
 }
 
-/// The two differ in their kernel alone.
+/// Implements [`Operation`] for [`ArgMin`] and [`ArgMax`], which differ only in their kernel.
 macro_rules! arg {
     ($name:ident by $kernel:path) => {
         impl Operation for $name {

@@ -17,13 +17,16 @@ word_enum_for!(CacheFormat { F32 = 0, F16 = 1, });
 record! {
     /// Causal multi-head attention over the KV cache, which it appends to.
     ///
-    /// The `tokens` rows of `k` and `v` become cache rows `P..P + tokens` (one contiguous row of `heads * head_dim` per token).
-    /// Then each of the last `queries` tokens attends to rows `0..=` its own:
-    /// `y[i] = concat over heads of softmax(scale * q[i]·K^T)·V`. With `queries = 0` the op only records; then `q`, `y` and
-    /// `scratch` are empty spans. All attentions of a program append the same number of tokens, and the caller advances `P`
-    /// after the whole program ran. `capacity` is the number of rows of the entry's KV state; its spans are relative to that state.
+    /// The `tokens` rows of `k` and `v` become cache rows `P..P + tokens` (one contiguous row of
+    /// `heads * head_dim` per token). Then each of the last `queries` tokens attends to rows `0..=`
+    /// its own: `y[i] = concat over heads of softmax(scale * q[i]·K^T)·V`. With `queries = 0` the
+    /// op only appends to the cache; then `q`, `y` and `scratch` are empty spans. All attentions of
+    /// a program append the same number of tokens, and the caller advances `P` after the whole
+    /// program ran. `capacity` is the number of rows of the entry's KV state; its spans are
+    /// relative to that state.
     pub struct Attention {
-        /// First of the `queries` rows; row `i` starts at `offset + i * q_stride`. Length `(queries - 1) * q_stride + heads * head_dim`.
+        /// First of the `queries` query rows; row `i` starts at `offset + i * q_stride`. Length
+        /// `(queries - 1) * q_stride + heads * head_dim`.
         pub q: Span,
         /// Elements from one query row to the next.
         pub q_stride: u32,
@@ -35,26 +38,28 @@ record! {
         pub v: Span,
         /// Elements from one value row to the next.
         pub v_stride: u32,
-        /// `[queries, heads * head_dim]`, contiguous.
+        /// Result `[queries, heads * head_dim]`, contiguous.
         pub y: Span,
-        /// How the cache is stored.
+        /// Storage format of the cache.
         pub format: CacheFormat,
-        /// `[capacity / 16, heads * head_dim, 16]`, blocks of 16 tokens, the last one whole: `lads_kernels::keys_len` elements
-        /// of `format`.
+        /// Cached keys `[capacity / 16, heads * head_dim, 16]`, blocks of 16 tokens, the last one
+        /// whole: `lads_kernels::keys_len` elements of `format`.
         pub cache_k: StateSpan,
-        /// `[capacity, heads * head_dim]` elements of `format`; does not overlap `cache_k`.
+        /// Cached values `[capacity, heads * head_dim]`, elements of `format`; does not overlap
+        /// `cache_k`.
         pub cache_v: StateSpan,
-        /// Heads.
+        /// Number of heads.
         pub heads: u32,
-        /// Elements per head.
+        /// Number of elements per head.
         pub head_dim: u32,
-        /// Tokens that the op appends.
+        /// Number of tokens that the op appends.
         pub tokens: u32,
-        /// How many of them, the last, are also queries.
+        /// Number of appended tokens, the last ones, that are also queries.
         pub queries: u32,
-        /// Multiplies the scores.
+        /// Factor of the scores before the softmax.
         pub scale: f32,
-        /// `lads_kernels::attention_scratch_len(queries, heads, capacity)` elements, overlaps nothing.
+        /// Scratch memory of `lads_kernels::attention_scratch_len(queries, heads, capacity)`
+        /// elements, overlaps nothing.
         pub scratch: Span,
     }
 }
@@ -215,7 +220,7 @@ impl Operation for Attention {
     }
 }
 
-/// A span holds `rows` rows of `width` elements that start `stride` elements apart.
+/// Checks that a span holds `rows` rows of `width` elements that start `stride` elements apart.
 fn rows(span: Span, rows: u32, stride: u32, width: u32) -> Checked {
     let len = u64::from(rows.saturating_sub(1))
         .saturating_mul(u64::from(stride))
@@ -227,7 +232,8 @@ fn rows(span: Span, rows: u32, stride: u32, width: u32) -> Checked {
     )
 }
 
-/// `len` words hold exactly so many elements of a format of the cache.
+/// Returns whether `len` words hold exactly the elements of a format of the cache with these
+/// dimensions.
 fn holds(len: u32, format: CacheFormat, dims: [u32; 2]) -> bool {
     let elements: u128 = dims.into_iter().map(u128::from).product();
     let held = u128::from(len).saturating_mul(format.per_word() as u128);

@@ -1,4 +1,4 @@
-//! Two operands, element by element, with broadcasts.
+//! Binary operations, element by element, with broadcasts.
 
 use lads_kernels as kernels;
 
@@ -14,21 +14,22 @@ pub use lads_kernels::BinaryKind;
 word_enum_for!(BinaryKind { Add = 0, Sub = 1, Mul = 2, Div = 3, Max = 4, Min = 5, Pow = 6, Greater = 7, Keep = 8, });
 
 record! {
-    /// `y[i] = kind(a[i], b[i])` over four dimensions. In place when `y` is exactly the span of a contiguous `a` or `b`.
+    /// Binary operation `y[i] = kind(a[i], b[i])` over four dimensions. The op is in place when `y`
+    /// is exactly the span of a contiguous `a` or `b`.
     pub struct Binary {
-        /// What is computed.
+        /// Function to compute.
         pub kind: BinaryKind,
         /// First operand.
         pub a: Operand,
         /// Second operand.
         pub b: Operand,
-        /// Contiguous, `dims`.
+        /// Result, contiguous, of shape `dims`.
         pub y: Span,
         /// Shape of the result, padded in front with ones.
         pub dims: [u32; 4],
         /// Elements from one index to the next in each dimension of `a`; 0 broadcasts.
         pub a_strides: [u32; 4],
-        /// The same for `b`.
+        /// Elements from one index to the next in each dimension of `b`; 0 broadcasts.
         pub b_strides: [u32; 4],
     }
 }
@@ -85,7 +86,8 @@ impl Operation for Binary {
     }
 }
 
-/// Strides of a contiguous layout; dimensions of length one may say anything.
+/// Returns whether strides are those of a contiguous layout; the strides of dimensions of length
+/// one do not matter.
 fn is_contiguous(dims: [u32; 4], strides: [u32; 4]) -> bool {
     let mut expected = 1_u64;
     let [d0, d1, d2, d3] = dims;

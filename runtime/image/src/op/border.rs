@@ -1,4 +1,4 @@
-//! The border of an image, which makes every pixel of a convolution the same work.
+//! Fills the border of an image, so that every pixel of a convolution is computed alike.
 
 use super::picture::{Pair, called};
 use super::{Operation, Work};
@@ -9,25 +9,25 @@ use crate::machine::{ExecError, Machine, Readable};
 use crate::place::{Span, WeightSpan};
 
 record! {
-    /// Fills the border of an image; what lies inside keeps its value.
+    /// Fills the border of an image; the pixels inside keep their value.
     pub struct Border {
-        /// `[before + inside + after rows, before + inside + after columns, c]`, contiguous.
+        /// Image `[before + inside + after rows, before + inside + after columns, c]`, contiguous.
         pub y: Span,
-        /// Size of what lies inside.
+        /// Size of the image without its border.
         pub inside: Pair,
-        /// Rows above, columns to the left.
+        /// Number of border rows above and border columns to the left.
         pub before: Pair,
-        /// Rows below, columns to the right.
+        /// Number of border rows below and border columns to the right.
         pub after: Pair,
-        /// Channels.
+        /// Number of channels.
         pub c: u32,
-        /// `[c]`: what a pixel of the border is; zeros otherwise.
+        /// Value of a border pixel, `[c]`; zeros if `None`.
         pub value: Option<WeightSpan>,
     }
 }
 
 impl Border {
-    /// Rows and columns with the border.
+    /// Returns the number of rows and columns, border included.
     fn whole(&self) -> [u32; 2] {
         let [before, inside, after] = [self.before, self.inside, self.after].map(Pair::words);
         let sum = |[a, b, c]: [u32; 3]| a.saturating_add(b).saturating_add(c);
@@ -35,7 +35,7 @@ impl Border {
         [sum([b0, i0, a0]), sum([b1, i1, a1])]
     }
 
-    /// The four sides: first element, rows, and elements of each.
+    /// Returns the four sides: first element, rows, and elements of each.
     fn sides(&self) -> [[u32; 3]; 4] {
         let line = self.line();
         let [above, left] = self.before.words();
@@ -55,7 +55,7 @@ impl Border {
         ]
     }
 
-    /// Elements of a row.
+    /// Returns the number of elements of a row.
     fn line(&self) -> u32 {
         let [_, cols] = self.whole();
         cols.saturating_mul(self.c)

@@ -1,4 +1,5 @@
-//! A convolution over an image that has its border: packed weights, bias, activation, residual connection.
+//! Convolution over an image whose border is stored: packed weights, bias, activation, residual
+//! connection.
 
 use lads_kernels as kernels;
 
@@ -13,27 +14,27 @@ use crate::place::{Span, WeightSpan};
 pub use lads_kernels::Activation;
 
 record! {
-    /// `y = activation(x * W + b + (accumulate ? y : 0))`; with `accumulate` the op is in place on `y`: a residual connection, to which
-    /// the activation belongs.
+    /// Convolution `y = activation(x * W + b + (accumulate ? y : 0))`; with `accumulate` the op is
+    /// in place on `y`: a residual connection, inside the activation.
     pub struct Conv {
-        /// `[rows, columns, c]`, border included.
+        /// Input image `[rows, columns, c]`, border included.
         pub x: Picture,
-        /// `[out rows, out columns, n]`
+        /// Output image `[out rows, out columns, n]`.
         pub y: Picture,
-        /// What moves over `x`.
+        /// Window that moves over `x`.
         pub window: Window,
-        /// Input channels.
+        /// Number of input channels.
         pub c: u32,
-        /// Output channels.
+        /// Number of output channels.
         pub n: u32,
-        /// `[kernel rows, kernel columns, c, n]` in panels of 16 outputs: `lads_kernels::conv_packed_len` elements, ordered by
-        /// `lads_kernels::conv_pack`.
+        /// Weights `[kernel rows, kernel columns, c, n]` in panels of 16 outputs:
+        /// `lads_kernels::conv_packed_len` elements, ordered by `lads_kernels::conv_pack`.
         pub w: WeightSpan,
-        /// `[n]`
+        /// Bias `[n]`.
         pub bias: WeightSpan,
-        /// Applied at the end.
+        /// Activation, applied last.
         pub activation: Activation,
-        /// Whether `y` is added to.
+        /// True if the result is added to `y`.
         pub accumulate: bool,
     }
 }

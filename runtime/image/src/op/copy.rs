@@ -10,17 +10,18 @@ use crate::machine::{ExecError, Machine, Readable};
 use crate::place::{Operand, Span};
 
 record! {
-    /// `y[i] = x[i]` over four dimensions, both sides strided: transposes, slices, broadcasts and the parts of a concatenation.
+    /// Strided copy `y[i] = x[i]` over four dimensions, both sides strided: transposes, slices,
+    /// broadcasts and the parts of a concatenation.
     pub struct Copy {
-        /// From here.
+        /// Operand to copy from.
         pub x: Operand,
-        /// To here; elements of the span that the strides do not reach keep their value.
+        /// Span to copy to; elements of the span that the strides do not reach keep their value.
         pub y: Span,
-        /// Shape, padded in front with ones.
+        /// Shape of the copy, padded in front with ones.
         pub dims: [u32; 4],
         /// Elements from one index to the next in each dimension of `x`; 0 broadcasts.
         pub x_strides: [u32; 4],
-        /// The same for `y`.
+        /// Elements from one index to the next in each dimension of `y`.
         pub y_strides: [u32; 4],
     }
 }

@@ -1,4 +1,4 @@
-//! A convolution of each channel by itself, over an image that has its border.
+//! Depthwise convolution, each channel by itself, over an image whose border is stored.
 
 use lads_kernels as kernels;
 
@@ -11,21 +11,22 @@ use crate::machine::{ExecError, Machine, Readable};
 use crate::place::{Span, WeightSpan};
 
 record! {
-    /// `y = activation(x * w + b)`, each channel with a kernel of its own.
+    /// Depthwise convolution `y = activation(x * w + b)`, each channel with a kernel of its own.
     pub struct Depthwise {
-        /// `[rows, columns, c]`, border included.
+        /// Input image `[rows, columns, c]`, border included.
         pub x: Picture,
-        /// `[out rows, out columns, c]`
+        /// Output image `[out rows, out columns, c]`.
         pub y: Picture,
-        /// What moves over `x`.
+        /// Window that moves over `x`.
         pub window: Window,
-        /// Channels.
+        /// Number of channels.
         pub c: u32,
-        /// `[kernel rows, kernel columns, c]`, the channels rounded up to sixteen: `lads_kernels::depthwise_packed_len` elements.
+        /// Weights `[kernel rows, kernel columns, c]`, the channels rounded up to sixteen:
+        /// `lads_kernels::depthwise_packed_len` elements.
         pub w: WeightSpan,
-        /// `[c]`
+        /// Bias `[c]`.
         pub bias: WeightSpan,
-        /// Applied at the end.
+        /// Activation, applied last.
         pub activation: Activation,
     }
 }

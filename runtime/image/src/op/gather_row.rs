@@ -1,4 +1,4 @@
-//! One row of a table, chosen by an integer.
+//! Copies one row of a table, chosen by an integer.
 
 use super::{Operation, Slots, Work};
 use crate::access::{self, Access};
@@ -8,21 +8,22 @@ use crate::machine::{ExecError, Machine, Readable};
 use crate::place::{IntSlot, Operand, Space, Span};
 
 record! {
-    /// `y = table[index + shift]`: a timestep's embedding, a codebook entry, the next action of a queue in the arena.
+    /// Table lookup `y = table[index + shift]`: a timestep's embedding, a codebook entry, the next
+    /// action of a queue in the arena.
     ///
     /// A row outside `0..rows` is an error when the program runs. `y` does not overlap the table.
     pub struct GatherRow {
-        /// `[rows, row_len]`
+        /// Table `[rows, row_len]`.
         pub table: Operand,
-        /// Elements of a row.
+        /// Number of elements of a row.
         pub row_len: u32,
-        /// Rows of the table.
+        /// Number of rows of the table.
         pub rows: u32,
-        /// Holds the index.
+        /// Slot that holds the index.
         pub index: IntSlot,
-        /// Added to the index.
+        /// Number added to the index.
         pub shift: i32,
-        /// `[row_len]`
+        /// Result `[row_len]`.
         pub y: Span,
     }
 }
@@ -48,7 +49,7 @@ impl Operation for GatherRow {
         Ok(())
     }
 
-    /// Reads the whole table: which row it is, nobody knows before it runs.
+    /// Reports a read of the whole table, because the row is known only at run time.
     fn accesses(&self, see: &mut dyn FnMut(Access)) {
         access::read(self.table, see);
         access::write(self.y, see);
@@ -102,7 +103,7 @@ mod tests {
         Ok(arena[6..].to_vec())
     }
 
-    /// Tables of the image, and queues in the arena.
+    /// Reads rows of tables in the image, and of queues in the arena.
     #[test]
     fn rows_come_from_either_space() {
         let weights = WeightSpan { offset: 0, len: 6 };

@@ -1,4 +1,4 @@
-//! Numbers of the arena as integers, and integers as numbers.
+//! Conversions between numbers in the arena and integers in slots.
 
 use super::{Operation, Slots, Work};
 use crate::access::{self, Access};
@@ -8,24 +8,24 @@ use crate::machine::{ExecError, Machine};
 use crate::place::{IntSlot, Span};
 
 record! {
-    /// `out = x` without its fraction: an index that a policy computes. What is negative, no number, or from 2^31 on becomes
-    /// `u32::MAX`, which is a row of no table.
+    /// Conversion to an integer, `out = trunc(x)`: an index that a policy computes. A number up to
+    /// -1, NaN, or a number from 2^31 on becomes `u32::MAX`, which is outside every table.
     pub struct ToIndex {
-        /// One element.
+        /// Number to convert, one element.
         pub x: Span,
-        /// Where the integer goes.
+        /// Slot of the resulting integer.
         pub out: IntSlot,
     }
 }
 
 record! {
-    /// `y = index + shift`, as a number.
+    /// Conversion to a float, `y = index + shift`.
     pub struct FromIndex {
-        /// Holds the integer.
+        /// Slot that holds the integer.
         pub index: IntSlot,
-        /// Added to it.
+        /// Number added to the integer.
         pub shift: i32,
-        /// One element.
+        /// Result, one element.
         pub y: Span,
     }
 }

@@ -10,21 +10,22 @@ use crate::machine::{ExecError, Machine, Readable};
 use crate::place::{Span, WeightSpan};
 
 record! {
-    /// `y = (x - mean) / sqrt(variance + eps) * gamma + beta`, per row, with the population variance.
+    /// Layer normalisation `y = (x - mean) / sqrt(variance + eps) * gamma + beta`, per row, with
+    /// the population variance.
     pub struct LayerNorm {
-        /// `[rows, cols]`
+        /// Input `[rows, cols]`.
         pub x: Span,
-        /// `[rows, cols]`
+        /// Result `[rows, cols]`.
         pub y: Span,
-        /// `[cols]`
+        /// Scale `[cols]`.
         pub gamma: WeightSpan,
-        /// `[cols]`
+        /// Shift `[cols]`.
         pub beta: WeightSpan,
-        /// Rows.
+        /// Number of rows.
         pub rows: u32,
-        /// Columns.
+        /// Number of columns.
         pub cols: u32,
-        /// Added to the variance.
+        /// Constant added to the variance.
         pub eps: f32,
     }
 }

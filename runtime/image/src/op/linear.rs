@@ -1,4 +1,4 @@
-//! A dense layer: packed weights in any of their formats, bias, activation, residual connection.
+//! Dense layer: packed weights in any of their formats, bias, activation, residual connection.
 
 use lads_kernels as kernels;
 
@@ -52,7 +52,7 @@ impl Field for Activation {
     }
 }
 
-/// Whether this build has the kernels of a format.
+/// Returns whether this build has the kernels of a format.
 const fn is_built(format: WeightFormat) -> bool {
     match format {
         WeightFormat::F32 => true,
@@ -64,29 +64,31 @@ const fn is_built(format: WeightFormat) -> bool {
 word_enum_for!(WeightFormat { F32 = 0, F16 = 1, Bf16 = 2, Int8 = 3, Int16 = 4, });
 
 record! {
-    /// `y = (accumulate ? y : 0) + activation(x·W + b)`; with `accumulate` the op is in place on `y`: a residual connection.
+    /// Dense layer `y = (accumulate ? y : 0) + activation(x·W + b)`; with `accumulate` the op is in
+    /// place on `y`: a residual connection.
     pub struct Linear {
-        /// `[m, k]`, contiguous.
+        /// Input `[m, k]`, contiguous.
         pub x: Span,
-        /// How `w` is stored.
+        /// Storage format of `w`.
         pub format: WeightFormat,
-        /// `[k, n]` in panels of 64 outputs: `lads_kernels::packed_len` elements of `format`, ordered by `lads_kernels::pack`.
+        /// Weights `[k, n]` in panels of 64 outputs: `lads_kernels::packed_len` elements of
+        /// `format`, ordered by `lads_kernels::pack`.
         pub w: WeightSpan,
-        /// `[n]`, with integers only: multiplies each output of `x·W`.
+        /// Factors `[n]` of the outputs of `x·W`, for integer formats only.
         pub scales: Option<WeightSpan>,
-        /// `[n]`
+        /// Bias `[n]`.
         pub bias: Option<WeightSpan>,
-        /// `[m, n]`, contiguous.
+        /// Result `[m, n]`, contiguous.
         pub y: Span,
-        /// Rows.
+        /// Number of rows.
         pub m: u32,
-        /// Inputs.
+        /// Number of inputs.
         pub k: u32,
-        /// Outputs.
+        /// Number of outputs.
         pub n: u32,
-        /// Applied to `x·W + b`, before accumulation.
+        /// Activation, applied to `x·W + b`, before accumulation.
         pub activation: Activation,
-        /// Whether `y` is added to.
+        /// True if the result is added to `y`.
         pub accumulate: bool,
     }
 }

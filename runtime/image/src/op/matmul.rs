@@ -10,21 +10,22 @@ use crate::machine::{ExecError, Machine, Readable};
 use crate::place::{Operand, Span};
 
 record! {
-    /// `y[b, i, j] = sum over l of a[b, i, l] * b[b, l, j]`: products of two activations, or with weights that are not packed.
+    /// Matrix product `y[b, i, j] = sum over l of a[b, i, l] * b[b, l, j]`: of two activations, or
+    /// with weights that are not packed.
     pub struct MatMul {
         /// First operand.
         pub a: Operand,
         /// Second operand.
         pub b: Operand,
-        /// `[batch, m, n]`, contiguous.
+        /// Result `[batch, m, n]`, contiguous.
         pub y: Span,
-        /// Independent products.
+        /// Number of independent products.
         pub batch: u32,
-        /// Rows.
+        /// Number of rows.
         pub m: u32,
         /// Inner dimension.
         pub k: u32,
-        /// Columns.
+        /// Number of columns.
         pub n: u32,
         /// Strides of `a` over batch, `m` and `k`.
         pub a_strides: [u32; 3],

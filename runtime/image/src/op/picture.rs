@@ -1,4 +1,4 @@
-//! Images in the arena: where their pixels lie, and windows that move over them.
+//! Images in the arena: the places of their pixels, and windows that move over them.
 
 use lads_kernels as kernels;
 
@@ -7,17 +7,17 @@ use crate::check::{Checked, Checker, Fault, reaches, require};
 use crate::codec::{Field, Reader, Writer, record};
 use crate::place::Span;
 
-/// A number of rows and one of columns, in one word.
+/// Two numbers, for rows and for columns, in one word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Pair {
-    /// Of rows, down the image.
+    /// Number for rows, down the image.
     pub rows: u16,
-    /// Of columns, along a row.
+    /// Number for columns, along a row.
     pub cols: u16,
 }
 
 impl Pair {
-    /// Both the same.
+    /// Makes a pair of twice the same number.
     pub const fn of(both: u16) -> Self {
         Self {
             rows: both,
@@ -25,7 +25,7 @@ impl Pair {
         }
     }
 
-    /// Both, none of them zero.
+    /// Checks that neither number is zero.
     pub(super) fn positive(self) -> Checked {
         require(self.rows != 0 && self.cols != 0, Fault::Shape)
     }
@@ -38,7 +38,7 @@ impl Pair {
         [self.rows, self.cols].map(usize::from)
     }
 
-    /// Input pixels that windows at so many places cover, gaps included.
+    /// Returns how many input pixels windows at this many places cover, gaps included.
     fn covered(self, stride: Self, kernel: Self, dilation: Self) -> [u32; 2] {
         let axis = |out: u16, stride: u16, kernel: u16, dilation: u16| {
             let steps = |n: u16, by: u16| u32::from(n.saturating_sub(1)).saturating_mul(by.into());
@@ -69,10 +69,11 @@ impl Field for Pair {
 }
 
 record! {
-    /// An image `[rows, columns, channels]` in the arena, channels side by side. Rows may lie inside wider ones, and pixels inside
-    /// pixels of more channels: what has a border, or is a group of channels.
+    /// An image `[rows, columns, channels]` in the arena, channels side by side. Rows may be part
+    /// of wider ones, and pixels part of pixels with more channels: images with a border, or groups
+    /// of channels.
     pub struct Picture {
-        /// From the first element to the last.
+        /// Span from the first element to the last.
         pub at: Span,
         /// Elements from a row to the next.
         pub row: u32,
@@ -82,14 +83,15 @@ record! {
 }
 
 impl Picture {
-    /// The image lies inside its span; it is read.
+    /// Checks that the image, which is read, lies inside its span.
     pub(super) fn read(self, checker: &Checker, [rows, cols]: [u32; 2], c: u32) -> Checked {
         checker.arena(self.at)?;
         require(rows != 0 && cols != 0 && c != 0, Fault::Shape)?;
         reaches(self.at.len, [rows, cols, c], [self.row, self.pixel, 1])
     }
 
-    /// The image lies inside its span, each element in a place of its own; it is written.
+    /// Checks that the image, which is written, lies inside its span, each element in a place of
+    /// its own.
     pub(super) fn written(self, checker: &Checker, [rows, cols]: [u32; 2], c: u32) -> Checked {
         self.read(checker, [rows, cols], c)?;
         let wide = u64::from(cols.saturating_sub(1)).saturating_mul(self.pixel.into());
@@ -115,9 +117,9 @@ impl Picture {
 }
 
 record! {
-    /// A window that moves over an image that has its border.
+    /// Window that moves over an image whose border is stored.
     pub struct Window {
-        /// Output pixels.
+        /// Number of output pixels.
         pub out: Pair,
         /// Size of the window.
         pub kernel: Pair,
@@ -135,7 +137,7 @@ impl Window {
             .try_for_each(Pair::positive)
     }
 
-    /// Input pixels that are read, gaps included.
+    /// Returns how many input pixels are read, gaps included.
     pub(super) fn covered(self) -> [u32; 2] {
         self.out.covered(self.stride, self.kernel, self.dilation)
     }
@@ -152,8 +154,9 @@ impl Window {
     }
 }
 
-/// Runs an operation on images out of the loop over a program, whose frame would grow by what each of them needs: a call is nothing
-/// beside an image. Generic, so that a build without the operation has none of it.
+/// Calls an operation on images out of line, so that the frame of the loop over a program does not
+/// grow by its needs: beside an image, the cost of a call is negligible. Generic, so that a build
+/// without the operation has none of it.
 #[inline(never)]
 pub(super) fn called<T>(run: impl FnOnce() -> T) -> T {
     run()

@@ -1,4 +1,4 @@
-//! The largest and the mean of windows of an image.
+//! Maximum and mean of windows of an image.
 
 use lads_kernels as kernels;
 
@@ -15,23 +15,23 @@ pub use lads_kernels::PoolKind;
 word_enum_for!(PoolKind { Max = 0, Mean = 1, PaddedMean = 2, });
 
 record! {
-    /// `y = kind over a window of x`; windows are cut at the image's edge.
+    /// Pooling `y = kind over a window of x`; windows are cut at the image's edge.
     pub struct Pool {
-        /// What is computed.
+        /// Function to compute.
         pub kind: PoolKind,
-        /// `[size, c]`, without a border.
+        /// Input image `[size, c]`, without a border.
         pub x: Picture,
-        /// `[out, c]`
+        /// Output image `[out, c]`.
         pub y: Picture,
         /// Size of `x`.
         pub size: Pair,
-        /// What moves over `x` and its padding.
+        /// Window that moves over `x` and its padding.
         pub window: Window,
-        /// Rows above, columns to the left.
+        /// Number of padding rows above and padding columns to the left.
         pub before: Pair,
-        /// Rows below, columns to the right.
+        /// Number of padding rows below and padding columns to the right.
         pub after: Pair,
-        /// Channels.
+        /// Number of channels.
         pub c: u32,
     }
 }

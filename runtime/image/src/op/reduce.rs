@@ -14,13 +14,13 @@ pub use lads_kernels::ReduceKind;
 word_enum_for!(ReduceKind { Sum = 0, Mean = 1, Max = 2, Min = 3, Prod = 4, });
 
 record! {
-    /// `y[o, i] = kind over a of x[o, a, i]`.
+    /// Reduction `y[o, i] = kind over a of x[o, a, i]`.
     pub struct Reduce {
-        /// What is computed.
+        /// Function to compute.
         pub kind: ReduceKind,
-        /// `[outer, axis, inner]`, contiguous.
+        /// Input `[outer, axis, inner]`, contiguous.
         pub x: Operand,
-        /// `[outer, inner]`
+        /// Result `[outer, inner]`.
         pub y: Span,
         /// Product of the dimensions before the axis.
         pub outer: u32,

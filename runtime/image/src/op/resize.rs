@@ -1,4 +1,4 @@
-//! An image in another size.
+//! Resizes an image.
 
 use lads_kernels as kernels;
 
@@ -11,21 +11,24 @@ use crate::machine::{ExecError, Machine, Readable};
 use crate::place::{Span, WeightSpan};
 
 record! {
-    /// Each pixel of `y` is a mix of two rows and two columns of `x`, which tables name.
+    /// Resized image: each pixel of `y` is a mix of two rows and two columns of `x`, which tables
+    /// name.
     pub struct Resize {
-        /// `[size, c]`
+        /// Input image `[size, c]`.
         pub x: Picture,
-        /// `[out, c]`
+        /// Output image `[out, c]`.
         pub y: Picture,
         /// Size of `x`.
         pub size: Pair,
         /// Size of `y`.
         pub out: Pair,
-        /// Channels.
+        /// Number of channels.
         pub c: u32,
-        /// `[out rows, 3]`: first row, second row, weight of the second. Rows beyond the image mean its last.
+        /// Table `[out rows, 3]` for each output row: first input row, second input row, weight of
+        /// the second. Rows beyond the image mean its last row.
         pub rows: WeightSpan,
-        /// `[out columns, 3]`, alike.
+        /// Table `[out columns, 3]` for each output column: first input column, second input
+        /// column, weight of the second. Columns beyond the image mean its last column.
         pub cols: WeightSpan,
     }
 }
@@ -60,7 +63,7 @@ impl Operation for Resize {
         })
     }
 
-    /// Reads the whole image: which pixels the tables name is not looked at.
+    /// Reports a read of the whole image, because the pixels that the tables name are not examined.
     fn accesses(&self, see: &mut dyn FnMut(Access)) {
         see(self.x.access(AccessKind::Read, self.size.words(), self.c));
         see(self.y.access(AccessKind::Write, self.out.words(), self.c));

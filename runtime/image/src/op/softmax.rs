@@ -10,15 +10,15 @@ use crate::machine::{ExecError, Machine, Readable};
 use crate::place::Span;
 
 record! {
-    /// `y = exp(x - max) / sum(exp(x - max))`, per row.
+    /// Softmax `y = exp(x - max) / sum(exp(x - max))`, per row.
     pub struct Softmax {
-        /// `[rows, cols]`
+        /// Input `[rows, cols]`.
         pub x: Span,
-        /// `[rows, cols]`
+        /// Result `[rows, cols]`.
         pub y: Span,
-        /// Rows.
+        /// Number of rows.
         pub rows: u32,
-        /// Columns.
+        /// Number of columns.
         pub cols: u32,
     }
 }

@@ -1,4 +1,4 @@
-//! One operand, element by element.
+//! Unary operations, element by element.
 
 use lads_kernels as kernels;
 
@@ -32,15 +32,15 @@ word_enum_for!(UnaryKind {
 });
 
 record! {
-    /// `y[i] = kind(x[i])`. In place when `x` and `y` are the same span.
+    /// Unary operation `y[i] = kind(x[i])`. The op is in place when `x` and `y` are the same span.
     pub struct Unary {
-        /// What is computed.
+        /// Function to compute.
         pub kind: UnaryKind,
-        /// Slope of `LeakyRelu`, factor of `Elu`; anything for the others.
+        /// Slope of `LeakyRelu`, factor of `Elu`; ignored for the others.
         pub alpha: f32,
         /// The operand.
         pub x: Operand,
-        /// As long as `x`.
+        /// Result, of the length of `x`.
         pub y: Span,
     }
 }

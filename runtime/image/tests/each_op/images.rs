@@ -7,7 +7,7 @@ use lads_kernels::{conv_packed_len, depthwise_packed_len};
 
 use super::samples::{span, weight};
 
-/// All of them.
+/// Returns all sound ops on images.
 pub fn images() -> Vec<Op> {
     let window = Window {
         out: Pair { rows: 2, cols: 3 },

@@ -1,4 +1,4 @@
-//! What every operation says of itself, held against what it does: check, encoding, accesses and spans.
+//! Compares what every operation declares with what it does: check, encoding, accesses and spans.
 
 mod images;
 mod samples;
@@ -19,7 +19,7 @@ const SPACES: Spaces = Spaces {
     cache_len: 200,
     rows: 9,
 };
-/// Rows of the cache that are there before a run.
+/// Number of rows of the cache that are valid before a run.
 const PAST: usize = 3;
 
 fn check(op: &Op) -> Result<(), Fault> {
@@ -38,7 +38,8 @@ fn accesses(op: &Op) -> Vec<Access> {
     all
 }
 
-/// The offsets of spans outside the arena, each with the length of its span and of its space.
+/// Returns the offsets of spans outside the arena, each with the length of its span and of its
+/// space.
 fn outside_the_arena(op: &mut Op) -> Vec<(&mut u32, u32, usize)> {
     fn weights(span: &mut WeightSpan) -> (&mut u32, u32, usize) {
         (&mut span.offset, span.len, SPACES.weights_len)
@@ -205,7 +206,7 @@ fn accesses_move_with_their_spans() {
     }
 }
 
-/// Runs one op over an arena whose elements are `values`, and returns the arena.
+/// Runs one op on an arena, and returns the arena and the integers.
 fn run(op: &Op, mut arena: Vec<f32>) -> (Vec<f32>, [u32; INT_SLOTS]) {
     let words = [op.encode()];
     // The whole arena is a port, so that the op may use any part of it.
@@ -229,7 +230,8 @@ fn run(op: &Op, mut arena: Vec<f32>) -> (Vec<f32>, [u32; INT_SLOTS]) {
     (arena, ints)
 }
 
-/// A run reads nothing and writes nothing but what the accesses say, and writes all of that.
+/// Compares the declared accesses with a run, which reads and writes nothing else, and writes all
+/// of the elements declared as written.
 #[test]
 fn accesses_are_what_a_run_does() {
     for op in samples() {

@@ -50,7 +50,7 @@ pub fn attention(queries: u32) -> Attention {
     }
 }
 
-/// All of them.
+/// Returns all sound ops.
 #[expect(clippy::too_many_lines, reason = "one sample per op and place")]
 pub fn samples() -> Vec<Op> {
     let linear = |format: WeightFormat, accumulate| {

@@ -21,7 +21,7 @@ pub enum Kind {
     Encode,
 }
 
-/// All of a policy.
+/// A policy assembled by hand: its programs, weights and sizes.
 #[derive(Clone)]
 pub struct Assembled {
     pub programs: [Draft; 7],
@@ -76,7 +76,7 @@ struct Packed {
     b: WeightSpan,
 }
 
-/// The weights of an image, each once.
+/// Weights of an image, each stored once.
 struct Pool(Vec<f32>);
 
 impl Pool {
@@ -122,7 +122,7 @@ struct PackedLayer {
     cache_v: StateSpan,
 }
 
-/// A program and its ports by name; arena is never used twice.
+/// A program under construction and its ports by name; arena is never reused.
 #[derive(Clone, Default)]
 pub struct Draft {
     pub ops: Vec<Op>,
@@ -202,7 +202,7 @@ impl Draft {
         y
     }
 
-    /// `x += table[timestep + shift]`
+    /// Adds the embedding of a timestep, `x += table[timestep + shift]`.
     fn add_timestep(&mut self, x: Span, table: WeightSpan, shift: i32) {
         let row = self.span(x.len);
         self.op(op::GatherRow {
@@ -225,7 +225,7 @@ impl Draft {
     }
 }
 
-/// The transformer's weights.
+/// Weights of the transformer.
 struct Transformer {
     width: u32,
     heads: u32,
@@ -238,7 +238,8 @@ struct Transformer {
 }
 
 impl Transformer {
-    /// The layers over `x`; with `decide` the logits of the last token, otherwise only keys and values.
+    /// Adds the layers over `x`; with `decide` the logits of the last token, otherwise only keys
+    /// and values.
     fn run(&self, draft: &mut Draft, x: Span, decide: bool) {
         let tokens = x.len / self.width;
         let mut x = draft.norm(x, self.norm_embed);
@@ -309,7 +310,7 @@ impl Transformer {
     }
 }
 
-/// The programs of a model, its weights and its KV cache.
+/// Assembles the programs of a model, its weights and its KV cache.
 pub fn assemble(model: &Model) -> Assembled {
     let spec = model.spec;
     let d = spec.width() as u32;
@@ -454,7 +455,8 @@ fn act(model: &Model, pool: &mut Pool) -> Draft {
     act
 }
 
-/// Squared distance to code `c` is `|x|^2 - 2 x·c + |c|^2`; the first term is the same for all codes.
+/// Adds the encoder, which picks the code `c` of the smallest squared distance
+/// `|x|^2 - 2 x·c + |c|^2`; the first term is left out, as it is the same for all codes.
 fn encode(model: &Model, pool: &mut Pool) -> Draft {
     let spec = model.spec;
     let mut encode = Draft::new(0);

@@ -11,7 +11,7 @@ use lads_image::{ExecError, Isa, Machine};
 pub use assemble::{Assembled, Kind};
 pub use model::{Model, Spec};
 
-/// A policy that is smaller than tiny: every word of it is changed.
+/// Assembles a policy that is smaller than tiny, because every word of it is changed.
 pub fn sound() -> Assembled {
     let spec = Spec {
         layers: 1,
@@ -26,18 +26,18 @@ pub fn sound() -> Assembled {
     assemble::assemble(&Model::random(spec, 2))
 }
 
-/// Runs the programs of a policy as a controller does, one KV cache under all of them.
+/// Runs the programs of a policy as a controller does, with one KV cache for all of them.
 pub struct Runner<'p> {
     policy: &'p Assembled,
     arena: Vec<f32>,
     cache: Vec<f32>,
     ints: [u32; INT_SLOTS],
-    /// Valid rows of the cache.
+    /// Number of valid rows of the cache.
     pub past: usize,
 }
 
 impl<'p> Runner<'p> {
-    /// Memory full of what must not matter.
+    /// Makes memory full of garbage that must not matter.
     pub fn new(policy: &'p Assembled) -> Self {
         Self {
             policy,
@@ -48,7 +48,8 @@ impl<'p> Runner<'p> {
         }
     }
 
-    /// Runs one program, a span that is set too short filled up with zeros. An integer is a float without fraction.
+    /// Runs one program; inputs that are shorter than their span are padded with zeros. Integers
+    /// are given as floats without a fraction.
     pub fn run(&mut self, kind: Kind, inputs: &[(&str, &[f32])]) -> Result<(), ExecError> {
         let draft = self.policy.draft(kind);
         let words = self.policy.encode(kind);
@@ -84,7 +85,7 @@ impl<'p> Runner<'p> {
         Ok(())
     }
 
-    /// An output of the program that ran last.
+    /// Returns an output of the program that ran last.
     pub fn output(&self, kind: Kind, port: &str) -> Vec<f32> {
         let outputs = &self.policy.draft(kind).outputs;
         let (_, place) = outputs
@@ -103,7 +104,7 @@ impl<'p> Runner<'p> {
 pub struct Random(pub u64);
 
 impl Random {
-    /// Uniform in -1..1.
+    /// Returns a number that is uniform in -1..1.
     pub fn next(&mut self) -> f32 {
         self.0 = self
             .0

@@ -1,4 +1,4 @@
-//! The network of LADS, naive: every decision recomputes the whole token sequence in `f64`.
+//! Naive network of LADS: every decision recomputes the whole token sequence in `f64`.
 
 use super::Random;
 
@@ -38,7 +38,7 @@ impl Spec {
         steps: 8,
     };
 
-    /// The sizes of Kitchen (state) in the paper.
+    /// Sizes of Kitchen (state) in the paper.
     pub const KITCHEN: Self = Self {
         observation_len: 30,
         action_len: 9,
@@ -55,13 +55,13 @@ impl Spec {
         steps: 280,
     };
 
-    /// Elements of a token.
+    /// Returns the number of elements of a token.
     pub fn width(&self) -> usize {
         self.heads * self.head_dim
     }
 }
 
-/// A dense layer: `w` is `[k, n]` row-major.
+/// Dense layer with weights `w`, `[k, n]` row-major.
 #[derive(Clone)]
 pub struct Dense {
     pub k: usize,
@@ -119,7 +119,7 @@ impl Norm {
     }
 }
 
-/// Added to the variance of every layer norm.
+/// Constant added to the variance of every layer norm.
 pub const EPS: f32 = 1e-5;
 
 /// Slope of the low level's activation.
@@ -136,7 +136,7 @@ pub struct Layer {
     pub down: Dense,
 }
 
-/// All weights of a policy.
+/// Weights of a policy.
 #[derive(Clone)]
 pub struct Model {
     pub spec: Spec,
@@ -206,7 +206,8 @@ impl Model {
             .map(f64::from)
     }
 
-    /// `x = LN([w_1..w_L, s_0, a_0, .., s_t])`, then the layers with a causal mask, then the head at `s_t`.
+    /// Computes the logits at `s_t`: `x = LN([w_1..w_L, s_0, a_0, .., s_t])`, then the layers with
+    /// a causal mask, then the head.
     pub fn logits(
         &self,
         words: &[f32],
@@ -249,7 +250,7 @@ impl Model {
             .apply(&self.norm_final.apply(x.last().expect("there is a token")))
     }
 
-    /// Attention of the last token to all of them.
+    /// Computes the attention of the last token to all of them.
     fn attend(&self, qkv: &[Vec<f64>]) -> Vec<f64> {
         let (d, head_dim) = (self.spec.width(), self.spec.head_dim);
         let q = &qkv.last().expect("there is a token")[..d];
@@ -274,12 +275,12 @@ impl Model {
         y
     }
 
-    /// The codebook entry of an index.
+    /// Returns the codebook entry of an index.
     pub fn plan(&self, index: usize) -> &[f32] {
         &self.codebook[index * self.spec.plan_len..(index + 1) * self.spec.plan_len]
     }
 
-    /// `a = MLP([s; z])`, clipped to -1..1.
+    /// Computes the action `a = MLP([s; z])`, clipped to -1..1.
     pub fn act(&self, observation: &[f32], plan: usize) -> Vec<f64> {
         let mut x: Vec<f64> = observation
             .iter()
@@ -298,7 +299,7 @@ impl Model {
         x.iter().map(|x| x.clamp(-1.0, 1.0)).collect()
     }
 
-    /// The codebook entry nearest to what a linear encoder makes of one horizon.
+    /// Returns the codebook entry nearest to the output of a linear encoder on one horizon.
     pub fn encode(&self, observations: &[f32], actions: &[f32]) -> usize {
         let x: Vec<f64> = observations
             .iter()
