@@ -1,8 +1,9 @@
 //! Causal multi-head attention over a key-value cache.
 //!
-//! Keys and values are read strictly in order, once for two queries and all heads, as [`Cache`] lays them out: sixteen scores are
-//! sixteen lanes, and nothing is summed across lanes. [`Append`](crate::Append) writes the rows of new tokens; [`Attention::run`]
-//! then reads them. For one query and one head:
+//! Keys and values are read strictly in order, once for two queries and all heads, in the layout of
+//! [`Cache`]: sixteen scores are sixteen lanes, and nothing is summed across lanes.
+//! [`Append`](crate::Append) writes the rows of new tokens; [`Attention::run`] then reads them. For
+//! one query and one head:
 //!
 //! ```text
 //! s[r] = scale * (sum over d of q[d] * K[r][d])      r = 0..=own row
@@ -17,10 +18,11 @@ use crate::norm::exponentials;
 use crate::simd::{Simd, prefetch_ahead};
 use crate::stored::{F16, F32};
 
-/// Queries that go through the cache together.
+/// Number of queries that share one pass over the cache.
 const TOGETHER: usize = 2;
 
-/// Elements of scratch that attention over a cache of `capacity` rows needs: the scores of all heads for two queries.
+/// Returns the number of elements of scratch that attention over a cache of `capacity` rows needs:
+/// the scores of all heads for two queries.
 pub const fn attention_scratch_len(queries: usize, heads: usize, capacity: usize) -> usize {
     let together = if queries < TOGETHER {
         queries
@@ -30,18 +32,18 @@ pub const fn attention_scratch_len(queries: usize, heads: usize, capacity: usize
     keys_len(capacity, heads).saturating_mul(together)
 }
 
-/// Attention of a few queries to a cache that already holds their own keys and values.
+/// Attention of a few queries to a cache that already holds the queries' own keys and values.
 #[derive(Debug, Clone, Copy)]
 pub struct Attention<'c> {
-    /// Heads.
+    /// Number of heads.
     pub heads: usize,
-    /// Elements per head.
+    /// Number of elements per head.
     pub head_dim: usize,
-    /// Multiplies the scores.
+    /// Factor of the scores.
     pub scale: f32,
     /// Elements from one query to the next.
     pub q_stride: usize,
-    /// How many rows of the cache the first query sees; each later query sees one more.
+    /// Number of rows of the cache that the first query sees; each later query sees one more.
     pub visible: usize,
     /// Keys and values, rows of `heads * head_dim` elements.
     pub cache: Cache<'c>,
@@ -63,7 +65,7 @@ impl Attention<'_> {
         }
     }
 
-    /// Attention over a cache whose format is known when this is compiled.
+    /// Runs attention over a cache whose format is known at compile time.
     fn over<C: Cached>(
         &self,
         isa: Isa,
@@ -128,7 +130,7 @@ impl Attention<'_> {
     }
 }
 
-/// `p[query][head][row] = scale * dot(q, K[row])`
+/// Computes the scores `p[query][head][row] = scale * dot(q, K[row])`.
 struct Scores<'a, C: Cached> {
     op: &'a Attention<'a>,
     keys: &'a [C::Bits],
@@ -176,7 +178,8 @@ impl<C: Cached> Scores<'_, C> {
     }
 }
 
-/// Softmax of the scores of every query and head over the rows that the query sees; zero for the others.
+/// Computes the softmax of the scores of every query and head over the rows that the query sees;
+/// zero for the others.
 struct Probabilities<'a> {
     heads: usize,
     visible: usize,
@@ -201,7 +204,8 @@ impl Kernel for Probabilities<'_> {
     }
 }
 
-/// `y = sum over rows of p[row] * V[row]`, in the order of the rows; `p` is `[query][head][len]`.
+/// Computes the weighted sums `y = sum over rows of p[row] * V[row]`, in the order of the rows; `p`
+/// is `[query][head][len]`.
 struct Sums<'a, C: Cached> {
     op: &'a Attention<'a>,
     values: &'a [C::Bits],
@@ -226,14 +230,15 @@ impl<C: Cached> Kernel for Sums<'_, C> {
 }
 
 impl<C: Cached> Sums<'_, C> {
-    /// The probabilities of a query's head.
+    /// Returns the probabilities of a query's head.
     #[inline(always)]
     fn of(&self, query: usize, head: usize) -> &[f32] {
         let start = (query * self.op.heads + head) * self.len;
         self.p.get(start..start + self.len).unwrap_or(&[])
     }
 
-    /// Heads that are no whole number of blocks: element by element, each sum in the same order.
+    /// Computes heads that are not a whole number of blocks: element by element, each sum in the
+    /// same order.
     fn one_by_one(mut self) {
         let width = self.op.heads * self.op.head_dim;
         let y = core::mem::take(&mut self.y);
@@ -269,7 +274,7 @@ impl<C: Cached> Sums<'_, C> {
     }
 }
 
-/// The products of `R` queries with sixteen keys, each summed in order.
+/// Computes the products of `R` queries with sixteen keys, each summed in order.
 #[inline(always)]
 #[expect(
     clippy::indexing_slicing,
@@ -300,7 +305,7 @@ fn dots<C: Cached, S: Simd, const R: usize>(
     sums
 }
 
-/// `P` blocks of `y`, from block `first` of `blocks` on; returns `P`.
+/// Computes `P` blocks of `y`, starting at block `first` of `blocks`, and returns `P`.
 #[inline(always)]
 #[expect(
     clippy::indexing_slicing,

@@ -1,12 +1,15 @@
-//! The key-value cache: where the keys and values of a token lie, in 32 bits or in 16.
+//! Layout of the key-value cache, in 32 bits or in 16.
 //!
-//! Keys lie in blocks of sixteen tokens, each block transposed, `[capacity / 16][width][16]`, the last block a whole one; values lie
-//! one contiguous row per token, `[capacity][width]`. Both are written once per token, by [`Append`], and read by
-//! [`Attention`](crate::Attention) in every later control step; with half precision they take half the memory and half the
-//! time to read, and are decoded in registers. Sums are 32-bit floats in any case.
+//! Keys are stored in blocks of sixteen tokens, each block transposed,
+//! `[capacity / 16][width][16]`, the last block a whole one; values are stored one contiguous row
+//! per token, `[capacity][width]`. Both are written once per token, by [`Append`], and read by
+//! [`Attention`](crate::Attention) in every later control step; with half precision they take half
+//! the memory and half the time to read, and are decoded in registers. Sums are always 32-bit
+//! floats.
 //!
-//! Nothing here can fail: rows beyond a cache's end are not written, and a number that half precision cannot hold becomes infinite
-//! (and what is computed from it not finite, which the controller refuses to send to motors).
+//! Nothing here can fail: rows beyond a cache's end are not written, and a number that half
+//! precision cannot hold becomes infinite (and results computed from it are not finite, which the
+//! controller refuses to send to motors).
 
 use crate::dispatch::{Isa, Kernel};
 use crate::elementwise::assign;
@@ -14,21 +17,21 @@ use crate::lanes::{Block, LANES};
 use crate::simd::{Portable, Simd};
 use crate::stored::{self, F16, F32, Stored};
 
-/// How the elements of a cache are stored.
+/// Storage format of the elements of a cache.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum CacheFormat {
-    /// IEEE 754 single precision: what was computed.
+    /// IEEE 754 single precision, without rounding.
     #[default]
     F32,
-    /// IEEE 754 half precision: the nearest number of 11 bits.
+    /// IEEE 754 half precision, rounded to the nearest number of 11 bits.
     F16,
 }
 
 impl CacheFormat {
-    /// All of them, the most exact first.
+    /// All cache formats, the most exact first.
     pub const ALL: [Self; 2] = [Self::F32, Self::F16];
 
-    /// Bytes of an element.
+    /// Returns the size of an element in bytes.
     pub const fn bytes(self) -> usize {
         match self {
             Self::F32 => 4,
@@ -36,7 +39,7 @@ impl CacheFormat {
         }
     }
 
-    /// Its name: `f32` or `f16`.
+    /// Returns the name of the format: `f32` or `f16`.
     pub const fn name(self) -> &'static str {
         match self {
             Self::F32 => "f32",
@@ -44,7 +47,7 @@ impl CacheFormat {
         }
     }
 
-    /// Elements in four bytes.
+    /// Returns the number of elements in four bytes.
     pub const fn per_word(self) -> usize {
         match self {
             Self::F32 => 1,
@@ -52,52 +55,52 @@ impl CacheFormat {
         }
     }
 
-    /// 4-byte words that `elements` elements take.
+    /// Returns the number of 4-byte words that `elements` elements take.
     pub const fn words(self, elements: usize) -> usize {
         elements.div_ceil(self.per_word())
     }
 }
 
-/// Keys, [`keys_len`] elements, and values, `[capacity, width]`.
+/// A key-value cache to read: keys, [`keys_len`] elements, and values, `[capacity, width]`.
 #[derive(Debug, Clone, Copy)]
 pub enum Cache<'c> {
-    /// [`CacheFormat::F32`]
+    /// A cache in [`CacheFormat::F32`].
     F32 {
-        /// The keys.
+        /// Keys, [`keys_len`] elements.
         keys: &'c [f32],
-        /// The values.
+        /// Values, `[capacity, width]`.
         values: &'c [f32],
     },
-    /// [`CacheFormat::F16`]
+    /// A cache in [`CacheFormat::F16`].
     F16 {
-        /// The keys.
+        /// Keys, [`keys_len`] elements.
         keys: &'c [u16],
-        /// The values.
+        /// Values, `[capacity, width]`.
         values: &'c [u16],
     },
 }
 
-/// Keys and values of a cache, to be written.
+/// A key-value cache to write.
 #[derive(Debug)]
 pub enum CacheMut<'c> {
-    /// [`CacheFormat::F32`]
+    /// A cache in [`CacheFormat::F32`].
     F32 {
-        /// The keys.
+        /// Keys, [`keys_len`] elements.
         keys: &'c mut [f32],
-        /// The values.
+        /// Values, `[capacity, width]`.
         values: &'c mut [f32],
     },
-    /// [`CacheFormat::F16`]
+    /// A cache in [`CacheFormat::F16`].
     F16 {
-        /// The keys.
+        /// Keys, [`keys_len`] elements.
         keys: &'c mut [u16],
-        /// The values.
+        /// Values, `[capacity, width]`.
         values: &'c mut [u16],
     },
 }
 
 impl CacheMut<'_> {
-    /// The cache, to be read.
+    /// Borrows the cache for reading.
     pub fn as_ref(&self) -> Cache<'_> {
         match self {
             Self::F32 { keys, values } => Cache::F32 { keys, values },
@@ -108,9 +111,9 @@ impl CacheMut<'_> {
 
 /// A format that a cache may have.
 pub(crate) trait Cached: Stored<Bits: Copy> {
-    /// Sixteen numbers as they are stored.
+    /// Converts sixteen numbers to the stored format.
     fn stored<S: Simd>(simd: S, from: &Block) -> [Self::Bits; LANES];
-    /// The number that stored bits mean.
+    /// Decodes one stored number.
     fn number(bits: Self::Bits) -> f32;
 }
 
@@ -136,7 +139,8 @@ impl Cached for F16 {
     }
 }
 
-/// Elements of the keys of a cache of `capacity` rows: their last block is a whole one.
+/// Returns the number of elements of the keys of a cache of `capacity` rows, the last block a whole
+/// one.
 pub const fn keys_len(capacity: usize, width: usize) -> usize {
     capacity.next_multiple_of(LANES).saturating_mul(width)
 }
@@ -144,22 +148,22 @@ pub const fn keys_len(capacity: usize, width: usize) -> usize {
 /// Keys and values of new tokens, one row each.
 #[derive(Debug, Clone, Copy)]
 pub struct Append<'x> {
-    /// Keys of the first token, and of each later one `k_stride` elements further.
+    /// Keys of the first token; each later token's keys start `k_stride` elements further.
     pub k: &'x [f32],
-    /// At least `width`.
+    /// Elements from one token's keys to the next, at least `width`.
     pub k_stride: usize,
-    /// Values, likewise.
+    /// Values of the first token; each later token's values start `v_stride` elements further.
     pub v: &'x [f32],
-    /// At least `width`.
+    /// Elements from one token's values to the next, at least `width`.
     pub v_stride: usize,
-    /// Elements of a row.
+    /// Number of elements of a row.
     pub width: usize,
-    /// The row of the cache for the first token.
+    /// Row of the cache for the first token.
     pub first: usize,
 }
 
 impl Append<'_> {
-    /// Writes them.
+    /// Writes the keys and values of the new tokens to the cache.
     pub fn run(&self, isa: Isa, cache: &mut CacheMut) {
         match cache {
             // A mere copy.
@@ -176,7 +180,7 @@ impl Append<'_> {
         }
     }
 
-    /// Row by row, sixteen elements together.
+    /// Writes keys and values row by row, sixteen elements at a time.
     #[inline(always)]
     fn write<C: Cached, S: Simd>(&self, simd: S, keys: &mut [C::Bits], values: &mut [C::Bits]) {
         let width = self.width.max(1);
@@ -207,7 +211,7 @@ impl Append<'_> {
     }
 }
 
-/// Sixteen elements; what is missing is zero.
+/// Returns sixteen elements; missing ones are zero.
 #[inline(always)]
 fn block(x: &[f32]) -> Block {
     let mut block = [0.0; LANES];
@@ -215,7 +219,7 @@ fn block(x: &[f32]) -> Block {
     block
 }
 
-/// Rounding at work.
+/// Kernel that rounds numbers to half precision.
 struct Rounded<'a> {
     append: &'a Append<'a>,
     keys: &'a mut [u16],

@@ -7,8 +7,8 @@
 //!         y[pixel][panel] = activation(sum + bias + y)
 //! ```
 //!
-//! There is no padding here: `x` is a view that has its border, so every pixel is the same work, and a kernel of one row is a
-//! convolution over time. Departures for speed, none of which changes a sum:
+//! There is no padding: the border is stored in `x`, so every pixel is the same work; a kernel of
+//! one row is a convolution over time. Departures for speed, none of which changes a sum:
 //!
 //! 1. Up to [`Simd::PIXELS`] pixels share each weight that is read, wherever in the image they lie; the pixels of an image are dealt
 //!    out evenly, because a tile of one pixel reads as many weights as one of six.
@@ -23,15 +23,18 @@ use crate::lanes::{Block, LANES};
 use crate::linear::{Activation, block};
 use crate::simd::{Simd, prefetch_ahead};
 
-/// Words of weights that are gone through for one tile of pixels before the next: a third of a first-level cache.
+/// Number of words of weights that are used for one tile of pixels before the next: a third of a
+/// first-level cache.
 const NEAR: usize = 4096;
 
-/// Elements of a `[k, n]` matrix in panels of sixteen outputs, `k` counting kernel rows, columns and input channels.
+/// Returns the number of elements of a `[k, n]` matrix in panels of sixteen outputs, `k` counting
+/// kernel rows, columns and input channels.
 pub const fn conv_packed_len([k, n]: [usize; 2]) -> usize {
     n.div_ceil(LANES) * LANES * k
 }
 
-/// Packs `w`, `[k, n]` row-major, into panels `[n / 16][k][16]`; columns are rounded up to sixteen with zeros. Offline work.
+/// Packs `w`, `[k, n]` row-major, into panels `[n / 16][k][16]`; columns are rounded up to sixteen
+/// with zeros. For offline use.
 ///
 /// # Panics
 /// When `w` is not `k * n` or `out` not [`conv_packed_len`] elements long.
@@ -49,26 +52,28 @@ pub fn conv_pack<T: Copy + Default>(w: &[T], [k, n]: [usize; 2], out: &mut [T]) 
     }
 }
 
-/// Where a convolution reads and writes. Sizes are of rows, then columns; strides are elements from a row to the next, then from a
-/// pixel to the next.
+/// Geometry of a convolution: sizes, strides and dilation of its input and output. Sizes are given
+/// for rows, then columns; strides are elements from a row to the next, then from a pixel to the
+/// next.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Sweep {
-    /// Output pixels.
+    /// Number of output pixels.
     pub out: [usize; 2],
-    /// Kernel.
+    /// Size of the kernel.
     pub kernel: [usize; 2],
     /// Input pixels from one output pixel to the next.
     pub stride: [usize; 2],
     /// Input pixels from one kernel element to the next.
     pub dilation: [usize; 2],
-    /// Of the input.
+    /// Strides of the input, in elements.
     pub x_strides: [usize; 2],
-    /// Of the output.
+    /// Strides of the output, in elements.
     pub y_strides: [usize; 2],
 }
 
 impl Sweep {
-    /// Elements of the input from the first that is read to behind the last, of pixels of `c` channels; `None` beyond `usize`.
+    /// Returns the number of elements of the input that are covered from the first to the last that
+    /// is read, for pixels of `c` channels; `None` beyond `usize`.
     pub(crate) fn reach(&self, c: usize) -> Option<usize> {
         let mut reach = c;
         for axis in 0..2 {
@@ -87,7 +92,7 @@ impl Sweep {
         Some(reach)
     }
 
-    /// The first input and the first output of each of the pixels from `first` on.
+    /// Returns the first input and the first output of `P` pixels, starting at pixel `first`.
     #[inline(always)]
     pub(crate) fn pixels<const P: usize>(&self, first: usize) -> [[usize; 2]; P] {
         let (mut row, mut col) = (first / self.out[1].max(1), first % self.out[1].max(1));
@@ -109,27 +114,28 @@ impl Sweep {
     }
 }
 
-/// A convolution of `c` input channels and `n` output channels.
+/// Convolution of `c` input channels and `n` output channels.
 #[derive(Debug, Clone, Copy)]
 pub struct Conv<'w> {
-    /// Where it reads and writes.
+    /// Geometry of the input and output.
     pub sweep: Sweep,
-    /// Input channels.
+    /// Number of input channels.
     pub c: usize,
-    /// Output channels.
+    /// Number of output channels.
     pub n: usize,
-    /// [`conv_packed_len`] elements, ordered by [`conv_pack`].
+    /// Packed weights: [`conv_packed_len`] elements, ordered by [`conv_pack`].
     pub w: &'w [f32],
-    /// `[n]`
+    /// Bias `[n]`.
     pub bias: &'w [f32],
-    /// Applied at the end, after accumulation.
+    /// Activation, applied last, after accumulation.
     pub activation: Activation,
-    /// Whether the sum is added to `y`.
+    /// True if the sum is added to `y`.
     pub accumulate: bool,
 }
 
 impl Conv<'_> {
-    /// Computes `y` from `x`, both from the first pixel on. A view that is too short, or weights that are, leave `y` as it was.
+    /// Computes `y` from `x`, both starting at their first pixel. If a view or the weights are too
+    /// short, `y` is unchanged.
     pub fn run(&self, isa: Isa, x: &[f32], y: &mut [f32]) {
         let [rows, cols] = self.sweep.kernel;
         let there = self
@@ -152,7 +158,7 @@ impl Conv<'_> {
     }
 }
 
-/// A convolution at work; `x` is long enough, and so are the weights.
+/// Operands of a running convolution; `x` and the weights are long enough.
 struct Pixels<'a> {
     conv: &'a Conv<'a>,
     k: usize,
@@ -160,7 +166,8 @@ struct Pixels<'a> {
     y: &'a mut [f32],
 }
 
-/// Runs of inputs that one output pixel reads: so many times so many, so far apart, each so long.
+/// Runs of inputs that one output pixel reads: two nested counts, their distances, and the length
+/// of a run.
 struct Runs {
     times: [usize; 2],
     apart: [usize; 2],
@@ -193,10 +200,10 @@ impl Runs {
     }
 }
 
-/// The most pixels and panels of a tile.
+/// Largest numbers of panels and of pixels of a tile.
 const MOST: [usize; 2] = [2, 6];
 
-/// Sums of a tile: panels, then pixels.
+/// Sums of a tile, by panel, then pixel.
 type Sums = [[Block; MOST[1]]; MOST[0]];
 
 impl Kernel for Pixels<'_> {
@@ -232,7 +239,7 @@ impl Kernel for Pixels<'_> {
     }
 }
 
-/// The sums of the first `size` of some pixels with `B` panels.
+/// Computes the sums of the first `size` of some pixels with `B` panels.
 #[inline(always)]
 fn some<S: Simd, const B: usize>(
     simd: S,
@@ -254,8 +261,9 @@ fn some<S: Simd, const B: usize>(
 }
 
 impl Pixels<'_> {
-    /// Bias, accumulation, activation and store of `size` pixels and so many panels from `panel` on. Written once for all sizes, and not
-    /// unrolled by those who know them: activations are long.
+    /// Applies bias, accumulation and activation to `size` pixels and the panels from `panel` on,
+    /// and stores them. Compiled once for all sizes and not unrolled for each, because activations
+    /// are long.
     #[inline(always)]
     fn finish<S: Simd>(
         &mut self,
@@ -279,7 +287,7 @@ impl Pixels<'_> {
 }
 
 impl Conv<'_> {
-    /// Accumulation, activation and store of the first `width` of sixteen outputs.
+    /// Applies accumulation and activation to the first `width` of sixteen outputs and stores them.
     #[inline(always)]
     fn finish<S: Simd>(&self, simd: S, mut v: S::V, y: &mut [f32], width: usize) {
         if width == LANES
@@ -302,7 +310,8 @@ impl Conv<'_> {
     }
 }
 
-/// The sums of `P` pixels with `B` panels of `k` weights each, from panel `first` on. Runs that are not there add nothing.
+/// Computes the sums of `P` pixels with `B` panels of `k` weights each, starting at panel `first`.
+/// Missing runs add nothing.
 #[inline(always)]
 #[expect(
     clippy::indexing_slicing,

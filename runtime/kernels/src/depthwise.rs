@@ -6,8 +6,9 @@
 //!     y[pixel][0..16] = activation(sum + bias)
 //! ```
 //!
-//! As in [`Conv`](crate::Conv) there is no padding: `x` is a view that has its border. Channels are the lanes; a few pixels at a time
-//! share the weights that are read. Each output is one sum in the order of the kernel.
+//! As in [`Conv`](crate::Conv) there is no padding: the border is stored in `x`. Channels are the
+//! lanes; a few pixels at a time share the weights that are read. Each output is one sum in the
+//! order of the kernel.
 
 use core::hint::black_box;
 
@@ -18,12 +19,14 @@ use crate::lanes::{Block, LANES};
 use crate::linear::{Activation, block};
 use crate::simd::Simd;
 
-/// Elements of the packed weights of so many kernel elements and channels.
+/// Returns the number of elements of the packed weights of `kernel` kernel elements and `c`
+/// channels.
 pub const fn depthwise_packed_len([kernel, c]: [usize; 2]) -> usize {
     c.next_multiple_of(LANES) * kernel
 }
 
-/// Packs `w`, `[kernel, c]` row-major, into `[kernel][c]` with `c` rounded up to sixteen with zeros. Offline work.
+/// Packs `w`, `[kernel, c]` row-major, into `[kernel][c]` with `c` rounded up to sixteen with
+/// zeros. For offline use.
 ///
 /// # Panics
 /// When `w` is not `kernel * c` or `out` not [`depthwise_packed_len`] elements long.
@@ -41,23 +44,24 @@ pub fn depthwise_pack(w: &[f32], [kernel, c]: [usize; 2], out: &mut [f32]) {
     }
 }
 
-/// A convolution of each of `c` channels with a kernel of its own.
+/// Depthwise convolution of `c` channels, each with a kernel of its own.
 #[derive(Debug, Clone, Copy)]
 pub struct Depthwise<'w> {
-    /// Where it reads and writes.
+    /// Geometry of the input and output.
     pub sweep: Sweep,
-    /// Channels.
+    /// Number of channels.
     pub c: usize,
-    /// [`depthwise_packed_len`] elements, ordered by [`depthwise_pack`].
+    /// Packed weights: [`depthwise_packed_len`] elements, ordered by [`depthwise_pack`].
     pub w: &'w [f32],
-    /// `[c]`
+    /// Bias `[c]`.
     pub bias: &'w [f32],
-    /// Applied at the end.
+    /// Activation, applied last.
     pub activation: Activation,
 }
 
 impl Depthwise<'_> {
-    /// Computes `y` from `x`, both from the first pixel on. A view that is too short, or weights that are, leave `y` as it was.
+    /// Computes `y` from `x`, both starting at their first pixel. If a view or the weights are too
+    /// short, `y` is unchanged.
     pub fn run(&self, isa: Isa, x: &[f32], y: &mut [f32]) {
         let [rows, cols] = self.sweep.kernel;
         let there = (self.sweep.reach(self.c)).is_some_and(|reach| reach <= x.len());
@@ -71,14 +75,14 @@ impl Depthwise<'_> {
     }
 }
 
-/// A depthwise convolution at work; `x` is long enough, and so are the weights.
+/// Operands of a running depthwise convolution; `x` and the weights are long enough.
 struct Channels<'a> {
     layer: &'a Depthwise<'a>,
     x: &'a [f32],
     y: &'a mut [f32],
 }
 
-/// The most pixels that share the weights that are read.
+/// Largest number of pixels that share the weights that are read.
 const MOST: usize = 4;
 
 impl Kernel for Channels<'_> {
@@ -111,8 +115,8 @@ impl Kernel for Channels<'_> {
 }
 
 impl Channels<'_> {
-    /// Bias, activation and store of sixteen channels of `size` pixels. Written once for all sizes, and not unrolled by those who know
-    /// them: activations are long.
+    /// Applies bias and activation to sixteen channels of `size` pixels and stores them. Compiled
+    /// once for all sizes and not unrolled for each, because activations are long.
     #[inline(always)]
     fn finish<S: Simd>(
         &mut self,
@@ -140,8 +144,8 @@ impl Channels<'_> {
     }
 }
 
-/// The sums of sixteen channels of `P` pixels. Behind the last pixel's channels zeros are read; behind another's, the next pixel, and
-/// nobody looks at the result.
+/// Computes the sums of sixteen channels of `P` pixels. Reads past a pixel's channels give zeros at
+/// the last pixel and the next pixel's elements elsewhere; those results are unused.
 #[inline(always)]
 #[expect(
     clippy::indexing_slicing,
@@ -202,10 +206,10 @@ fn sums<S: Simd, const P: usize>(
     }
 }
 
-/// The sixteen elements from `first` on.
+/// Returns the sixteen elements from `first` on.
 ///
 /// # Safety
-/// They are there.
+/// `x` has at least `first + 16` elements.
 #[inline(always)]
 #[expect(unsafe_code, reason = "see where it is called")]
 unsafe fn sixteen(x: &[f32], first: usize) -> &Block {

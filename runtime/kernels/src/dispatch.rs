@@ -1,4 +1,4 @@
-//! One kernel body, compiled once per instruction set.
+//! Instruction-set dispatch: one kernel body, compiled once per instruction set.
 //!
 //! ```text
 //! Isa::run(kernel):  AVX-512 → avx512(kernel)    the same inlined `Kernel::run`, with the vectors of `simd`
@@ -9,8 +9,8 @@
 //! ```
 //!
 //! Invariants:
-//! - An [`Isa`] is the proof that its instructions exist: only its constructors make one, and of them only [`Isa::detect`] and
-//!   [`Isa::all`] ask the CPU.
+//! - An [`Isa`] is the proof that its instructions exist: only its constructors make one, and only
+//!   [`Isa::detect`] and [`Isa::all`] query the CPU.
 //! - The bits of a result do not depend on the `Isa`. A wider register holds more of the sixteen lanes, and wider code sums more
 //!   outputs side by side, but each sum has the same operations in the same order, and Rust never fuses a multiplication with an
 //!   addition. `tests/twins.rs` compares every kernel bit for bit.
@@ -22,14 +22,15 @@ use core::fmt;
 
 use crate::simd::{Portable, Simd};
 
-/// Instructions that kernels may use, chosen once and then passed along; copying it costs nothing.
+/// Instruction set that kernels may use, chosen once and then passed along; copying it costs
+/// nothing.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Isa(Level);
 
-/// Sorted: a later one is wider.
+/// Levels of instruction sets, sorted from narrow to wide.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Level {
-    /// What the target of the build offers in any case.
+    /// The baseline of the build's target.
     Portable,
     /// AVX, AVX2 and F16C.
     #[cfg(target_arch = "x86_64")]
@@ -37,7 +38,7 @@ enum Level {
     /// AVX-512 F, BW, DQ, VL and VNNI, and the above: Cascade Lake, Zen 4 and later.
     #[cfg(target_arch = "x86_64")]
     Avx512,
-    /// NEON, which the target has in any case, by name.
+    /// NEON, the baseline of aarch64, through its intrinsics.
     #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
     Neon,
     /// NEON with the dot product of bytes: Cortex-A55, A75 and later.
@@ -46,12 +47,13 @@ enum Level {
 }
 
 impl Isa {
-    /// What every CPU of the build's target has. For tests, and where the machine code has to be the same on all machines.
+    /// Returns the baseline instruction set, which every CPU of the build's target has. For tests,
+    /// and where the machine code has to be the same on all machines.
     pub const fn portable() -> Self {
         Self(Level::Portable)
     }
 
-    /// The widest that this CPU and its operating system offer.
+    /// Returns the widest instruction set that this CPU and its operating system offer.
     pub fn detect() -> Self {
         #[cfg(target_arch = "x86_64")]
         return Self(x86_64::widest());
@@ -64,7 +66,8 @@ impl Isa {
         return Self::portable();
     }
 
-    /// All that this CPU and its operating system offer, the portable one first.
+    /// Returns all instruction sets that this CPU and its operating system offer, the portable one
+    /// first.
     pub fn all() -> impl Iterator<Item = Self> {
         let widest = Self::detect();
         [
@@ -83,7 +86,8 @@ impl Isa {
         .filter(move |isa| *isa <= widest)
     }
 
-    /// Its name: `portable`; on x86-64 also `avx2` and `avx512`, on aarch64 `neon` and `dotprod`.
+    /// Returns the name of the instruction set: `portable`; on x86-64 also `avx2` and `avx512`, on
+    /// aarch64 `neon` and `dotprod`.
     pub const fn name(self) -> &'static str {
         match self.0 {
             Level::Portable => "portable",
@@ -98,7 +102,7 @@ impl Isa {
         }
     }
 
-    /// Runs a kernel with these instructions.
+    /// Runs a kernel with this instruction set.
     #[inline(always)]
     pub(crate) fn run(self, kernel: impl Kernel) {
         match self.0 {
@@ -128,15 +132,16 @@ impl fmt::Debug for Isa {
 
 /// A kernel and its operands.
 pub(crate) trait Kernel {
-    /// Whether AVX-512 runs it on half as wide vectors: where conversions take the time, which wide ones do not shorten.
+    /// True if AVX-512 runs the kernel on vectors of half the width, because its time goes into
+    /// conversions, which wide vectors do not shorten.
     #[cfg_attr(
         not(target_arch = "x86_64"),
         allow(dead_code, reason = "only AVX-512 asks")
     )]
     const NARROW: bool = false;
 
-    /// Does the work. `#[inline(always)]` in every implementation, and in what it calls, so that each instruction set gets a
-    /// body of its own.
+    /// Runs the kernel with the vectors of `simd`. Every implementation, and every function that it
+    /// calls, is `#[inline(always)]`, so that each instruction set gets a body of its own.
     fn run<S: Simd>(self, simd: S);
 }
 
@@ -147,6 +152,8 @@ mod x86_64 {
     use super::{Kernel, Level};
     use crate::simd::x86_64::{Avx2, Avx512, Avx512Narrow};
 
+    /// Runs a kernel compiled for AVX2 and F16C.
+    ///
     /// # Safety
     /// The CPU and the operating system offer AVX2 and F16C.
     #[target_feature(enable = "avx2,f16c")]
@@ -155,6 +162,8 @@ mod x86_64 {
         kernel.run(unsafe { Avx2::new() });
     }
 
+    /// Runs a kernel compiled for AVX-512.
+    ///
     /// # Safety
     /// The CPU and the operating system offer AVX2, F16C and the five parts of AVX-512.
     #[target_feature(enable = "avx2,f16c,avx512f,avx512bw,avx512dq,avx512vl,avx512vnni")]
@@ -174,7 +183,8 @@ mod x86_64 {
     /// Bits of XCR0 for AVX-512: SSE, AVX, the mask registers, the upper halves of the first sixteen ZMM registers, the other sixteen.
     const ZMM_STATE: u64 = 0b1110_0110;
 
-    /// Asks the CPU. Bits and leaves are those of Intel's manual, volume 1, sections 14.3, 14.7.1 and 15.2.
+    /// Queries the CPU for the widest level. Bits and leaves are from Intel's manual, volume 1,
+    /// sections 14.3, 14.7.1 and 15.2.
     pub fn widest() -> Level {
         let has = |register: u32, bits: &[u32]| bits.iter().all(|bit| register >> bit & 1 == 1);
         if __cpuid(0).eax < 7 {
@@ -205,6 +215,8 @@ mod aarch64 {
     use super::{Kernel, Level};
     use crate::simd::aarch64::Dot;
 
+    /// Runs a kernel compiled for the dot product of bytes.
+    ///
     /// # Safety
     /// The CPU has FEAT_DotProd.
     #[target_feature(enable = "dotprod")]
@@ -221,7 +233,8 @@ mod aarch64 {
         }
     }
 
-    /// What the operating system says. The CPU's own registers are for the operating system alone, so elsewhere the build has to say it
+    /// Asks the operating system whether the CPU has the dot product of bytes. User code cannot
+    /// read the CPU's own registers, so elsewhere the build has to state it
     /// (`-C target-feature=+dotprod`, as Apple's targets do).
     fn has_dot_product() -> bool {
         #[cfg(any(target_os = "linux", target_os = "android"))]
@@ -254,7 +267,7 @@ mod tests {
         assert!(Isa::all().is_sorted());
     }
 
-    /// The standard library's detection is another implementation of the same question.
+    /// Compares the detection with the standard library's independent implementation.
     #[cfg(target_arch = "x86_64")]
     #[test]
     fn detection_agrees_with_the_standard_library() {
@@ -274,7 +287,7 @@ mod tests {
         assert_eq!(Isa::detect().name(), expected);
     }
 
-    /// The standard library's detection is another implementation of the same question.
+    /// Compares the detection with the standard library's independent implementation.
     #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
     #[test]
     fn detection_agrees_with_the_standard_library() {

@@ -5,7 +5,7 @@ use crate::lanes::{Block, LANES};
 use crate::math;
 use crate::simd::Simd;
 
-/// Copies element by element as far as both slices reach: `copy_from_slice` without its panic.
+/// Copies element by element up to the shorter slice's end: `copy_from_slice` without its panic.
 #[inline(always)]
 pub fn assign(to: &mut [f32], from: &[f32]) {
     for (to, &from) in to.iter_mut().zip(from) {
@@ -13,16 +13,16 @@ pub fn assign(to: &mut [f32], from: &[f32]) {
     }
 }
 
-/// An operation on one element.
+/// Functions of one element.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum UnaryKind {
-    /// `max(x, 0)`
+    /// Rectifier, `max(x, 0)`.
     Relu,
-    /// `x` where `x >= 0`, else `alpha * x`.
+    /// Leaky rectifier: `x` where `x >= 0`, else `alpha * x`.
     LeakyRelu,
     /// Hyperbolic tangent.
     Tanh,
-    /// `1 / (1 + exp(-x))`
+    /// Logistic sigmoid, `1 / (1 + exp(-x))`.
     Sigmoid,
     /// Natural exponential.
     Exp,
@@ -30,52 +30,52 @@ pub enum UnaryKind {
     Log,
     /// Square root.
     Sqrt,
-    /// `1 / sqrt(x)`
+    /// Reciprocal square root, `1 / sqrt(x)`.
     Rsqrt,
-    /// `-x`
+    /// Negation, `-x`.
     Neg,
     /// Absolute value.
     Abs,
-    /// `1 / x`
+    /// Reciprocal, `1 / x`.
     Recip,
     /// Error function.
     Erf,
-    /// `x * x`
+    /// Square, `x * x`.
     Square,
-    /// `x` where `x >= 0`, else `alpha * (exp(x) - 1)`.
+    /// Exponential linear unit: `x` where `x >= 0`, else `alpha * (exp(x) - 1)`.
     Elu,
-    /// `log(1 + exp(x))`
+    /// Softplus, `log(1 + exp(x))`.
     Softplus,
-    /// `x * tanh(log(1 + exp(x)))`
+    /// Mish, `x * tanh(log(1 + exp(x)))`.
     Mish,
-    /// The next whole number towards zero.
+    /// Rounding towards zero.
     Trunc,
 }
 
-/// An operation on each element.
+/// Unary operation on each element.
 #[derive(Debug, Clone, Copy)]
 pub struct Unary {
-    /// Which.
+    /// Function to compute.
     pub kind: UnaryKind,
-    /// The slope of [`UnaryKind::LeakyRelu`], the factor of [`UnaryKind::Elu`].
+    /// Slope of [`UnaryKind::LeakyRelu`], factor of [`UnaryKind::Elu`].
     pub alpha: f32,
 }
 
 impl Unary {
-    /// `y[i] = kind(x[i])`
+    /// Computes `y[i] = kind(x[i])`.
     pub fn run(self, isa: Isa, x: &[f32], y: &mut [f32]) {
         assign(y, x);
         self.run_in_place(isa, y);
     }
 
-    /// `y[i] = kind(y[i])`
+    /// Computes `y[i] = kind(y[i])`.
     pub fn run_in_place(self, isa: Isa, y: &mut [f32]) {
         let Self { kind, alpha } = self;
         isa.run(Elements { kind, alpha, y });
     }
 }
 
-/// A unary operation at work.
+/// Operands of a running unary operation.
 struct Elements<'a> {
     kind: UnaryKind,
     alpha: f32,

@@ -1,11 +1,11 @@
-//! Panels of weights that are floats: decoded where they are short, then products and sums of 32-bit floats.
+//! Panels of float weights: short formats are decoded, then products and sums are 32-bit floats.
 
 use crate::lanes::LANES;
 use crate::linear::{PANEL_BLOCKS, Sums};
 use crate::simd::{Simd, prefetch_ahead};
 use crate::stored::Stored;
 
-/// One panel and `R` rows, in as many parts as the registers ask for.
+/// Computes one panel for `R` rows, in as many parts as the registers require.
 #[inline(always)]
 pub(crate) fn panel<S: Simd, W: Stored, const R: usize>(
     simd: S,
@@ -27,7 +27,8 @@ pub(crate) fn panel<S: Simd, W: Stored, const R: usize>(
     }
 }
 
-/// The sums of `R` rows of `k` elements with `P` blocks, from block `at` on, of a panel of `blocks`; returns `P`.
+/// Computes the sums of `R` rows of `k` elements with `P` blocks, starting at block `at` of a panel
+/// of `blocks`, and returns `P`.
 #[inline(always)]
 #[expect(
     clippy::indexing_slicing,

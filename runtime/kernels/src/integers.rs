@@ -24,7 +24,7 @@ use crate::lanes::{Block, LANES};
 use crate::linear::{PANEL_BLOCKS, Sums};
 use crate::simd::{Portable, Simd, prefetch_ahead};
 
-/// Inputs that are made integers at a time.
+/// Number of inputs that are converted to integers at a time.
 pub(crate) const PART: usize = 256;
 
 /// Pairs of inputs whose products are added before they become floats: `2 * PAIRS * 16383 * 8191 < 2^31`.
@@ -33,18 +33,18 @@ pub(crate) const PAIRS: usize = 8;
 /// Largest magnitude of an input as an integer.
 const LARGEST: f32 = 8191.0;
 
-/// Two inputs.
+/// A pair of inputs as integers.
 type Pair = [i16; 2];
 
-/// Inputs whose products are added before they become floats.
+/// Inputs whose products are added as integers before they become floats.
 pub(crate) type Group = [Pair; PAIRS];
 
-/// How integer weights are stored.
+/// A storage format of integer weights.
 pub(crate) trait Integer: Copy {
-    /// Two weights of each of sixteen outputs, as 16-bit integers.
+    /// Loads two weights of each of sixteen outputs, as 16-bit integers.
     fn load<S: Simd>(simd: S, from: &[Self; 2 * LANES]) -> S::Pairs;
 
-    /// The sums of a group of inputs, as [`Simd::group_of_bytes`].
+    /// Computes the sums of a group of inputs, like [`Simd::group_of_bytes`].
     #[inline(always)]
     fn group<'w, S: Simd, const P: usize, const R: usize>(
         simd: S,
@@ -81,10 +81,10 @@ impl Integer for i8 {
     }
 }
 
-/// A part of a row as integers, followed by zeros.
+/// Part of a row as integers, followed by zeros.
 pub(crate) struct Part {
     pairs: [Pair; PART / 2],
-    /// The input that the integer one stands for.
+    /// Value of an input per unit of its integer.
     scale: f32,
 }
 
@@ -95,11 +95,11 @@ impl Part {
         scale: 0.0,
     };
 
-    /// Takes the first part of a row.
+    /// Converts the first part of a row.
     #[inline(always)]
     pub fn take<S: Simd>(&mut self, simd: S, x: &[f32]) {
         const INFINITE: u32 = f32::INFINITY.to_bits();
-        /// 2^-100
+        /// Bits of 2^-100, below which magnitudes are read as zero.
         const SMALLEST: u32 = (127 - 100) << 23;
         // All ones, for masks: a selection may be compiled to a branch.
         let all = |condition: bool| u32::from(condition).wrapping_neg();
@@ -130,7 +130,7 @@ impl Part {
     }
 }
 
-/// Adds the sums of parts `i` of `R` rows with one panel of so many blocks to those of the parts before.
+/// Adds the sums of parts `i` of `R` rows with one panel to those of the parts before.
 #[inline(always)]
 pub(crate) fn panel<S: Simd, W: Integer, const R: usize>(
     simd: S,
@@ -170,7 +170,8 @@ pub(crate) fn panel<S: Simd, W: Integer, const R: usize>(
     }
 }
 
-/// Adds the sums of part `i` of one row, block by block: where registers are few, compiled once for any number of rows.
+/// Adds the sums of part `i` of one row, block by block; where registers are few, it is compiled
+/// once for any number of rows.
 #[inline(never)]
 fn one_row<W: Integer>(
     w: &[[W; 2 * LANES]],
@@ -184,7 +185,8 @@ fn one_row<W: Integer>(
     }
 }
 
-/// Adds the sums of parts `i` of `R` rows with `P` blocks, from block `at` on, of a panel of `blocks`; returns `P`.
+/// Adds the sums of parts `i` of `R` rows with `P` blocks, starting at block `at` of a panel of
+/// `blocks`, and returns `P`.
 #[inline(always)]
 #[expect(
     unsafe_code,
@@ -236,7 +238,7 @@ fn sweep<S: Simd, W: Integer, const P: usize, const R: usize>(
     P
 }
 
-/// The sums of a group, pair by pair.
+/// Computes the sums of a group, pair by pair.
 #[inline(always)]
 #[expect(
     clippy::indexing_slicing,

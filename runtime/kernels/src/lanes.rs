@@ -1,12 +1,13 @@
 //! Sums in sixteen lanes: element `i` goes to lane `i % 16`, then the lanes are added as a tree. One order on every target.
 
-/// Lanes of a sum. Sixteen elements are one cache line, and fill vectors of four, eight or sixteen.
+/// Number of lanes of a sum. Sixteen elements are one cache line, and fill vectors of four, eight
+/// or sixteen.
 pub const LANES: usize = 16;
 
-/// One block of elements.
+/// One block of [`LANES`] elements.
 pub type Block = [f32; LANES];
 
-/// The sum of the lanes: halves are added until one element is left.
+/// Returns the sum of the lanes: halves are added until one element is left.
 #[inline(always)]
 #[expect(
     clippy::indexing_slicing,
@@ -24,7 +25,7 @@ pub fn tree(acc: &Block) -> f32 {
     (four[0] + four[2]) + (four[1] + four[3])
 }
 
-/// Sum of `f(x[i])`.
+/// Returns the sum of `f(x[i])`.
 #[inline(always)]
 pub fn sum_of(x: &[f32], f: impl Fn(f32) -> f32) -> f32 {
     let mut acc = [0.0; LANES];
@@ -40,7 +41,7 @@ pub fn sum_of(x: &[f32], f: impl Fn(f32) -> f32) -> f32 {
     tree(&acc)
 }
 
-/// The largest element, or negative infinity; elements that are not a number are passed over.
+/// Returns the largest element, or negative infinity; NaNs are skipped.
 #[inline(always)]
 pub fn max_of(x: &[f32]) -> f32 {
     let larger = |a: f32, b: f32| if b > a { b } else { a };

@@ -1,13 +1,17 @@
-//! Dense kernels for batch-1 policies: slices and shapes, nothing of ONNX or LADS.
+//! Dense kernels for batch-1 policies, on slices and shapes, independent of ONNX and LADS.
 //!
 //! Invariants:
-//! - No allocation, no `std`, no panic, and no unsafe code but in `dispatch`, `simd`, `subnormal` and the loops over weights, cache and images: a slice
-//!   that is too short leaves the rest of the result as it was.
-//!   Callers that want to be told check shapes beforehand; `lads-image` does so once per program.
-//! - The same bits on every target with IEEE 754 arithmetic, but for subnormal numbers under [`flushed`]: every sum has one fixed order (sixteen lanes, then a tree; outputs of layers and images in the order of their inputs), no
-//!   multiply-add is fused, and `exp`, `tanh` and `sigmoid` are the polynomials of [`math`].
-//! - Inner loops run over blocks of sixteen elements: plain Rust that compilers vectorise, or the vectors of `simd` where a control
-//!   step spends its time. Those kernels are compiled once per instruction set and take an [`Isa`], which says which of them to run.
+//! - No allocation, no `std`, no panic, and no unsafe code but in `dispatch`, `simd`, `subnormal`
+//!   and the loops over weights, cache and images: a slice that is too short leaves the rest of the
+//!   result unchanged. Callers that need an error check shapes beforehand; `lads-image` does so
+//!   once per program.
+//! - Results have the same bits on every target with IEEE 754 arithmetic, except for subnormal
+//!   numbers under [`flushed`]: every sum has one fixed order (sixteen lanes, then a tree; outputs
+//!   of layers and images in the order of their inputs), no multiply-add is fused, and `exp`,
+//!   `tanh` and `sigmoid` are the polynomials of [`math`].
+//! - Inner loops run over blocks of sixteen elements: plain Rust that compilers vectorise, or the
+//!   vectors of `simd` where a control step spends its time. Those kernels are compiled once per
+//!   instruction set and take an [`Isa`], which selects the one to run.
 //!
 //! [`mod@reference`] holds the naive twin of every kernel; `tests/twins.rs` compares them on random shapes.
 #![no_std]

@@ -10,7 +10,7 @@
 //! weight once. A target with few registers takes a panel in parts. Each output is one sum in the order of `k`, then the scale,
 //! then the bias, whatever the number of rows or parts.
 //!
-//! How a panel is summed up is in `floats` and, for weights that are integers, in `integers`.
+//! The module `floats` sums panels of float weights, `integers` those of integer weights.
 
 use core::hint::black_box;
 use core::ops::Range;
@@ -24,13 +24,14 @@ use crate::math;
 use crate::simd::Simd;
 use crate::stored::{Bf16, F16, F32, Panels, WeightFormat};
 
-/// Blocks of sixteen outputs in a whole panel.
+/// Number of blocks of sixteen outputs in a whole panel.
 pub(crate) const PANEL_BLOCKS: usize = 4;
 
-/// Outputs of one whole weight panel.
+/// Number of outputs of one whole weight panel.
 pub const PANEL: usize = PANEL_BLOCKS * LANES;
 
-/// Rows of a `[k, n]` weight matrix in panels: `k`, with integers rounded up to sixteen.
+/// Returns the number of rows of a `[k, n]` weight matrix in panels: `k`, rounded up to sixteen for
+/// integer formats.
 pub const fn packed_rows(format: WeightFormat, k: usize) -> usize {
     if format.is_scaled() {
         k.next_multiple_of(LANES)
@@ -39,13 +40,15 @@ pub const fn packed_rows(format: WeightFormat, k: usize) -> usize {
     }
 }
 
-/// Elements of a `[k, n]` weight matrix in panels: rows times `n` rounded up to sixteen.
+/// Returns the number of elements of a `[k, n]` weight matrix in panels: rows times `n` rounded up
+/// to sixteen.
 pub const fn packed_len(format: WeightFormat, [k, n]: [usize; 2]) -> usize {
     n.div_ceil(LANES) * LANES * packed_rows(format, k)
 }
 
-/// Packs `w`, `[k, n]` row-major, into panels `[n / 64][k][64]`, of integers `[n / 64][k / 2][64][2]`. What is left of `n` is a last,
-/// narrower panel. Rows and columns are rounded up to sixteen with zeros. Offline work.
+/// Packs `w`, `[k, n]` row-major, into panels `[n / 64][k][64]`, or `[n / 64][k / 2][64][2]` for
+/// integer formats. The remainder of `n` becomes a last, narrower panel. Rows and columns are
+/// rounded up to sixteen with zeros. For offline use.
 ///
 /// # Panics
 /// When `w` is not `k * n` or `out` not [`packed_len`] elements long.
@@ -67,37 +70,39 @@ pub fn pack<T: Copy + Default>(format: WeightFormat, w: &[T], [k, n]: [usize; 2]
     }
 }
 
-/// Whether the kernels of integer weights are in this build; without them such a layer computes nothing.
+/// True if this build has the kernels of integer weights; without them such a layer computes
+/// nothing.
 const INTEGERS: bool = cfg!(feature = "integer-weights");
 
-/// Whether the kernels of 16-bit floats are in this build; without them such a layer computes nothing.
+/// True if this build has the kernels of 16-bit floats; without them such a layer computes nothing.
 const HALVES: bool = cfg!(feature = "half-weights");
 
-/// The non-linearity of a dense layer.
+/// Non-linearity of a dense layer or a convolution.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Activation {
-    /// `x`
+    /// Identity, `x`.
     None,
-    /// `max(x, 0)`
+    /// Rectifier, `max(x, 0)`.
     Relu,
-    /// `x` where `x >= 0`, else `alpha * x`.
+    /// Leaky rectifier: `x` where `x >= 0`, else `alpha * x`.
     LeakyRelu(f32),
-    /// `min(max(x, 0), bound)`: with a bound of 6, the rectifier of mobile networks.
+    /// Clipped rectifier, `min(max(x, 0), bound)`: with a bound of 6, the ReLU6 of mobile networks.
     Clipped(f32),
     /// Hyperbolic tangent.
     Tanh,
-    /// `1 / (1 + exp(-x))`
+    /// Logistic sigmoid, `1 / (1 + exp(-x))`.
     Sigmoid,
-    /// `x` where `x >= 0`, else `alpha * (exp(x) - 1)`.
+    /// Exponential linear unit: `x` where `x >= 0`, else `alpha * (exp(x) - 1)`.
     Elu(f32),
-    /// `log(1 + exp(x))`
+    /// Softplus, `log(1 + exp(x))`.
     Softplus,
-    /// `x * tanh(log(1 + exp(x)))`
+    /// Mish, `x * tanh(log(1 + exp(x)))`.
     Mish,
 }
 
 impl Activation {
-    /// The operation on each element that a layer may leave for the end: long code, which is compiled once.
+    /// Returns the unary operation that a layer may leave for a last pass over its outputs: long
+    /// code, which is compiled once.
     fn for_the_end(self) -> Option<Unary> {
         let (kind, alpha) = match self {
             Self::None | Self::Relu | Self::LeakyRelu(_) | Self::Clipped(_) => return None,
@@ -112,7 +117,7 @@ impl Activation {
 
     #[inline(always)]
     pub(crate) fn apply<S: Simd>(self, simd: S, x: S::V) -> S::V {
-        /// Where a result is added to what is there; the same code for all instruction sets.
+        /// Applies a long activation element by element, in code that all instruction sets share.
         #[inline(never)]
         fn each(block: &mut Block, alpha: f32, f: fn(f32, f32) -> f32) {
             for x in block {
@@ -142,20 +147,20 @@ impl Activation {
     }
 }
 
-/// A dense layer of `k` inputs and `n` outputs.
+/// Dense layer of `k` inputs and `n` outputs.
 #[derive(Debug, Clone, Copy)]
 pub struct Linear<'w> {
-    /// Inputs.
+    /// Number of inputs.
     pub k: usize,
-    /// Outputs.
+    /// Number of outputs.
     pub n: usize,
-    /// [`packed_len`] elements, ordered by [`pack`].
+    /// Packed weights: [`packed_len`] elements, ordered by [`pack`].
     pub w: Panels<'w>,
-    /// `[n]`, or empty for none.
+    /// Bias `[n]`, or empty for none.
     pub bias: &'w [f32],
-    /// Applied to `x·W + b`.
+    /// Activation, applied to `x·W + b`.
     pub activation: Activation,
-    /// Whether the result is added to `y` or replaces it.
+    /// True if the result is added to `y`; else it replaces `y`.
     pub accumulate: bool,
 }
 
@@ -196,13 +201,15 @@ impl Linear<'_> {
         }
     }
 
-    /// The layer with integer weights. Out of line, so float layers do not reserve this stack buffer.
+    /// Runs the layer with integer weights. Out of line, so float layers do not reserve this stack
+    /// buffer.
     #[inline(never)]
     fn integers(&self, isa: Isa, activation: Activation, x: &[f32], y: &mut [f32]) {
         self.wide(isa, activation, x, y, &mut [Part::EMPTY; 2]);
     }
 
-    /// The layer with 32-bit floats or integers as weights. Out of line, so that these formats share one compiled body.
+    /// Runs the layer with 32-bit floats or integers as weights. Out of line, so that these formats
+    /// share one compiled body.
     #[inline(never)]
     fn wide(&self, isa: Isa, activation: Activation, x: &[f32], y: &mut [f32], parts: &mut [Part]) {
         isa.run(Rows::<false> {
@@ -214,14 +221,14 @@ impl Linear<'_> {
         });
     }
 
-    /// Whether the weights are integers.
+    /// Returns whether the weights are integers.
     #[inline(always)]
     fn is_scaled(&self) -> bool {
         INTEGERS && matches!(self.w, Panels::Int8 { .. } | Panels::Int16 { .. })
     }
 
-    /// The sums of `R` rows with the panel of so many blocks that is weights `at`; with integers those of part `i`, added to those
-    /// of earlier parts.
+    /// Computes the sums of `R` rows with the panel that starts at weight `at`; with integers it
+    /// adds those of part `i` to those of earlier parts.
     #[inline(always)]
     fn panel<S: Simd, const R: usize, const NARROW: bool>(
         &self,
@@ -255,7 +262,8 @@ impl Linear<'_> {
         }
     }
 
-    /// Scale, bias, activation and store of sixteen outputs from `first` on, or of as many as there are.
+    /// Applies scale, bias and activation to the up to sixteen outputs from `first` on, and stores
+    /// them.
     #[inline(always)]
     fn finish<S: Simd>(
         &self,
@@ -285,7 +293,7 @@ impl Linear<'_> {
     }
 }
 
-/// The sixteen elements from `first` on; what is missing is zero, in `spare`.
+/// Returns the sixteen elements from `first` on; missing ones are zero, in `spare`.
 #[inline(always)]
 pub(crate) fn block<'b>(x: &'b [f32], first: usize, spare: &'b mut Block) -> &'b Block {
     let x = x.get(first..).unwrap_or(&[]);
@@ -297,12 +305,13 @@ pub(crate) fn block<'b>(x: &'b [f32], first: usize, spare: &'b mut Block) -> &'b
     spare
 }
 
-/// A layer at work, of wide weights or integers, or of `NARROW` ones, see [`Kernel::NARROW`].
+/// Operands of a running layer, of wide weights or integers, or of `NARROW` ones, see
+/// [`Kernel::NARROW`].
 struct Rows<'a, const NARROW: bool> {
     layer: &'a Linear<'a>,
-    /// The layer's, or none where it is applied at the end.
+    /// Activation of the layer, or none if it is applied in a last pass.
     activation: Activation,
-    /// Two for integer weights, else empty.
+    /// Two parts for integer weights, else empty.
     parts: &'a mut [Part],
     x: &'a [f32],
     y: &'a mut [f32],

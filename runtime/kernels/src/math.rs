@@ -4,25 +4,25 @@
 //! Error bounds are the largest relative errors that `tests/math.rs` finds against `f64` over a dense sample of all `f32`.
 //! In units in the last place, of which one is a relative 6.0e-8 to 1.2e-7: below 1.2e-7 is below 2 units, below 2.5e-7 below 4.2.
 
-/// `max(x, 0)`; not a number stays not a number.
+/// Rectifier, `max(x, 0)`; NaN stays NaN.
 #[inline(always)]
 pub fn relu(x: f32) -> f32 {
     if x < 0.0 { 0.0 } else { x }
 }
 
-/// `x` where `x >= 0`, else `alpha * x`.
+/// Leaky rectifier: `x` where `x >= 0`, else `alpha * x`.
 #[inline(always)]
 pub fn leaky_relu(x: f32, alpha: f32) -> f32 {
     if x < 0.0 { alpha * x } else { x }
 }
 
-/// The larger; not a number if either is.
+/// Returns the larger number; NaN if either is NaN.
 #[inline(always)]
 pub fn max(a: f32, b: f32) -> f32 {
     if a < b || b.is_nan() { b } else { a }
 }
 
-/// The smaller; not a number if either is.
+/// Returns the smaller number; NaN if either is NaN.
 #[inline(always)]
 pub fn min(a: f32, b: f32) -> f32 {
     if a > b || b.is_nan() { b } else { a }
@@ -41,7 +41,8 @@ pub fn exp(x: f32) -> f32 {
     (p + 1.0) * power_of_two(half) * power_of_two(n.wrapping_sub(half))
 }
 
-/// `n` and `p` with `exp(x) = 2^n * (1 + p)`, of an `x` between -104 and 89.
+/// Splits an exponential: returns `n` and `p` with `exp(x) = 2^n * (1 + p)`, for an `x` between
+/// -104 and 89.
 #[inline(always)]
 fn split(x: f32) -> (i32, f32) {
     // 1.5 * 2^23: adding it leaves the rounded number in the low bits of the mantissa.
@@ -64,7 +65,8 @@ fn split(x: f32) -> (i32, f32) {
     (n, p * (r * r) + r)
 }
 
-/// `x` where `x >= 0`, else `alpha * (exp(x) - 1)`, near zero without cancellation; relative error below 1.2e-7 with an `alpha` of 1.
+/// Exponential linear unit: `x` where `x >= 0`, else `alpha * (exp(x) - 1)`, near zero without
+/// cancellation; relative error below 1.2e-7 with an `alpha` of 1.
 #[inline(always)]
 pub fn elu(x: f32, alpha: f32) -> f32 {
     // Below -30 the exponential is lost beside one.
@@ -74,7 +76,7 @@ pub fn elu(x: f32, alpha: f32) -> f32 {
     if x < 0.0 { below } else { x }
 }
 
-/// `log(1 + exp(x))`; relative error below 4.0e-7 where the result is a normal number.
+/// Softplus, `log(1 + exp(x))`; relative error below 4.0e-7 where the result is a normal number.
 ///
 /// `max(x, 0) + log(1 + t)` with `t = exp(-|x|)`, and `log(1 + t) = 2 atanh(s)` with `s = t / (2 + t)`, at most a third, as a series.
 #[inline(always)]
@@ -91,7 +93,8 @@ pub fn softplus(x: f32) -> f32 {
     relu(x) + (2.0 * s + 2.0 * s * z * p)
 }
 
-/// `x * tanh(log(1 + exp(x)))`; relative error below 4.0e-7 where the result is a normal number.
+/// Mish, `x * tanh(log(1 + exp(x)))`; relative error below 4.0e-7 where the result is a normal
+/// number.
 ///
 /// With `w = exp(x)` the hyperbolic tangent is `n / (n + 2)`, `n = w (w + 2)`.
 #[inline(always)]
@@ -102,31 +105,32 @@ pub fn mish(x: f32) -> f32 {
     x * (n / (n + 2.0))
 }
 
-/// The next whole number towards zero.
+/// Rounds towards zero.
 #[inline(always)]
 pub fn trunc(x: f32) -> f32 {
     libm::truncf(x)
 }
 
-/// 1 where `a > b`, else 0.
+/// Returns 1 if `a > b`, else 0.
 #[inline(always)]
 pub fn greater(a: f32, b: f32) -> f32 {
     if a > b { 1.0 } else { 0.0 }
 }
 
-/// `a` where `b` is not zero, else 0.
+/// Returns `a` if `b` is not zero, else 0.
 #[inline(always)]
 pub fn keep(a: f32, b: f32) -> f32 {
     if b == 0.0 { 0.0 } else { a }
 }
 
-/// `2^n` for `n` in `-126..=127`.
+/// Returns `2^n` for `n` in `-126..=127`.
 #[inline(always)]
 fn power_of_two(n: i32) -> f32 {
     f32::from_bits((n.wrapping_add(127) << 23).cast_unsigned())
 }
 
-/// `1 / (1 + exp(-x))`; relative error below 2.5e-7 where the result is a normal number.
+/// Logistic sigmoid, `1 / (1 + exp(-x))`; relative error below 2.5e-7 where the result is a normal
+/// number.
 #[inline(always)]
 pub fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + exp(-x))
@@ -158,7 +162,7 @@ pub fn log(x: f32) -> f32 {
     libm::logf(x)
 }
 
-/// `a` to the power of `b`, from the `libm` crate; relative error below 1.2e-7.
+/// Power `a^b`, from the `libm` crate; relative error below 1.2e-7.
 pub fn pow(a: f32, b: f32) -> f32 {
     libm::powf(a, b)
 }

@@ -1,15 +1,16 @@
 //! Products of two activations, batched and strided.
 
-/// `y[b, i, j] = sum over l of a[b, i, l] * b[b, l, j]`, each sum in the order of `l`.
+/// Batched matrix product `y[b, i, j] = sum over l of a[b, i, l] * b[b, l, j]`, each sum in the
+/// order of `l`.
 #[derive(Debug, Clone, Copy)]
 pub struct MatMul {
-    /// Independent products.
+    /// Number of independent products.
     pub batch: usize,
-    /// Rows.
+    /// Number of rows.
     pub m: usize,
     /// Inner dimension.
     pub k: usize,
-    /// Columns.
+    /// Number of columns.
     pub n: usize,
     /// Strides of `a` over batch, `m` and `k`.
     pub a_strides: [usize; 3],
@@ -38,7 +39,7 @@ impl MatMul {
     }
 }
 
-/// `y[j] += a * b[j * stride]`
+/// Computes `y[j] += a * b[j * stride]`.
 #[inline(always)]
 fn add_row(y: &mut [f32], a: f32, b: &[f32], stride: usize) {
     match (stride, b.first()) {

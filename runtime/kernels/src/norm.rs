@@ -9,17 +9,18 @@ use crate::simd::Simd;
 /// Layer norm with the weights of one layer.
 #[derive(Debug, Clone, Copy)]
 pub struct LayerNorm<'w> {
-    /// Multiplies each normalised element; its length is that of a row.
+    /// Scale of each normalised element; its length is that of a row.
     pub gamma: &'w [f32],
-    /// Added last; as long as `gamma`.
+    /// Shift, added last; as long as `gamma`.
     pub beta: &'w [f32],
-    /// Added to the variance.
+    /// Constant added to the variance.
     pub eps: f32,
 }
 
 impl LayerNorm<'_> {
-    /// `y = (x - mean) / sqrt(variance + eps) * gamma + beta` for each row of `gamma.len()` elements; population variance,
-    /// taken in a second pass over the differences from the mean.
+    /// Computes `y = (x - mean) / sqrt(variance + eps) * gamma + beta` for each row of
+    /// `gamma.len()` elements; population variance, taken in a second pass over the differences
+    /// from the mean.
     pub fn run(&self, isa: Isa, x: &[f32], y: &mut [f32]) {
         if !self.gamma.is_empty() {
             isa.run(LayerNormRows { norm: *self, x, y });
@@ -27,7 +28,7 @@ impl LayerNorm<'_> {
     }
 }
 
-/// Layer norm at work.
+/// Operands of a running layer norm.
 struct LayerNormRows<'a> {
     norm: LayerNorm<'a>,
     x: &'a [f32],
@@ -51,14 +52,14 @@ impl Kernel for LayerNormRows<'_> {
     }
 }
 
-/// `y = exp(x - max) / sum(exp(x - max))` for each row of `cols` elements.
+/// Computes `y = exp(x - max) / sum(exp(x - max))` for each row of `cols` elements.
 pub fn softmax(isa: Isa, x: &[f32], cols: usize, y: &mut [f32]) {
     if cols > 0 {
         isa.run(SoftmaxRows { x, cols, y });
     }
 }
 
-/// Softmax at work.
+/// Operands of a running softmax.
 struct SoftmaxRows<'a> {
     x: &'a [f32],
     cols: usize,

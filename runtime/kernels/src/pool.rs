@@ -1,4 +1,4 @@
-//! The largest and the mean of windows of an image `[rows, columns, channels]`.
+//! Pooling: maximum and mean of windows of an image `[rows, columns, channels]`.
 //!
 //! ```text
 //! for each output pixel:  y[c] = max or sum over the window's pixels inside the image of x[pixel][c]; a sum is divided by their number,
@@ -13,45 +13,48 @@ use crate::elementwise::assign;
 use crate::math;
 use crate::simd::Simd;
 
-/// What is made of a window.
+/// Function of the elements of a window.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PoolKind {
-    /// The largest element; not a number if any is.
+    /// Largest element; NaN if any element is NaN.
     Max,
-    /// The mean of the elements inside the image.
+    /// Mean of the elements inside the image.
     Mean,
-    /// The sum of the elements inside the image, divided by the pixels of the window inside image and padding.
+    /// Sum of the elements inside the image, divided by the number of the window's pixels inside
+    /// image and padding.
     PaddedMean,
 }
 
-/// Windows over an image. Sizes are of rows, then columns; strides are elements from a row to the next, then from a pixel to the next.
+/// Pooling of windows over an image. Sizes are given for rows, then columns; strides are elements
+/// from a row to the next, then from a pixel to the next.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Pool {
-    /// What is computed.
+    /// Function to compute.
     pub kind: PoolKind,
-    /// Input pixels.
+    /// Number of input pixels.
     pub size: [usize; 2],
-    /// Output pixels.
+    /// Number of output pixels.
     pub out: [usize; 2],
-    /// Channels.
+    /// Number of channels.
     pub c: usize,
-    /// Window.
+    /// Size of the window.
     pub kernel: [usize; 2],
     /// Input pixels from one window to the next.
     pub stride: [usize; 2],
     /// Input pixels from one element of a window to the next.
     pub dilation: [usize; 2],
-    /// Rows above the image, columns left of it.
+    /// Padding: rows above the image, columns left of it.
     pub before: [usize; 2],
-    /// Rows below the image, columns right of it.
+    /// Padding: rows below the image, columns right of it.
     pub after: [usize; 2],
-    /// Of the input.
+    /// Strides of the input, in elements.
     pub x_strides: [usize; 2],
-    /// Of the output.
+    /// Strides of the output, in elements.
     pub y_strides: [usize; 2],
 }
 
-/// One axis of a window: its first element inside the image, how many are inside, and how many inside image and padding.
+/// One axis of a window: its first element inside the image, the number inside, and the number
+/// inside image and padding.
 struct Cut {
     first: usize,
     inside: usize,
@@ -59,7 +62,7 @@ struct Cut {
 }
 
 impl Pool {
-    /// Computes `y` from `x`, both from the first pixel on.
+    /// Computes `y` from `x`, both starting at their first pixel.
     pub fn run(&self, isa: Isa, x: &[f32], y: &mut [f32]) {
         isa.run(Windows { pool: self, x, y });
     }
@@ -90,7 +93,7 @@ impl Pool {
     }
 }
 
-/// Windows at work.
+/// Operands of a running pooling.
 struct Windows<'a> {
     pool: &'a Pool,
     x: &'a [f32],
@@ -130,7 +133,7 @@ impl Kernel for Windows<'_> {
 }
 
 impl Pool {
-    /// Combines the pixels of a window from the first on.
+    /// Combines the pixels of a window, starting at the first.
     #[inline(always)]
     fn window(
         &self,

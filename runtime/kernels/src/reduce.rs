@@ -4,31 +4,32 @@ use crate::elementwise::assign;
 use crate::lanes::{LANES, sum_of};
 use crate::math;
 
-/// How an axis is reduced.
+/// Function that reduces an axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ReduceKind {
     /// Sum of the elements.
     Sum,
     /// Sum divided by the axis' length.
     Mean,
-    /// The largest element; not a number if any is.
+    /// Largest element; NaN if any element is NaN.
     Max,
-    /// The smallest element; not a number if any is.
+    /// Smallest element; NaN if any element is NaN.
     Min,
     /// Product of the elements.
     Prod,
 }
 
-/// The axis that is reduced: `x` is `[outer, len, inner]`, `outer` following from its length.
+/// Axis to reduce: `x` is `[outer, len, inner]`, where `outer` follows from its length.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Axis {
     /// Length of the axis.
     pub len: usize,
-    /// Product of the dimensions after it.
+    /// Product of the dimensions after the axis.
     pub inner: usize,
 }
 
-/// `y[o, i] = kind over a of x[o, a, i]`. Sums over the last axis run in sixteen lanes, all others in the axis' order.
+/// Computes `y[o, i] = kind over a of x[o, a, i]`. Sums over the last axis run in sixteen lanes,
+/// all others in the axis' order.
 pub fn reduce(kind: ReduceKind, x: &[f32], axis: Axis, y: &mut [f32]) {
     if axis.len == 0 || axis.inner == 0 {
         return;
@@ -59,7 +60,7 @@ fn sum(x: &[f32], y: &mut [f32]) {
     }
 }
 
-/// Combines the rows of `x`, each as long as `y`, from the first on.
+/// Combines the rows of `x`, each as long as `y`, starting at the first.
 #[inline(always)]
 fn fold(x: &[f32], y: &mut [f32], f: impl Fn(f32, f32) -> f32) {
     let mut rows = x.chunks_exact(y.len().max(1));
@@ -73,23 +74,26 @@ fn fold(x: &[f32], y: &mut [f32], f: impl Fn(f32, f32) -> f32) {
     }
 }
 
-/// Index of the largest element, the first of equal ones; elements that are not a number are passed over. 0 if there is none.
+/// Returns the index of the largest element, the first of equal ones; NaNs are skipped. Returns 0
+/// if there is no number.
 pub fn arg_max(x: &[f32]) -> usize {
     first_largest(x, |rank| rank)
 }
 
-/// Index of the smallest element, the first of equal ones; elements that are not a number are passed over. 0 if there is none.
+/// Returns the index of the smallest element, the first of equal ones; NaNs are skipped. Returns 0
+/// if there is no number.
 pub fn arg_min(x: &[f32]) -> usize {
     first_largest(x, |rank| -rank)
 }
 
-/// Arithmetic of integers without a comparison, which may be compiled to a branch: a decision executes the same instructions
-/// whichever plan is the best.
+/// Returns the index of the element of highest rank, by integer arithmetic without a comparison,
+/// which may be compiled to a branch: a decision executes the same instructions whichever plan is
+/// the best.
 #[inline(always)]
 fn first_largest(x: &[f32], rank: impl Fn(i64) -> i64) -> usize {
-    /// Below the rank of every number, and its negation too.
+    /// Rank below that of every number; so is its negation.
     const NONE: i64 = i64::MIN / 4;
-    /// Ones where it is negative, else zeros.
+    /// Returns all ones if `x` is negative, else zeros.
     #[inline(always)]
     fn negative(x: i64) -> i64 {
         x >> 63

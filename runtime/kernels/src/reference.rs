@@ -1,4 +1,5 @@
-//! The naive twin of every kernel, written from its definition with sums in `f64`. For tests; slow, and panics on bad shapes.
+//! Naive twin of every kernel, written from its definition with sums in `f64`. For tests; slow, and
+//! panics on bad shapes.
 #![allow(
     clippy::indexing_slicing,
     reason = "twins read like the definition and run in tests only"
@@ -13,7 +14,7 @@ use crate::{
 
 pub use images::{conv, depthwise, pool, resize};
 
-/// `x`, after the non-linearity.
+/// Applies a non-linearity to `x`.
 pub fn activation(activation: Activation, x: f64) -> f64 {
     match activation {
         // What is no number stays none.
@@ -29,12 +30,12 @@ pub fn activation(activation: Activation, x: f64) -> f64 {
     }
 }
 
-/// `log(1 + exp(x))`
+/// Returns `log(1 + exp(x))`.
 fn softplus(x: f64) -> f64 {
     x.max(0.0) + libm::log1p(libm::exp(-x.abs()))
 }
 
-/// `activation(x·w + bias)` with `w` as `[k, n]`; `y` is `[m, n]` and `bias` may be empty.
+/// Computes `activation(x·w + bias)` with `w` as `[k, n]`; `y` is `[m, n]` and `bias` may be empty.
 pub fn linear(
     x: &[f32],
     w: &[f32],
@@ -52,7 +53,7 @@ pub fn linear(
     }
 }
 
-/// Layer norm of each row of `gamma.len()` elements.
+/// Computes the layer norm of each row of `gamma.len()` elements.
 pub fn layer_norm(x: &[f32], gamma: &[f32], beta: &[f32], eps: f32, y: &mut [f32]) {
     let cols = gamma.len();
     for (i, y) in y.iter_mut().enumerate() {
@@ -69,7 +70,7 @@ pub fn layer_norm(x: &[f32], gamma: &[f32], beta: &[f32], eps: f32, y: &mut [f32
     }
 }
 
-/// `core` has no `powi`.
+/// Squares a number; `core` has no `powi`.
 trait Square {
     fn powi_2(self) -> Self;
 }
@@ -80,7 +81,7 @@ impl Square for f64 {
     }
 }
 
-/// Softmax of each row of `cols` elements.
+/// Computes the softmax of each row of `cols` elements.
 pub fn softmax(x: &[f32], cols: usize, y: &mut [f32]) {
     for (i, y) in y.iter_mut().enumerate() {
         let row = &x[i / cols * cols..][..cols];
@@ -92,7 +93,7 @@ pub fn softmax(x: &[f32], cols: usize, y: &mut [f32]) {
     }
 }
 
-/// Attention of each query to the rows of the cache that it sees.
+/// Computes the attention of each query to the rows of the cache that it sees.
 pub fn attention(op: &Attention, q: &[f32], y: &mut [f32]) {
     let width = op.heads * op.head_dim;
     for (i, y) in y.iter_mut().enumerate() {
@@ -130,12 +131,12 @@ impl Cache<'_> {
     }
 }
 
-/// Where element `col` of key `row` lies.
+/// Returns the position of element `col` of key `row`.
 pub fn key(width: usize, row: usize, col: usize) -> usize {
     (row / 16 * width + col) * 16 + row % 16
 }
 
-/// One element.
+/// Computes a unary function of one element.
 pub fn unary(kind: UnaryKind, alpha: f32, x: f32) -> f32 {
     let x = f64::from(x);
     (match kind {
@@ -159,7 +160,7 @@ pub fn unary(kind: UnaryKind, alpha: f32, x: f32) -> f32 {
     }) as f32
 }
 
-/// Two elements.
+/// Computes a binary function of two elements.
 pub fn binary(kind: BinaryKind, a: f32, b: f32) -> f32 {
     let (a, b) = (f64::from(a), f64::from(b));
     (match kind {
@@ -176,7 +177,7 @@ pub fn binary(kind: BinaryKind, a: f32, b: f32) -> f32 {
     }) as f32
 }
 
-/// The offset of the `i`-th element of a shape in a strided layout.
+/// Returns the offset of the `i`-th element of a shape in a strided layout.
 pub fn offset(dims: [usize; 4], strides: [usize; 4], mut i: usize) -> usize {
     let mut offset = 0;
     for (dim, stride) in dims.into_iter().zip(strides).rev() {
@@ -186,14 +187,14 @@ pub fn offset(dims: [usize; 4], strides: [usize; 4], mut i: usize) -> usize {
     offset
 }
 
-/// A strided copy.
+/// Copies between two strided layouts.
 pub fn copy(op: &StridedCopy, x: &[f32], y: &mut [f32]) {
     for i in 0..op.dims.iter().product() {
         y[offset(op.dims, op.y_strides, i)] = x[offset(op.dims, op.x_strides, i)];
     }
 }
 
-/// A reduction.
+/// Reduces one axis.
 pub fn reduce(kind: ReduceKind, x: &[f32], axis: Axis, y: &mut [f32]) {
     for (i, y) in y.iter_mut().enumerate() {
         let first = i / axis.inner * axis.len * axis.inner + i % axis.inner;
@@ -208,7 +209,7 @@ pub fn reduce(kind: ReduceKind, x: &[f32], axis: Axis, y: &mut [f32]) {
     }
 }
 
-/// A matrix product.
+/// Computes a batched matrix product.
 pub fn matmul(op: &MatMul, a: &[f32], b: &[f32], y: &mut [f32]) {
     for (i, y) in y.iter_mut().enumerate() {
         let (batch, row, col) = (i / (op.m * op.n), i / op.n % op.m, i % op.n);

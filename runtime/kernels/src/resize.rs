@@ -1,43 +1,47 @@
-//! An image `[rows, columns, channels]` in another size: each output pixel is a mix of two rows and two columns of the input.
+//! Resizes an image `[rows, columns, channels]`: each output pixel is a mix of two rows and two
+//! columns of the input.
 //!
 //! ```text
 //! y[i][j] = mix(mix(x[r0][c0], x[r0][c1], wc), mix(x[r1][c0], x[r1][c1], wc), wr),  mix(a, b, w) = a + (b - a) * w
 //! ```
 //!
-//! Which rows and columns, and how much of the second, is in tables that were made offline: the nearest pixel is a mix with weight 0.
-//! Coordinates beyond the image are those of its last pixel, so no table can make this read elsewhere.
+//! The rows and columns, and the weight of the second, are in tables that were made offline: the
+//! nearest pixel is a mix with weight 0. Coordinates beyond the image are those of its last pixel,
+//! so no table can cause a read elsewhere.
 
 use crate::dispatch::{Isa, Kernel};
 use crate::simd::Simd;
 
-/// Numbers of a table for each row or column of the output: first input, second input, weight of the second.
+/// Numbers of a table for each row or column of the output: first input, second input, weight of
+/// the second.
 pub(crate) const TABLE_WIDTH: usize = 3;
 
-/// A change of size. Sizes are of rows, then columns; strides are elements from a row to the next, then from a pixel to the next.
+/// Resizing of an image by tables. Sizes are given for rows, then columns; strides are elements
+/// from a row to the next, then from a pixel to the next.
 #[derive(Debug, Clone, Copy)]
 pub struct Resize<'w> {
-    /// Input pixels.
+    /// Number of input pixels.
     pub size: [usize; 2],
-    /// Channels.
+    /// Number of channels.
     pub c: usize,
-    /// `[output rows, 3]`: first row, second row, weight of the second.
+    /// Table `[output rows, 3]`: first row, second row, weight of the second.
     pub rows: &'w [f32],
-    /// `[output columns, 3]`, alike.
+    /// Table `[output columns, 3]`: first column, second column, weight of the second.
     pub cols: &'w [f32],
-    /// Of the input.
+    /// Strides of the input, in elements.
     pub x_strides: [usize; 2],
-    /// Of the output.
+    /// Strides of the output, in elements.
     pub y_strides: [usize; 2],
 }
 
 impl Resize<'_> {
-    /// Computes `y` from `x`, both from the first pixel on.
+    /// Computes `y` from `x`, both starting at their first pixel.
     pub fn run(&self, isa: Isa, x: &[f32], y: &mut [f32]) {
         isa.run(Mixes { resize: self, x, y });
     }
 }
 
-/// A change of size at work.
+/// Operands of a running resize.
 struct Mixes<'a> {
     resize: &'a Resize<'a>,
     x: &'a [f32],

@@ -1,11 +1,12 @@
 //! Vectors of sixteen lanes, one implementation per instruction set; the bits of every operation are those of [`Portable`].
 //!
-//! Loops that compilers vectorise by themselves are written over arrays; the loops in which a control step spends its time, over
-//! weights and over the KV cache, are written with these vectors, so that what they compile to does not depend on the
-//! compiler's mood.
+//! Loops that compilers vectorise by themselves are written over arrays; the loops in which a
+//! control step spends its time, over weights and over the KV cache, are written with these
+//! vectors, so that their machine code does not depend on the compiler's choices.
 //!
-//! Invariant: a value that implements [`Simd`] is the proof that its instructions exist. Those of an instruction set that the
-//! target does not have in any case are made by `dispatch` alone, inside a function that is compiled for them.
+//! Invariant: a value that implements [`Simd`] is the proof that its instructions exist. Only
+//! `dispatch` makes the value of an instruction set beyond the target's baseline, inside a function
+//! that is compiled for it.
 #![allow(unsafe_code)]
 
 #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
@@ -17,72 +18,75 @@ use crate::integers::{self, Group};
 use crate::lanes::{Block, LANES};
 use crate::stored;
 
-/// An instruction set's vectors.
+/// Vectors of one instruction set.
 pub(crate) trait Simd: Copy {
-    /// Sixteen lanes.
+    /// Vector of sixteen lanes of `f32`.
     type V: Copy;
-    /// Sixteen lanes of two 16-bit integers.
+    /// Vector of sixteen lanes of two 16-bit integers.
     type Pairs: Copy;
-    /// Sixteen lanes of a 32-bit integer.
+    /// Vector of sixteen lanes of a 32-bit integer.
     type Integers: Copy;
 
-    /// How many sums of sixteen lanes stay in registers, beside the operands.
+    /// Number of sums of sixteen lanes that stay in registers, beside the operands.
     const SUMS: usize;
-    /// How many sums of products take turns, one or two: two where the next product would wait for the sum, as two take more code.
+    /// Number of sums of products that alternate, one or two: two if the next product would wait
+    /// for the sum, though two take more code.
     const CHAINS: usize;
-    /// Pixels of an image whose sums stay in registers, beside the weights of as many panels as [`PANELS`](Self::PANELS) says.
+    /// Number of pixels of an image whose sums stay in registers, beside the weights of
+    /// [`PANELS`](Self::PANELS) panels.
     const PIXELS: usize;
-    /// Panels of sixteen outputs that share the pixels that are read, one or two.
+    /// Number of panels of sixteen outputs that share the pixels that are read, one or two.
     const PANELS: usize;
 
-    /// The same number in every lane.
+    /// Returns the same number in every lane.
     fn splat(self, x: f32) -> Self::V;
-    /// Sixteen numbers of memory.
+    /// Loads sixteen numbers from memory.
     fn load(self, from: &Block) -> Self::V;
-    /// Back to memory.
+    /// Stores sixteen numbers to memory.
     fn store(self, v: Self::V, to: &mut Block);
-    /// `a + b`
+    /// Returns `a + b`.
     fn add(self, a: Self::V, b: Self::V) -> Self::V;
-    /// `other` in the lanes where `x < 0`, else `x`.
+    /// Returns `other` in the lanes where `x < 0`, else `x`.
     fn where_negative(self, x: Self::V, other: Self::V) -> Self::V;
-    /// `bound` in the lanes where it is less than `x`, else `x`.
+    /// Returns `bound` in the lanes where it is less than `x`, else `x`.
     fn at_most(self, x: Self::V, bound: Self::V) -> Self::V;
-    /// `a * b`
+    /// Returns `a * b`.
     fn mul(self, a: Self::V, b: Self::V) -> Self::V;
-    /// `sum + a * b`, rounded twice: never fused.
+    /// Returns `sum + a * b`, rounded twice: never fused.
     fn add_product(self, sum: Self::V, a: Self::V, b: Self::V) -> Self::V;
-    /// Sixteen half-precision numbers, [`stored::from_f16`].
+    /// Loads sixteen half-precision numbers, see [`stored::from_f16`].
     fn load_f16(self, from: &[u16; LANES]) -> Self::V;
-    /// Sixteen numbers as half-precision ones, [`stored::round_to_f16`].
+    /// Rounds sixteen numbers to half precision, see [`stored::round_to_f16`].
     fn round_to_f16(self, v: Self::V) -> [u16; LANES];
-    /// Sixteen brain floats, [`stored::from_bf16`].
+    /// Loads sixteen brain floats, see [`stored::from_bf16`].
     fn load_bf16(self, from: &[u16; LANES]) -> Self::V;
-    /// The same two integers in every lane.
+    /// Returns the same two integers in every lane.
     #[expect(
         clippy::trivially_copy_pass_by_ref,
         reason = "where it lies, it can be read into every lane at once"
     )]
     fn splat_pair(self, pair: &[i16; 2]) -> Self::Pairs;
-    /// Sixteen pairs of memory.
+    /// Loads sixteen pairs from memory.
     fn load_i16(self, from: &[i16; 2 * LANES]) -> Self::Pairs;
-    /// Sixteen pairs of memory, widened from 8-bit integers.
+    /// Loads sixteen pairs of 8-bit integers from memory and widens them.
     fn load_i8(self, from: &[i8; 2 * LANES]) -> Self::Pairs;
-    /// No sum yet.
+    /// Returns sums of zero.
     fn zeros(self) -> Self::Integers;
-    /// `sum + a[0] * b[0] + a[1] * b[1]`; what overflows wraps around.
+    /// Returns `sum + a[0] * b[0] + a[1] * b[1]`; overflow wraps around.
     fn add_products(self, sum: Self::Integers, a: Self::Pairs, b: Self::Pairs) -> Self::Integers;
-    /// `a + b`; what overflows wraps around.
+    /// Returns `a + b`; overflow wraps around.
     fn add_integers(self, a: Self::Integers, b: Self::Integers) -> Self::Integers;
-    /// The nearest floats, ties to even.
+    /// Converts integers to the nearest floats, ties to even.
     fn floats(self, integers: Self::Integers) -> Self::V;
-    /// The nearest integers, ties to even, of magnitudes up to 32767; any integers of what is larger or no number.
+    /// Rounds magnitudes up to 32767 to the nearest integers, ties to even; larger ones and NaN
+    /// give any integers.
     fn whole(self, v: Self::V) -> [i16; LANES];
-    /// The larger of each integer, not negative, and the bits of a float without its sign.
+    /// Returns the larger of each integer, not negative, and the bits of a float without its sign.
     fn larger(self, largest: Self::Integers, v: Self::V) -> Self::Integers;
-    /// The largest of sixteen integers that are not negative.
+    /// Returns the largest of sixteen integers that are not negative.
     fn largest(self, integers: Self::Integers) -> u32;
-    /// The sums of a group of inputs of `R` rows with `P` blocks of 8-bit weights, as floats; `w(pair, block)` are the weights of a pair of
-    /// inputs. What overflows wraps around.
+    /// Computes the sums of a group of inputs of `R` rows with `P` blocks of 8-bit weights, as
+    /// floats; `w(pair, block)` are the weights of a pair of inputs. Overflow wraps around.
     #[inline(always)]
     fn group_of_bytes<'w, const P: usize, const R: usize>(
         self,
@@ -93,17 +97,20 @@ pub(crate) trait Simd: Copy {
     }
 }
 
-/// Numbers to which this is added end in their nearest integer, ties to even, as the low bits of a float: 3 * 2^22.
+/// Constant that rounds when added: the low bits of the float sum are the nearest integer, ties to
+/// even; 3 * 2^22.
 const ROUND: f32 = 12_582_912.0;
 
 /// All bits of a float but its sign.
 const MAGNITUDE: i32 = i32::MAX;
 
-/// Asks for the cache line that will be read [`AHEAD`] bytes after the `i`th of blocks that lie one after the other, once for each
-/// line, where the target has an instruction for it. A hint: nothing need be there.
+/// Prefetches the cache line that will be read [`AHEAD`] bytes after the `i`th of consecutive
+/// blocks, once for each line, where the target has an instruction for it. It is a hint: the
+/// address need not be valid.
 ///
-/// Weights and KV cache are read strictly in order, so the processor's own prefetcher follows them; but it stops at the end of a page,
-/// and does not ask for as many lines at a time as memory could give.
+/// Weights and KV cache are read strictly in order, so the processor's own prefetcher follows them;
+/// but it stops at the end of a page, and does not request as many lines at a time as memory could
+/// deliver.
 #[inline(always)]
 pub(crate) fn prefetch_ahead<T>(i: usize, block: &T) {
     #[cfg(target_arch = "x86_64")]
@@ -131,22 +138,23 @@ pub(crate) fn prefetch_ahead<T>(i: usize, block: &T) {
     let _ = (i, block);
 }
 
-/// Bytes of a cache line.
+/// Size of a cache line in bytes.
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 const LINE: usize = 64;
 
-/// Far enough for memory to answer, near enough for the first-level cache: of 0.5 to 64 KiB, a Xeon took least time with 8, and on it
-/// and another generation a control step takes a quarter less than without where memory is far, and an action up to a tenth less
-/// where it is near.
+/// Distance of the prefetch in bytes, far enough for memory to answer, near enough for the
+/// first-level cache: of 0.5 to 64 KiB, a Xeon took least time with 8, and on it and another
+/// generation a control step takes a quarter less than without where memory is far, and an action
+/// up to a tenth less where it is near.
 #[cfg(target_arch = "x86_64")]
 const AHEAD: usize = 8192;
 
-/// What memory delivers while it answers once, 10 GB/s for 200 ns: boards have smaller first-level caches and narrower memory.
-/// Computed, not measured.
+/// Distance of the prefetch in bytes, which memory delivers during one access, 10 GB/s for 200 ns:
+/// boards have smaller first-level caches and narrower memory. Computed, not measured.
 #[cfg(target_arch = "aarch64")]
 const AHEAD: usize = 2048;
 
-/// What the build's target has in any case: arrays, which compilers put into its registers.
+/// Baseline of the build's target: arrays, which compilers put into its registers.
 #[derive(Clone, Copy)]
 pub(crate) struct Portable;
 
@@ -297,7 +305,7 @@ impl Simd for Portable {
     }
 }
 
-/// [`Simd::add_products`] for arrays.
+/// Implements [`Simd::add_products`] for arrays.
 #[cfg(any(test, not(target_arch = "x86_64")))]
 #[inline(always)]
 fn add_products(mut sum: [i32; LANES], a: [i16; 2 * LANES], b: [i16; 2 * LANES]) -> [i32; LANES] {

@@ -1,5 +1,5 @@
-//! How weights are stored: 32-bit floats, shorter ones that are decoded in registers while they are read, or integers, with which
-//! the inputs of a layer become integers too (see `integers`).
+//! Storage formats of weights: 32-bit floats, shorter ones that are decoded in registers while they
+//! are read, or integers, with which the inputs of a layer become integers too (see `integers`).
 //!
 //! | format | bits | error of a weight | error of an input |
 //! |---|---|---|---|
@@ -9,13 +9,14 @@
 //! | `Bf16` | 16 | half a unit of 8 bits (relative 2^-8) | none |
 //! | `Int8` | 8, and one `f32` scale per output | half of the scale: the output's largest weight / 254 | the largest of 256 inputs / 16382 |
 //!
-//! Conversions round to the nearest, ties to even, and are exact the other way, so every instruction set decodes the same bits.
-//! Encoding is offline work and can fail: [`to_f16`] has no number for what is too large.
+//! Conversions round to the nearest, ties to even, and are exact the other way, so every
+//! instruction set decodes the same bits. Encoding is done offline and can fail: [`to_f16`] returns
+//! `None` for numbers that are too large.
 
 use crate::lanes::{Block, LANES};
 use crate::simd::Simd;
 
-/// How the weights of a dense layer are stored.
+/// Storage format of the weights of a dense layer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum WeightFormat {
     /// IEEE 754 single precision.
@@ -23,7 +24,7 @@ pub enum WeightFormat {
     F32,
     /// IEEE 754 half precision.
     F16,
-    /// The upper half of single precision.
+    /// Brain float, the upper half of single precision.
     Bf16,
     /// Integers from -127 to 127, times a scale per output.
     Int8,
@@ -32,10 +33,10 @@ pub enum WeightFormat {
 }
 
 impl WeightFormat {
-    /// All of them, the most exact first.
+    /// All weight formats, the most exact first.
     pub const ALL: [Self; 5] = [Self::F32, Self::Int16, Self::F16, Self::Bf16, Self::Int8];
 
-    /// Bytes of a weight.
+    /// Returns the size of a weight in bytes.
     pub const fn bytes(self) -> usize {
         match self {
             Self::F32 => 4,
@@ -44,12 +45,12 @@ impl WeightFormat {
         }
     }
 
-    /// Whether weights are integers, times a scale per output.
+    /// Returns whether weights are integers, times a scale per output.
     pub const fn is_scaled(self) -> bool {
         matches!(self, Self::Int8 | Self::Int16)
     }
 
-    /// Its name: `f32`, `int16`, `f16`, `bf16` or `int8`.
+    /// Returns the name of the format: `f32`, `int16`, `f16`, `bf16` or `int8`.
     pub const fn name(self) -> &'static str {
         match self {
             Self::F32 => "f32",
@@ -61,36 +62,36 @@ impl WeightFormat {
     }
 }
 
-/// The weights of a dense layer in panels, as [`pack`](crate::pack) orders them.
+/// Weights of a dense layer in panels, as [`pack`](crate::pack) orders them.
 #[derive(Debug, Clone, Copy)]
 pub enum Panels<'w> {
-    /// [`WeightFormat::F32`]
+    /// Weights in [`WeightFormat::F32`].
     F32(&'w [f32]),
-    /// [`WeightFormat::F16`]
+    /// Weights in [`WeightFormat::F16`].
     F16(&'w [u16]),
-    /// [`WeightFormat::Bf16`]
+    /// Weights in [`WeightFormat::Bf16`].
     Bf16(&'w [u16]),
-    /// [`WeightFormat::Int8`]
+    /// Weights in [`WeightFormat::Int8`].
     Int8 {
-        /// The integers.
+        /// Integers of the panels.
         panels: &'w [i8],
-        /// `[n]`: multiplies each output's sum.
+        /// Factor of each output's sum, `[n]`.
         scales: &'w [f32],
     },
-    /// [`WeightFormat::Int16`]
+    /// Weights in [`WeightFormat::Int16`].
     Int16 {
-        /// The integers.
+        /// Integers of the panels.
         panels: &'w [i16],
-        /// `[n]`: multiplies each output's sum.
+        /// Factor of each output's sum, `[n]`.
         scales: &'w [f32],
     },
 }
 
-/// A format of floats at work: how sixteen stored weights become a vector.
+/// A float format that decodes sixteen stored weights to a vector.
 pub(crate) trait Stored {
-    /// One weight as it is stored.
+    /// One weight in its stored form.
     type Bits;
-    /// Decodes.
+    /// Decodes sixteen weights.
     fn load<S: Simd>(simd: S, from: &[Self::Bits; LANES]) -> S::V;
 }
 
@@ -122,8 +123,9 @@ impl Stored for Bf16 {
     }
 }
 
-/// The number that half-precision bits mean; exact. Integer arithmetic, and one subtraction of normal numbers for those below
-/// the normal range, so that it does not depend on how the processor treats subnormal numbers.
+/// Decodes a half-precision number; exact. It uses integer arithmetic, and one subtraction of
+/// normal numbers for those below the normal range, so that the result does not depend on how the
+/// processor treats subnormal numbers.
 #[inline(always)]
 pub fn from_f16(bits: u16) -> f32 {
     // What the exponents' biases, 127 and 15, differ by, and the exponent 2^-14 of the smallest normal number.
@@ -148,13 +150,15 @@ pub fn from_f16(bits: u16) -> f32 {
     f32::from_bits(found | u32::from(bits & 0x8000) << 16)
 }
 
-/// Sixteen of them; compiled once, because it is long, which a call is not.
+/// Decodes sixteen half-precision numbers; compiled once, because the code is long and a call is
+/// not.
 #[inline(never)]
 pub(crate) fn all_from_f16(bits: &[u16; LANES]) -> Block {
     bits.map(from_f16)
 }
 
-/// The nearest half-precision number, ties to even; infinite from 65520 on, the midpoint between 65504 and what would come next.
+/// Rounds to the nearest half-precision number, ties to even; infinite from 65520 on, the midpoint
+/// between 65504 and the next number.
 #[inline(always)]
 pub fn round_to_f16(x: f32) -> u16 {
     const INFINITE: u32 = 0x7c00;
@@ -183,24 +187,27 @@ pub fn round_to_f16(x: f32) -> u16 {
     sign | found as u16
 }
 
-/// Sixteen numbers rounded to half precision; compiled once, because it is long and a control step needs it for the new tokens only.
+/// Rounds sixteen numbers to half precision; compiled once, because the code is long and a control
+/// step needs it for the new tokens only.
 #[inline(never)]
 pub(crate) fn round_all_to_f16(x: &Block) -> [u16; LANES] {
     x.map(round_to_f16)
 }
 
-/// The nearest half-precision number, ties to even; `None` for what is not finite or rounds to infinity.
+/// Rounds to the nearest half-precision number, ties to even; `None` if `x` is not finite or rounds
+/// to infinity.
 pub fn to_f16(x: f32) -> Option<u16> {
     (x.abs() < 65520.0).then(|| round_to_f16(x))
 }
 
-/// The number that a brain float means; exact.
+/// Decodes a brain float; exact.
 #[inline(always)]
 pub fn from_bf16(bits: u16) -> f32 {
     f32::from_bits(u32::from(bits) << 16)
 }
 
-/// The nearest brain float, ties to even; `None` for what is not finite or rounds to infinity.
+/// Rounds to the nearest brain float, ties to even; `None` if `x` is not finite or rounds to
+/// infinity.
 pub fn to_bf16(x: f32) -> Option<u16> {
     let bits = x.to_bits();
     let rounded = bits.checked_add(0x7fff + (bits >> 16 & 1))? >> 16;
@@ -213,12 +220,14 @@ const INT16_LARGEST: f32 = 16383.0;
 /// Largest quantised `Int8` magnitude.
 const INT8_LARGEST: f32 = 127.0;
 
-/// The scale of one output's weights in `Int8`: its largest magnitude / 127; 1 where all are zero.
+/// Returns the scale of one output's weights in `Int8`: their largest magnitude / 127; 1 if all are
+/// zero.
 pub fn int8_scale(weights: impl Iterator<Item = f32>) -> f32 {
     scale(weights, INT8_LARGEST)
 }
 
-/// The scale of one output's weights in `Int16`: its largest magnitude / 16383; 1 where all are zero.
+/// Returns the scale of one output's weights in `Int16`: their largest magnitude / 16383; 1 if all
+/// are zero.
 pub fn int16_scale(weights: impl Iterator<Item = f32>) -> f32 {
     scale(weights, INT16_LARGEST)
 }
@@ -233,12 +242,12 @@ fn scale(weights: impl Iterator<Item = f32>, steps: f32) -> f32 {
     }
 }
 
-/// The nearest multiple of the scale, ties to even; between -127 and 127.
+/// Quantises a weight to the nearest multiple of the scale, ties to even; between -127 and 127.
 pub fn to_int8(x: f32, scale: f32) -> i8 {
     libm::rintf(x / scale).clamp(-INT8_LARGEST, INT8_LARGEST) as i8
 }
 
-/// The nearest multiple of the scale, ties to even; between -16383 and 16383.
+/// Quantises a weight to the nearest multiple of the scale, ties to even; between -16383 and 16383.
 pub fn to_int16(x: f32, scale: f32) -> i16 {
     libm::rintf(x / scale).clamp(-INT16_LARGEST, INT16_LARGEST) as i16
 }

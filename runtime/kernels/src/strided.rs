@@ -2,39 +2,39 @@
 
 use crate::math;
 
-/// An operation on two elements.
+/// Functions of two elements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BinaryKind {
-    /// `a + b`
+    /// Sum, `a + b`.
     Add,
-    /// `a - b`
+    /// Difference, `a - b`.
     Sub,
-    /// `a * b`
+    /// Product, `a * b`.
     Mul,
-    /// `a / b`
+    /// Quotient, `a / b`.
     Div,
-    /// The larger; not a number if either is.
+    /// Larger element; NaN if either is NaN.
     Max,
-    /// The smaller; not a number if either is.
+    /// Smaller element; NaN if either is NaN.
     Min,
-    /// `a` to the power of `b`.
+    /// Power, `a` to the power of `b`.
     Pow,
-    /// 1 where `a > b`, else 0.
+    /// Comparison: 1 where `a > b`, else 0.
     Greater,
-    /// `a` where `b` is not zero, else 0: what a condition selects.
+    /// Selection by a condition: `a` where `b` is not zero, else 0.
     Keep,
 }
 
 /// An operand of [`binary`].
 #[derive(Debug, Clone, Copy)]
 pub enum Input<'x> {
-    /// Elements, and how far apart neighbours in each dimension lie; 0 broadcasts.
+    /// Elements, and the distance between neighbours in each dimension; 0 broadcasts.
     Strided(&'x [f32], [usize; 4]),
-    /// What the result holds beforehand, element by element: the operation is in place.
+    /// Previous content of the result, element by element: the operation is in place.
     Output,
 }
 
-/// One row, the last dimension, of an operand.
+/// One row, along the last dimension, of an operand.
 #[derive(Clone, Copy)]
 enum Row<'x> {
     Strided(&'x [f32], usize),
@@ -53,7 +53,7 @@ impl<'x> Input<'x> {
     }
 }
 
-/// `y[i] = kind(a[i], b[i])` over `dims`; `y` is contiguous.
+/// Computes `y[i] = kind(a[i], b[i])` over `dims`; `y` is contiguous.
 pub fn binary(kind: BinaryKind, a: Input, b: Input, dims: [usize; 4], y: &mut [f32]) {
     let mut ys = y.chunks_exact_mut(dims[3].max(1));
     for_each_row(dims, |at| {
@@ -85,7 +85,7 @@ fn binary_row(kind: BinaryKind, a: Row, b: Row, y: &mut [f32]) {
     }
 }
 
-/// `y = f(a, b)`, where at least one of them is in `y` already.
+/// Computes `y = f(a, b)`, where at least one of them is in `y` already.
 #[inline(always)]
 fn apply(a: Row, b: Row, y: &mut [f32], f: impl Fn(f32, f32) -> f32) {
     match (a, b) {
@@ -99,7 +99,7 @@ fn apply(a: Row, b: Row, y: &mut [f32], f: impl Fn(f32, f32) -> f32) {
     }
 }
 
-/// `y[i] = f(y[i], x[i * stride])`
+/// Computes `y[i] = f(y[i], x[i * stride])`.
 #[inline(always)]
 fn combine(y: &mut [f32], x: &[f32], stride: usize, f: impl Fn(f32, f32) -> f32) {
     match (stride, x.first()) {
@@ -125,7 +125,7 @@ fn combine(y: &mut [f32], x: &[f32], stride: usize, f: impl Fn(f32, f32) -> f32)
 /// A copy between two strided layouts.
 #[derive(Debug, Clone, Copy)]
 pub struct StridedCopy {
-    /// Shape.
+    /// Shape of the copy.
     pub dims: [usize; 4],
     /// Elements from one index to the next in each dimension of the source; 0 broadcasts.
     pub x_strides: [usize; 4],
@@ -134,7 +134,7 @@ pub struct StridedCopy {
 }
 
 impl StridedCopy {
-    /// `y[i] = x[i]`; elements of `y` that the strides do not reach keep their value.
+    /// Copies `y[i] = x[i]`; elements of `y` that the strides do not reach keep their value.
     pub fn run(&self, x: &[f32], y: &mut [f32]) {
         let [x0, x1, x2, x3] = self.x_strides;
         let [y0, y1, y2, y3] = self.y_strides;

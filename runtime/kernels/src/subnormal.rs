@@ -1,27 +1,32 @@
-//! Subnormal numbers taken as zero while a program runs.
+//! Treats subnormal numbers as zero while a program runs.
 //!
-//! Some processors need a hundred cycles and more for an operation on a number below the normal range, which a controller would
-//! feel as jitter that depends on the data. On x86-64 the two bits of MXCSR that replace such operands and results by zero are set
-//! for the time of a run and what was there comes back afterwards. All instruction sets of a processor share the mode, so results
-//! still have the same bits on all of them. Elsewhere nothing happens: a program that meets subnormal numbers may give other bits
-//! there. Arm's mode would not close that gap, because it decides before rounding what is too small, and x86-64 after.
+//! Some processors need a hundred cycles and more for an operation on a number below the normal
+//! range, which a controller would feel as jitter that depends on the data. On x86-64 the two bits
+//! of MXCSR that replace such operands and results by zero are set for the time of a run and
+//! restored afterwards. All instruction sets of a processor share the mode, so results still have
+//! the same bits on all of them. On other targets nothing happens: a program that meets subnormal
+//! numbers may give other bits there. Arm's mode would not close that gap, because it decides
+//! before rounding what is too small, and x86-64 after.
 //!
 //! Invariants:
-//! - The mode ends where [`flushed`] ends, also by a panic. The guard that restores the register never leaves this module, so
-//!   no caller can forget it, move it or drop two of them out of order.
-//! - A thread has a register of its own. Linux gives a new thread its creator's: what runs here starts no threads.
-//! - Rust gives no promise about floating-point arithmetic under another MXCSR; compilers compute constants, and move arithmetic,
-//!   as if subnormal numbers were exact. The switches therefore are assembly that may read and write any memory: what is
-//!   loaded after the first and stored before the second is computed between them, which is all that a program does with
-//!   its arena. A constant that a compiler computes is what it would be without this mode.
+//! - The mode ends when [`flushed`] ends, also by a panic. The guard that restores the register
+//!   never leaves this module, so no caller can forget it, move it or drop two of them out of
+//!   order.
+//! - Each thread has a register of its own. Linux gives a new thread its creator's mode, so code
+//!   that runs here must not start threads.
+//! - Rust gives no promise about floating-point arithmetic under another MXCSR; compilers compute
+//!   constants, and move arithmetic, as if subnormal numbers were exact. The switches therefore are
+//!   assembly that may read and write any memory: loads after the first and stores before the
+//!   second are computed between them, which covers all that a program does with its arena. A
+//!   constant that a compiler computes is what it would be without this mode.
 //!
 //! Nothing here can fail.
 #![allow(unsafe_code)]
 
-/// Runs `work` with subnormal numbers taken as zero on this thread, and returns what it returns.
+/// Runs `work` with subnormal numbers taken as zero on this thread, and returns its result.
 ///
-/// The processor's mode before the call comes back afterwards, also when `work` panics. A guard would not do: safe code may
-/// forget one.
+/// The processor's previous mode is restored afterwards, also if `work` panics. The function takes
+/// a closure because safe code could forget a guard.
 #[inline(always)]
 pub fn flushed<T>(work: impl FnOnce() -> T) -> T {
     let _restored = Mode::flush();
@@ -32,7 +37,7 @@ pub fn flushed<T>(work: impl FnOnce() -> T) -> T {
 #[cfg(target_arch = "x86_64")]
 const FLUSH: u32 = 1 << 15 | 1 << 6;
 
-/// The mode to come back to when this is dropped.
+/// Guard that restores the previous mode when it is dropped.
 struct Mode {
     #[cfg(target_arch = "x86_64")]
     before: u32,
@@ -64,7 +69,7 @@ impl Drop for Mode {
 mod x86_64 {
     use core::arch::asm;
 
-    /// MXCSR.
+    /// Reads MXCSR.
     #[inline(always)]
     pub fn mode() -> u32 {
         let mut mode = 0_u32;
@@ -73,7 +78,7 @@ mod x86_64 {
         mode
     }
 
-    /// Sets MXCSR to what `mode` gave, with or without `FLUSH`.
+    /// Sets MXCSR to a value that `mode` returned, with or without `FLUSH`.
     #[inline(always)]
     pub fn set_mode(mode: u32) {
         // SAFETY: the value has no reserved bit, because it was read from the register but for two bits that every x86-64 CPU has.
@@ -93,12 +98,12 @@ mod tests {
 
     use super::flushed;
 
-    /// Half of the smallest normal number, computed now.
+    /// Computes half of the smallest normal number at run time.
     fn halved() -> f32 {
         black_box(black_box(f32::MIN_POSITIVE) * black_box(0.5))
     }
 
-    /// Whether subnormal operands are zero now.
+    /// Returns whether subnormal operands are currently taken as zero.
     fn is_flushed() -> bool {
         black_box(black_box(f32::from_bits(1)) * black_box(1e20)).to_bits() == 0
     }

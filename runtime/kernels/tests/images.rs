@@ -1,4 +1,5 @@
-//! Kernels of images against their naive twins, on random shapes, strides and values, and bit for bit on every instruction set.
+//! Compares kernels of images with their naive twins, on random shapes, strides and values, and bit
+//! for bit on every instruction set.
 
 mod support;
 
@@ -23,12 +24,13 @@ fn activation() -> impl Strategy<Value = Activation> {
     select(all.to_vec())
 }
 
-/// Sizes of rows, then columns.
+/// Generates sizes of rows, then columns.
 fn pair(range: std::ops::Range<usize>) -> impl Strategy<Value = [usize; 2]> {
     [range.clone(), range]
 }
 
-/// A sweep over pixels of `c` channels to pixels of `n`, with gaps between pixels and between rows, and the lengths of both sides.
+/// Generates a sweep over pixels of `c` channels to pixels of `n`, with gaps between pixels and
+/// between rows, and the lengths of both sides.
 fn sweep(
     [c, n]: [usize; 2],
     [out, kernel, stride, dilation]: [[usize; 2]; 4],
@@ -56,7 +58,7 @@ fn sweep(
     (sweep, lens)
 }
 
-/// Whether everything but the written elements is as it was.
+/// Returns whether everything but the written elements is unchanged.
 fn untouched(sweep: &Sweep, n: usize, before: &[f32], after: &[f32]) -> bool {
     let [row, pixel] = sweep.y_strides;
     before
@@ -319,7 +321,7 @@ fn not_a_number_is_not_lost() {
     }
 }
 
-/// Bits that must never change, on any target or at any optimisation level.
+/// Pins result bits that must never change, on any target or at any optimisation level.
 #[test]
 fn results_have_the_same_bits_everywhere() {
     let (sweep, [x_len, y_len]) = sweep([19, 37], [[5, 7], [3, 3], [2, 1], [1, 1]], [0, 0]);

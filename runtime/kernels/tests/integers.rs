@@ -1,15 +1,16 @@
-//! Layers of integer weights where their arithmetic is exact, where it nearly overflows, and where inputs are extreme.
+//! Tests layers of integer weights where their arithmetic is exact, where it nearly overflows, and
+//! where inputs are extreme.
 
 use lads_kernels::{Activation, Isa, Linear, Panels, WeightFormat, pack, packed_len};
 use proptest::prelude::*;
 
-/// The largest magnitude of an input as an integer.
+/// Largest magnitude of an input as an integer.
 const LARGEST: i16 = 8191;
 
-/// That of a weight.
+/// Largest magnitude of a weight as an integer.
 const WEIGHT: i16 = 16383;
 
-/// `x·W` on every instruction set; the bits have to be the same.
+/// Computes `x·W` on every instruction set; the bits have to be the same.
 #[track_caller]
 fn product(x: &[f32], w: &[i16], [k, n]: [usize; 2]) -> Vec<f32> {
     let mut panels = vec![0; packed_len(WeightFormat::Int16, [k, n])];
@@ -42,8 +43,8 @@ fn product(x: &[f32], w: &[i16], [k, n]: [usize; 2]) -> Vec<f32> {
 }
 
 proptest! {
-    /// Whole inputs, one of each part as large as they get, are the integers that they are multiplied as; what is below 2^24 is
-    /// exact as a float.
+    /// Inputs that are whole numbers, one of each part as large as the largest integer, are
+    /// multiplied exactly; results below 2^24 are exact as floats.
     #[test]
     fn whole_numbers_are_multiplied_exactly(
         (rows, k, n) in (1_usize..4, 1_usize..600, 1_usize..100),
@@ -73,7 +74,7 @@ proptest! {
     }
 }
 
-/// Sixteen products of the largest magnitudes are what a sum of integers just holds.
+/// Sixteen products of the largest magnitudes just fit a sum of integers.
 #[test]
 fn the_largest_sums_do_not_overflow() {
     for (x, w) in [(1, 1), (1, -1), (-1, -1)] {
@@ -89,7 +90,7 @@ fn the_largest_sums_do_not_overflow() {
     }
 }
 
-/// An image is not trusted: its integers may be larger than a compiler's.
+/// Integers of an untrusted image may be larger than a compiler's, and still give the same bits.
 #[test]
 fn integers_that_overflow_have_the_same_bits_on_every_instruction_set() {
     let y = product(&[1.0; 64], &[i16::MIN; 64 * 70], [64, 70]);

@@ -1,4 +1,5 @@
-//! Dense layers in every format against their naive twin, on random shapes and values, and bit for bit on every instruction set.
+//! Compares dense layers in every format with their naive twin, on random shapes and values, and
+//! bit for bit on every instruction set.
 
 mod support;
 
@@ -8,7 +9,7 @@ use proptest::prelude::*;
 use proptest::sample::select;
 use support::{close_up_to, digest, on_all, values};
 
-/// A matrix as it is stored, and the numbers that it then means.
+/// A matrix in a storage format, and the numbers that it then decodes to.
 struct Matrix {
     format: WeightFormat,
     singles: Vec<f32>,
@@ -84,7 +85,8 @@ impl Matrix {
         }
     }
 
-    /// What rounding the inputs may change in each result, as the module `stored` states it.
+    /// Returns how much rounding the inputs may change each result, as the module `stored` states
+    /// it.
     fn input_error(&self, x: &[f32], [k, n]: [usize; 2]) -> Vec<f32> {
         let errors = |row: usize, col: usize| {
             (0..k).map(move |l| {

@@ -1,8 +1,8 @@
-//! The error bounds that `math` states, measured against `f64` over a dense sample of all `f32`.
+//! Measures the error bounds that `math` states against `f64`, over a dense sample of all `f32`.
 
 use lads_kernels::math;
 
-/// Every `f32` that is not NaN, in steps of 257 bit patterns: 16.7 million values.
+/// Returns every `f32` that is not NaN, in steps of 257 bit patterns: 16.7 million values.
 fn samples() -> impl Iterator<Item = f32> {
     (0..=u32::MAX)
         .step_by(257)
@@ -10,8 +10,8 @@ fn samples() -> impl Iterator<Item = f32> {
         .filter(|x| !x.is_nan())
 }
 
-/// The largest relative error over the samples of a range; results below the normal numbers have to be within one
-/// subnormal step instead.
+/// Returns the largest relative error over the samples of a range; results below the normal numbers
+/// have to be within one subnormal step instead.
 fn largest_error(range: [f32; 2], f: fn(f32) -> f32, exact: fn(f64) -> f64) -> f64 {
     let mut largest = 0.0_f64;
     for x in samples().filter(|x| (range[0]..=range[1]).contains(x)) {

@@ -1,10 +1,12 @@
-//! The formats of stored weights against their definitions, over all bit patterns or a dense sample of all `f32`.
+//! Compares the formats of stored weights with their definitions, over all bit patterns or a dense
+//! sample of all `f32`.
 
 use lads_kernels::stored::{
     from_bf16, from_f16, int8_scale, int16_scale, round_to_f16, to_bf16, to_f16, to_int8, to_int16,
 };
 
-/// IEEE 754-2019, section 3.4, with 5 bits of exponent and 10 of fraction.
+/// Decodes a half-precision number by IEEE 754-2019, section 3.4, with 5 bits of exponent and 10 of
+/// fraction.
 fn half(bits: u16) -> f64 {
     let sign = if bits >> 15 == 1 { -1.0 } else { 1.0 };
     let (exponent, fraction) = (i32::from(bits >> 10 & 31), f64::from(bits & 1023));
@@ -16,7 +18,8 @@ fn half(bits: u16) -> f64 {
     }
 }
 
-/// Numbers whose conversion may be wrong: a sample of all, and the neighbourhood of every half and of every midpoint of two.
+/// Returns numbers whose conversion may be wrong: a sample of all, and the neighbourhood of every
+/// half-precision number and of every midpoint of two.
 fn samples() -> impl Iterator<Item = f32> {
     let near = |x: f64| {
         let bits = (x as f32).to_bits();

@@ -1,4 +1,5 @@
-//! Every kernel against its naive twin, on random shapes and values, and bit for bit on every instruction set that the CPU offers.
+//! Compares every kernel with its naive twin, on random shapes and values, and bit for bit on every
+//! instruction set that the CPU offers.
 
 mod support;
 
@@ -53,13 +54,13 @@ const REDUCE: [ReduceKind; 5] = [
     ReduceKind::Prod,
 ];
 
-/// Equal up to `bound` times the size of what was added up.
+/// Asserts equality up to `bound` times the expected magnitude, at least 1.
 #[track_caller]
 fn close(got: &[f32], expected: &[f32], bound: f32) {
     close_up_to(got, expected, bound, &vec![0.0; got.len()]);
 }
 
-/// A number as a cache of this format holds it.
+/// Returns the bits of a number in a cache of this format.
 fn bits(format: CacheFormat, x: f32) -> u32 {
     match format {
         CacheFormat::F32 => x.to_bits(),
@@ -320,7 +321,8 @@ proptest! {
     }
 }
 
-/// Strides of a contiguous layout with `gap` between elements, 0 in the dimensions that are not kept.
+/// Returns the strides of a contiguous layout with `gap` between elements, 0 in the dimensions that
+/// are not kept.
 fn strides(dims: [usize; 4], keeps: [bool; 4], gap: usize) -> [usize; 4] {
     let mut strides = [0; 4];
     let mut stride = gap;
@@ -333,7 +335,8 @@ fn strides(dims: [usize; 4], keeps: [bool; 4], gap: usize) -> [usize; 4] {
     strides
 }
 
-/// Floats of all magnitudes: subnormal, infinite, not a number, and where `exp` and `tanh` change their ways.
+/// Covers floats of all magnitudes: subnormal, infinite, NaN, and where `exp` and `tanh` change
+/// their formulas.
 #[test]
 fn extreme_elements_are_the_same_on_every_instruction_set() {
     let x: Vec<f32> = (0..=u32::MAX).step_by(65521).map(f32::from_bits).collect();
@@ -367,7 +370,7 @@ fn what_is_not_a_number_is_passed_over_by_the_best_element() {
     assert_eq!((arg_max(&[f32::NAN]), arg_max(&[])), (0, 0));
 }
 
-/// Bits that must never change, on any target or at any optimisation level.
+/// Pins result bits that must never change, on any target or at any optimisation level.
 #[test]
 fn results_have_the_same_bits_everywhere() {
     let (k, n) = (128, 40);

@@ -1,9 +1,10 @@
-//! The naive twins of the kernels of images.
+//! Naive twins of the kernels of images.
 
 use super::activation;
 use crate::{Activation, Pool, PoolKind, Resize, Sweep};
 
-/// A convolution with `w` as `[kernel rows, kernel columns, c, n]`, which is accumulated where `residual` is.
+/// Computes a convolution with `w` as `[kernel rows, kernel columns, c, n]`, accumulated if
+/// `residual` is set.
 pub fn conv(
     sweep: &Sweep,
     (w, bias): (&[f32], &[f32]),
@@ -30,7 +31,7 @@ pub fn conv(
     }
 }
 
-/// A depthwise convolution with `w` as `[kernel rows, kernel columns, c]`.
+/// Computes a depthwise convolution with `w` as `[kernel rows, kernel columns, c]`.
 pub fn depthwise(
     sweep: &Sweep,
     (w, bias): (&[f32], &[f32]),
@@ -53,7 +54,7 @@ pub fn depthwise(
     }
 }
 
-/// Where the input of a kernel element at an output pixel lies.
+/// Returns the position of the input of a kernel element at an output pixel.
 fn place(sweep: &Sweep, pixel: [usize; 2], element: [usize; 2]) -> usize {
     (0..2)
         .map(|axis| {
@@ -63,7 +64,7 @@ fn place(sweep: &Sweep, pixel: [usize; 2], element: [usize; 2]) -> usize {
         .sum()
 }
 
-/// Windows over an image.
+/// Pools windows over an image.
 pub fn pool(op: &Pool, x: &[f32], y: &mut [f32]) {
     for (row, col) in (0..op.out[0]).flat_map(|row| (0..op.out[1]).map(move |col| (row, col))) {
         for i in 0..op.c {
@@ -95,7 +96,7 @@ pub fn pool(op: &Pool, x: &[f32], y: &mut [f32]) {
     }
 }
 
-/// What is known of the elements of a window.
+/// Statistics of the elements of a window.
 struct Elements {
     largest: f32,
     sum: f64,
@@ -120,7 +121,7 @@ impl Elements {
     }
 }
 
-/// An image in another size.
+/// Resizes an image.
 pub fn resize(op: &Resize, x: &[f32], y: &mut [f32]) {
     for (i, row) in op.rows.chunks(3).enumerate() {
         for (j, col) in op.cols.chunks(3).enumerate() {

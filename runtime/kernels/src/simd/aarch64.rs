@@ -1,4 +1,4 @@
-//! Vectors of aarch64: NEON, which its targets have in any case, and NEON with the dot product of bytes.
+//! Vectors of aarch64: NEON, its baseline, and NEON with the dot product of bytes.
 //!
 //! A block takes four registers of thirty-two. Integers of 16 bits are multiplied and added four at a time (`smlal`): pairs are not
 //! taken apart, so even and odd lanes of a register hold the sums of either input of a pair until [`Simd::floats`] adds
@@ -25,13 +25,13 @@ use super::{MAGNITUDE, ROUND, Simd};
 use crate::integers::{self, Group, PAIRS};
 use crate::lanes::{Block, LANES};
 
-/// A block in four registers. `DOT` is whether the dot product of bytes is there.
+/// A block in four registers. `DOT` is true if the CPU has the dot product of bytes.
 #[derive(Clone, Copy)]
 pub(crate) struct Neon<const DOT: bool>(());
 
-/// NEON as every CPU of the target has it.
+/// NEON alone, which every CPU of the target has.
 pub(crate) type Plain = Neon<false>;
-/// NEON and the dot product of bytes (FEAT_DotProd).
+/// NEON with the dot product of bytes (FEAT_DotProd).
 pub(crate) type Dot = Neon<true>;
 
 impl Plain {
@@ -42,6 +42,8 @@ impl Plain {
 }
 
 impl Dot {
+    /// Makes the value that proves FEAT_DotProd.
+    ///
     /// # Safety
     /// The CPU has FEAT_DotProd.
     #[inline(always)]
@@ -53,7 +55,7 @@ impl Dot {
 impl<const DOT: bool> Simd for Neon<DOT> {
     type V = [float32x4_t; 4];
     type Pairs = [int16x8_t; 4];
-    /// Even and odd lanes belong together.
+    /// Sums whose even and odd lanes are added by [`Simd::floats`].
     type Integers = [int32x4_t; 8];
 
     const SUMS: usize = 4;
@@ -297,13 +299,13 @@ impl<const DOT: bool> Simd for Neon<DOT> {
     }
 }
 
-/// Quarter by quarter.
+/// Applies `f` to each quarter of a block.
 #[inline(always)]
 fn both<T: Copy>(a: [T; 4], b: [T; 4], f: impl Fn(T, T) -> T) -> [T; 4] {
     [f(a[0], b[0]), f(a[1], b[1]), f(a[2], b[2]), f(a[3], b[3])]
 }
 
-/// Both halves of sixteen words.
+/// Loads sixteen words as two halves.
 #[inline(always)]
 fn eights(from: &[u16; LANES]) -> [uint16x8_t; 2] {
     let from = from.as_ptr();
@@ -311,7 +313,7 @@ fn eights(from: &[u16; LANES]) -> [uint16x8_t; 2] {
     unsafe { [vld1q_u16(from), vld1q_u16(from.add(8))] }
 }
 
-/// Both halves of thirty-two bytes.
+/// Loads thirty-two bytes as two halves.
 #[inline(always)]
 fn sixteens(from: &[i8; 2 * LANES]) -> [int8x16_t; 2] {
     let from = from.as_ptr();
@@ -319,7 +321,7 @@ fn sixteens(from: &[i8; 2 * LANES]) -> [int8x16_t; 2] {
     unsafe { [vld1q_s8(from), vld1q_s8(from.add(16))] }
 }
 
-/// Eight half-precision numbers.
+/// Decodes eight half-precision numbers.
 #[inline(always)]
 fn from_f16(bits: uint16x8_t) -> [float32x4_t; 2] {
     let (low, high): (float32x4_t, float32x4_t);
@@ -338,7 +340,7 @@ fn from_f16(bits: uint16x8_t) -> [float32x4_t; 2] {
     [low, high]
 }
 
-/// Eight numbers as half-precision ones.
+/// Rounds eight numbers to half precision.
 #[inline(always)]
 fn to_f16(low: float32x4_t, high: float32x4_t) -> uint16x8_t {
     let bits: uint16x8_t;
@@ -356,7 +358,8 @@ fn to_f16(low: float32x4_t, high: float32x4_t) -> uint16x8_t {
     bits
 }
 
-/// [`Simd::group_of_bytes`] by dot products: four inputs at a time, so that two rows of pairs are interleaved.
+/// Implements [`Simd::group_of_bytes`] by dot products: four inputs at a time, so two rows of pairs
+/// are interleaved.
 ///
 /// # Safety
 /// The CPU has FEAT_DotProd.
@@ -413,15 +416,16 @@ unsafe fn dot_products<'w, const P: usize, const R: usize>(
     sums
 }
 
-/// Sixteen bytes of zero.
+/// Returns sixteen bytes of zero.
 #[inline(always)]
 fn zero_bytes() -> int8x16_t {
     // SAFETY: NEON is part of the target; sixteen bytes are read of sixteen.
     unsafe { vld1q_s8([0; 16].as_ptr()) }
 }
 
-/// Sixteen inputs `x` as bytes `high`, from -64 to 64, and `low`, from -64 to 63, with `x = 128 * high + low`; any bytes of an input
-/// with more than 14 bits, which only a part that is not finite has.
+/// Splits sixteen inputs `x` into bytes `high`, from -64 to 64, and `low`, from -64 to 63, with
+/// `x = 128 * high + low`; an input with more than 14 bits, which only a part that is not finite
+/// has, gives any bytes.
 #[inline(always)]
 fn split(x: &Group) -> [int8x16_t; 2] {
     let x = x.as_flattened().as_ptr();
@@ -434,7 +438,7 @@ fn split(x: &Group) -> [int8x16_t; 2] {
     }
 }
 
-/// Two inputs and the next two of sixteen outputs as the four of each.
+/// Interleaves two inputs and the next two of sixteen outputs to groups of four.
 #[inline(always)]
 fn quads(first: &[i8; 2 * LANES], next: &[i8; 2 * LANES]) -> [int8x16_t; 4] {
     let (a, b) = (sixteens(first), sixteens(next));
@@ -450,7 +454,7 @@ fn quads(first: &[i8; 2 * LANES], next: &[i8; 2 * LANES]) -> [int8x16_t; 4] {
     [q0, q1, q2, q3]
 }
 
-/// `sum[i] += w[4 * i] * x[4 * AT] + ... + w[4 * i + 3] * x[4 * AT + 3]`
+/// Computes `sum[i] += w[4 * i] * x[4 * AT] + ... + w[4 * i + 3] * x[4 * AT + 3]`.
 ///
 /// # Safety
 /// The CPU has FEAT_DotProd.

@@ -24,7 +24,7 @@ use core::arch::x86_64::{
 use super::{MAGNITUDE, ROUND, Simd};
 use crate::lanes::{Block, LANES};
 
-/// A block in two registers. `NARROW` is whether AVX-512 doubles their number.
+/// A block in two registers. `NARROW` is true if AVX-512 doubles the number of registers.
 #[derive(Clone, Copy)]
 pub(crate) struct Halves<const NARROW: bool>(());
 
@@ -37,6 +37,8 @@ pub(crate) type Avx512Narrow = Halves<true>;
 pub(crate) struct Avx512(());
 
 impl<const NARROW: bool> Halves<NARROW> {
+    /// Makes the value that proves these instructions.
+    ///
     /// # Safety
     /// The CPU and the operating system offer AVX2 and F16C, and AVX-512 VL where `NARROW`.
     #[inline(always)]
@@ -46,6 +48,8 @@ impl<const NARROW: bool> Halves<NARROW> {
 }
 
 impl Avx512 {
+    /// Makes the value that proves these instructions.
+    ///
     /// # Safety
     /// The CPU and the operating system offer AVX-512 F, BW, DQ, VL and VNNI.
     #[inline(always)]
@@ -414,13 +418,14 @@ impl Simd for Avx512 {
     }
 }
 
-/// Two integers as the one of their bytes.
+/// Returns two 16-bit integers as the 32-bit integer of their bytes.
 #[inline(always)]
 fn joined([low, high]: [i16; 2]) -> i32 {
     i32::from(low.cast_unsigned()) | i32::from(high) << 16
 }
 
-/// [`Simd::add_products`] for arrays, with what every x86-64 CPU has: compilers do not find the instruction by themselves.
+/// Implements [`Simd::add_products`] for arrays with the x86-64 baseline, because compilers do not
+/// find the instruction by themselves.
 #[inline(always)]
 pub(super) fn add_products(
     mut sum: [i32; LANES],

@@ -1,8 +1,9 @@
-//! What the suites of kernels share.
+//! Shared helpers of the kernels' tests.
 
 use lads_kernels::Isa;
 
-/// Values in -1..1 from a seed: long vectors would make proptest slow, and shrinking their elements says nothing.
+/// Returns values in -1..1 from a seed: long vectors would make proptest slow, and shrinking their
+/// elements says nothing.
 pub fn values(len: usize, seed: u64) -> Vec<f32> {
     let mut state = seed;
     let next = || {
@@ -14,7 +15,8 @@ pub fn values(len: usize, seed: u64) -> Vec<f32> {
     std::iter::repeat_with(next).take(len).collect()
 }
 
-/// Equal up to `bound` times the size of what was added up, and up to an error of each element.
+/// Asserts equality up to `bound` times the expected magnitude, at least 1, and up to an error of
+/// each element.
 #[track_caller]
 pub fn close_up_to(got: &[f32], expected: &[f32], bound: f32, errors: &[f32]) {
     assert_eq!([got.len(), errors.len()], [expected.len(); 2]);
@@ -25,7 +27,8 @@ pub fn close_up_to(got: &[f32], expected: &[f32], bound: f32, errors: &[f32]) {
     }
 }
 
-/// Runs a kernel on every instruction set; its results, which have to have the same bits, and not a number in the same places.
+/// Runs a kernel on every instruction set and returns its results, which must have the same bits,
+/// and NaN in the same places.
 #[track_caller]
 pub fn on_all<const N: usize>(kernel: impl Fn(Isa) -> [Vec<f32>; N]) -> [Vec<f32>; N] {
     let portable = kernel(Isa::portable());
@@ -42,7 +45,7 @@ pub fn on_all<const N: usize>(kernel: impl Fn(Isa) -> [Vec<f32>; N]) -> [Vec<f32
     portable
 }
 
-/// A number that two results with different bits do not share by chance.
+/// Returns a hash that two results with different bits do not share by chance.
 pub fn digest(x: &[f32]) -> u64 {
     x.iter().fold(0xcbf2_9ce4_8422_2325, |hash, x| {
         (hash ^ u64::from(x.to_bits())).wrapping_mul(0x0100_0000_01b3)
