@@ -1,6 +1,8 @@
-//! How long a control step takes from Rust, hot: one step after another on the golden episode's first observation.
+//! Measures the time of a control step from Rust, hot: one step after another on the golden
+//! episode's first observation.
 //!
-//! `cargo run --release -p lads-host --example step_cost -- MODEL STEPS` prints nanoseconds per step; benches/python.py puts it beside Python.
+//! `cargo run --release -p lads-host --example step_cost -- MODEL STEPS` prints nanoseconds per
+//! step; benches/python.py compares it with Python.
 
 use std::time::Instant;
 

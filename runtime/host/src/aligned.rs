@@ -1,4 +1,4 @@
-//! Bytes of an image at an address as weights want it.
+//! Image bytes at an address with the alignment that weights need.
 
 use std::alloc::{Layout, handle_alloc_error};
 
@@ -9,7 +9,7 @@ use crate::pages::Pages;
 pub struct Aligned(Pages);
 
 impl Aligned {
-    /// A copy of `bytes`; without memory for it, the program ends as it does where a `Vec` gets none.
+    /// Copies `bytes`; if memory runs out, the program aborts as it does for a `Vec`.
     pub fn new(bytes: &[u8]) -> Self {
         let mut pages = Pages::zeroed(bytes.len())
             .unwrap_or_else(|_| handle_alloc_error(Layout::for_value(bytes)));
@@ -17,7 +17,7 @@ impl Aligned {
         Self(pages)
     }
 
-    /// The bytes.
+    /// Returns the bytes.
     pub fn as_bytes(&self) -> &[u8] {
         self.0.as_bytes()
     }

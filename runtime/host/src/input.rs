@@ -1,7 +1,7 @@
-//! Reading a whole file that a person named.
+//! Reads a whole file that a person named.
 //!
-//! A device or a FIFO has no end that could be waited for, so only a regular file is read. What can fail: it is missing, unreadable, or
-//! no regular file.
+//! A device or a FIFO has no end that could be waited for, so only a regular file is read. What can
+//! fail: the file is missing, unreadable, or not a regular file.
 
 use std::fs::{self, File};
 use std::io::{self, Read as _};

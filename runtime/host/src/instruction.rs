@@ -1,13 +1,15 @@
-//! Finding a known instruction by what a person wrote.
+//! Finds a known instruction by what a person wrote.
 //!
-//! The rule is [`Contract::instructions_called`], the same everywhere; here is what to say where it finds none ([`UnknownInstruction`]).
+//! The rule is [`Contract::instructions_called`], the same everywhere; this module adds the error
+//! for an unknown instruction ([`UnknownInstruction`]).
 
 use lads_core::Contract;
 
-/// How many known instructions are shown to one who asked for an unknown one.
+/// Number of known instructions that are suggested for an unknown one.
 const SUGGESTIONS: usize = 3;
 
-/// The number of the first known instruction with this id, or with this text up to case and white space.
+/// Returns the number of the first known instruction with this id, or with this text up to case and
+/// white space.
 pub fn find(contract: &Contract, wanted: &str) -> Result<u32, UnknownInstruction> {
     let found = contract.instructions_called(wanted.as_bytes()).next();
     found.ok_or_else(|| {
@@ -22,7 +24,8 @@ pub fn find(contract: &Contract, wanted: &str) -> Result<u32, UnknownInstruction
     })
 }
 
-/// Known instructions (id and text), those first whose id or text is most like what a person wrote.
+/// Returns known instructions (id and text), those first whose id or text is most similar to what a
+/// person wrote.
 pub fn nearest<'a>(
     known: impl Iterator<Item = (&'a str, &'a str)>,
     wanted: &str,
@@ -36,7 +39,7 @@ pub fn nearest<'a>(
     scored.into_iter().map(|(_, known)| known).collect()
 }
 
-/// Lower case, single spaces.
+/// Normalises a text to lower case and single spaces.
 fn plain(text: &str) -> String {
     text.to_lowercase()
         .split_whitespace()
@@ -44,16 +47,17 @@ fn plain(text: &str) -> String {
         .join(" ")
 }
 
-/// A policy does not know what it was told to do.
+/// Error: a policy does not know the instruction that it was given.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "instruction '{wanted}': the policy does not know it; {}",
     remedy(nearest)
 )]
 pub struct UnknownInstruction {
-    /// What it was told.
+    /// The unknown instruction.
     pub wanted: String,
-    /// Ids and texts of the known ones that are most like it, the best first; none where the policy takes no instruction.
+    /// Ids and texts of the known instructions that are most similar, the best first; empty if the
+    /// policy takes no instruction.
     pub nearest: Vec<(String, String)>,
 }
 

@@ -1,14 +1,20 @@
-//! What programs on a host share: opening policies, the memory of a controller, the files that they read and write.
+//! Shared parts of programs on a host: opening policies, the memory of a controller, reading and
+//! writing files.
 //!
-//! - [`open()`] reads a policy from either of its forms, a bundle (ONNX), which it compiles, or a compiled image. An [`Opened`] is a
-//!   policy that was checked; [`Opened::load`] gives it memory, and [`Loaded::controller`] puts it to work.
+//! - [`open()`] reads a policy from either of its forms, a bundle (ONNX), which it compiles, or a
+//!   compiled image. An [`Opened`] is a checked policy; [`Opened::load`] gives it memory, and
+//!   [`Loaded::controller`] runs it.
 //! - [`Memory`] and [`Aligned`] are memory in large pages, where the operating system has them.
-//! - [`instruction`] finds a known instruction by what a person wrote; [`refused()`] says which value a controller did not take.
-//! - [`schedule`] says which programs run at which step, and what that costs; [`stored()`] in which formats weights and caches lie.
-//! - [`output`] is the one place where a command writes a file, [`input`] the one where it reads a whole one that a person named.
+//! - [`instruction`] finds a known instruction by what a person wrote; [`refused()`] describes a
+//!   value that a controller refused.
+//! - [`schedule`] lists which programs run at which step, and their cost; [`stored()`] names the
+//!   formats of weights and caches.
+//! - [`output`] writes every file of a command, [`input`] reads every whole file that a person
+//!   named.
 //!
-//! Needs `std` and may allocate; what it opens may be hostile, so every error is a value that names the thing and the remedy. The
-//! feature `compile`, on by default, brings the compiler; without it, only images are opened.
+//! The crate needs `std` and may allocate; the files that it opens may be hostile, so every error
+//! is a value that names the thing and the remedy. The feature `compile`, on by default, includes
+//! the compiler; without it, only images are opened.
 //!
 //! ```no_run
 //! # fn run() -> Result<(), Box<dyn std::error::Error>> {

@@ -1,22 +1,23 @@
-//! The memory of a controller on a host that may allocate.
+//! Memory of a controller on a host that may allocate.
 //!
-//! Images are untrusted, and one may ask for more than there is: that is refused before any of it is touched.
+//! Images are untrusted, and one may ask for more memory than there is: that is refused before any
+//! of it is touched.
 
 use lads_core::{Controller, Isa, Policy, Workspace, WorkspaceTooSmall};
 
 use crate::pages::Pages;
 
-/// What one controller works in, allocated once.
+/// Memory of one controller, allocated once.
 #[derive(Debug)]
 pub struct Memory {
-    /// Scratch, then what survives a control step.
+    /// Scratch memory, then the state that survives a control step.
     pages: Pages,
-    /// Elements of the scratch.
+    /// Number of elements of the scratch memory.
     arena: usize,
 }
 
 impl Memory {
-    /// As much as `policy` asks for, up to [`Policy::MEMORY_LIMIT`].
+    /// Allocates as much memory as `policy` asks for, up to [`Policy::MEMORY_LIMIT`].
     pub fn of(policy: &Policy<'_>) -> Result<Self, MemoryError> {
         let (arena, state) = (policy.arena_len(), policy.state_len());
         let bytes = Self::bytes_of(arena.saturating_add(state))?;
@@ -24,7 +25,7 @@ impl Memory {
         Ok(Self { pages, arena })
     }
 
-    /// Bytes of so many f32 elements, if that is not more than a policy gets.
+    /// Converts a number of f32 elements to bytes, if that is within a policy's limit.
     fn bytes_of(elements: usize) -> Result<usize, MemoryError> {
         let bytes = elements.saturating_mul(size_of::<f32>());
         if bytes > Policy::MEMORY_LIMIT {
@@ -33,7 +34,8 @@ impl Memory {
         Ok(bytes)
     }
 
-    /// A controller that works in this memory; refused when it was made for a smaller policy.
+    /// Makes a controller that works in this memory; fails if the memory was made for a smaller
+    /// policy.
     pub fn controller<'p, 'm>(
         &'m mut self,
         policy: &Policy<'p>,
@@ -41,7 +43,7 @@ impl Memory {
         self.controller_with(policy, Isa::detect())
     }
 
-    /// The same on chosen instructions.
+    /// Makes a controller on a chosen instruction set that works in this memory.
     pub fn controller_with<'p, 'm>(
         &'m mut self,
         policy: &Policy<'p>,
@@ -53,24 +55,24 @@ impl Memory {
     }
 }
 
-/// Why there is no memory for a controller.
+/// Reason why there is no memory for a controller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum MemoryError {
-    /// The policy asks for more than any policy gets.
+    /// The policy asks for more memory than any policy gets.
     #[error(
         "the policy asks for a workspace of {bytes} bytes, and gets at most {most}; do not trust it, or export a bundle with a shorter context",
         most = Policy::MEMORY_LIMIT
     )]
     Excessive {
-        /// What it asks for.
+        /// Memory that the policy asks for, in bytes.
         bytes: usize,
     },
-    /// This machine does not have it.
+    /// This machine does not have the memory.
     #[error(
         "this machine has no {bytes} bytes left for the policy's workspace; end other programs, or export a bundle with a shorter context"
     )]
     Exhausted {
-        /// What the policy asks for.
+        /// Memory that the policy asks for, in bytes.
         bytes: usize,
     },
     /// The memory was made for a smaller policy.

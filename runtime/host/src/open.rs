@@ -1,7 +1,9 @@
-//! A policy from a file, whichever of its two forms: the bundle (ONNX), which is compiled on the way, or a compiled program image.
+//! Opens a policy from a file in either of its two forms: the bundle (ONNX), which is compiled on
+//! the way, or a compiled program image.
 //!
-//! Which of them it is, is told by its first bytes, not by its name. Invariant of an [`Opened`]: its image was checked, and its
-//! checksum is right. What can fail: the file cannot be read, is neither of the two, or is broken ([`OpenError`]).
+//! The form is recognised by the first bytes, not by the file's name. Invariant of an [`Opened`]:
+//! its image and its checksum were checked. What can fail: the file cannot be read, is neither of
+//! the two, or is broken ([`OpenError`]).
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -16,7 +18,7 @@ use crate::input;
 use crate::instruction::{self, UnknownInstruction};
 use crate::memory::{Memory, MemoryError};
 
-/// A policy that was read and checked, its image in large pages.
+/// A policy that was read and checked, with its image in large pages.
 #[derive(Debug)]
 pub struct Opened {
     image: Aligned,
@@ -24,12 +26,13 @@ pub struct Opened {
     bundle: Option<Box<Bundle>>,
 }
 
-/// Reads the policy at `path`; a bundle is compiled, its numbers stored as it was tuned.
+/// Reads the policy at `path`; a bundle is compiled with the number formats that it was tuned for.
 pub fn open(path: &Path) -> Result<Opened, OpenError> {
     at(path, from_bytes)
 }
 
-/// Reads a policy from a file's content; a bundle is compiled, its numbers stored as it was tuned.
+/// Reads a policy from a file's content; a bundle is compiled with the number formats that it was
+/// tuned for.
 pub fn from_bytes(bytes: &[u8]) -> Result<Opened, OpenError> {
     if is_image(bytes) {
         return image(bytes);
@@ -40,13 +43,15 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Opened, OpenError> {
     return Err(Problem::NoCompiler.into());
 }
 
-/// Reads the policy at `path` and compiles it as `options` say; an image has what it was compiled with.
+/// Reads the policy at `path` and compiles a bundle with these `options`; an image keeps the
+/// options that it was compiled with.
 #[cfg(feature = "compile")]
 pub fn open_with(path: &Path, options: &Options) -> Result<Opened, OpenError> {
     at(path, |bytes| from_bytes_with(bytes, options))
 }
 
-/// Reads a policy from a file's content and compiles it as `options` say; an image has what it was compiled with.
+/// Reads a policy from a file's content and compiles a bundle with these `options`; an image keeps
+/// the options that it was compiled with.
 #[cfg(feature = "compile")]
 pub fn from_bytes_with(bytes: &[u8], options: &Options) -> Result<Opened, OpenError> {
     if is_image(bytes) {
@@ -56,12 +61,12 @@ pub fn from_bytes_with(bytes: &[u8], options: &Options) -> Result<Opened, OpenEr
     }
 }
 
-/// Whether a file's content is a program image, of whatever version.
+/// Returns whether a file's content is a program image, of whatever version.
 fn is_image(bytes: &[u8]) -> bool {
     bytes.starts_with(&MAGIC.to_le_bytes())
 }
 
-/// Reads the file, and names it in errors.
+/// Reads the policy at a path and names the file in errors.
 fn at(
     path: &Path,
     read: impl FnOnce(&[u8]) -> Result<Opened, OpenError>,
@@ -101,12 +106,12 @@ fn compiled(bytes: &[u8], options: &Options) -> Result<Opened, OpenError> {
 }
 
 impl Opened {
-    /// The program image.
+    /// Returns the program image.
     pub fn image(&self) -> &[u8] {
         self.image.as_bytes()
     }
 
-    /// The checked view on the image.
+    /// Returns the checked view on the image.
     pub fn policy(&self) -> Policy<'_> {
         match Policy::new_checked(self.image()) {
             Ok(policy) => policy,
@@ -114,7 +119,7 @@ impl Opened {
         }
     }
 
-    /// Whether it was read from a bundle and compiled, not read as an image.
+    /// Returns whether the policy was read from a bundle and compiled, not read as an image.
     pub fn is_bundle(&self) -> bool {
         #[cfg(feature = "compile")]
         return self.bundle.is_some();
@@ -122,18 +127,20 @@ impl Opened {
         return false;
     }
 
-    /// The bundle that it was read from, with a contract that says more than the image's.
+    /// Returns the bundle that the policy was read from, whose contract is more detailed than the
+    /// image's.
     #[cfg(feature = "compile")]
     pub fn bundle(&self) -> Option<&Bundle> {
         self.bundle.as_deref()
     }
 
-    /// The number of the known instruction that a person means, by [the one rule](lads_core::Contract::instructions_called).
+    /// Returns the number of the known instruction that a person means, by [the one
+    /// rule](lads_core::Contract::instructions_called).
     pub fn instruction(&self, wanted: &str) -> Result<u32, UnknownInstruction> {
         instruction::find(self.policy().contract(), wanted)
     }
 
-    /// Gives it the memory of one controller.
+    /// Allocates the memory of one controller.
     pub fn load(self) -> Result<Loaded, MemoryError> {
         let memory = Memory::of(&self.policy())?;
         Ok(Loaded {
@@ -151,17 +158,17 @@ pub struct Loaded {
 }
 
 impl Loaded {
-    /// The policy.
+    /// Returns the policy.
     pub fn opened(&self) -> &Opened {
         &self.opened
     }
 
-    /// A fresh controller on the widest instructions that this CPU offers.
+    /// Makes a fresh controller on the widest instruction set that this CPU offers.
     pub fn controller(&mut self) -> Controller<'_, '_> {
         self.controller_with(Isa::detect())
     }
 
-    /// A fresh controller on chosen instructions.
+    /// Makes a fresh controller on a chosen instruction set.
     pub fn controller_with(&mut self, isa: Isa) -> Controller<'_, '_> {
         let policy = self.opened.policy();
         match self.memory.controller_with(&policy, isa) {
@@ -171,13 +178,14 @@ impl Loaded {
     }
 }
 
-/// Why a file is no policy that can be used; one line that names the file, where there is one, and the remedy.
+/// Reason why a file cannot be used as a policy; one line that names the file, where there is one,
+/// and the remedy.
 #[derive(Debug, thiserror::Error)]
 #[error("{}{problem}", path.as_ref().map(|path| format!("{}: ", path.display())).unwrap_or_default())]
 pub struct OpenError {
-    /// The file, unless only its content was given.
+    /// Path of the file, unless only its content was given.
     pub path: Option<PathBuf>,
-    /// What is wrong with it.
+    /// Problem of the file.
     #[source]
     pub problem: Problem,
 }
@@ -191,30 +199,30 @@ impl From<Problem> for OpenError {
     }
 }
 
-/// What is wrong with a file that was to be opened as a policy.
+/// Problem of a file that was to be opened as a policy.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Problem {
-    /// It cannot be read.
+    /// The file cannot be read.
     #[error("{0}; name a bundle (.onnx) or a compiled image (.lads)")]
     Read(io::Error),
-    /// It is an image that cannot be used.
+    /// The file is an image that cannot be used.
     #[error("{0}; compile it again from its bundle")]
     Image(PolicyError),
-    /// It is an image that is not what the compiler wrote.
+    /// The file is an image that changed after the compiler wrote it.
     #[error(
         "its checksum does not match: it was changed after it was compiled; compile it again from its bundle"
     )]
     Changed,
-    /// It is no image, and no compiler is there.
+    /// The file is not an image, and this build has no compiler.
     #[cfg(not(feature = "compile"))]
     #[error("it is no program image; compile it from its bundle first")]
     NoCompiler,
-    /// It is no bundle that can be used.
+    /// The file is not a usable bundle.
     #[cfg(feature = "compile")]
     #[error(transparent)]
     Bundle(BundleError),
-    /// It is a bundle that does not compile.
+    /// The file is a bundle that does not compile.
     #[cfg(feature = "compile")]
     #[error(transparent)]
     Compile(CompileError),

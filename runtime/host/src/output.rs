@@ -1,12 +1,14 @@
-//! Writing a file that a person named, in one way for all commands.
+//! Writes a file that a person named, in one way for all commands.
 //!
-//! - A regular file is there whole or not at all: a [`Draft`] is a temporary file beside it, which [`Draft::commit`] renames.
-//! - A symbolic link is followed: what it leads to is replaced, in its own folder, and the link stays a link.
-//! - A device, a FIFO or a socket is written into, and stays what it is.
+//! - A regular file is written completely or not at all: a [`Draft`] is a temporary file beside it,
+//!   which [`Draft::commit`] renames.
+//! - A symbolic link is followed: its target is replaced, in the target's folder, and the link
+//!   stays a link.
+//! - A device, a FIFO or a socket is written into, not replaced.
 //! - An output that is an input, or another output, is refused before any work: [`check`].
 //!
-//! What can fail: the place is a folder, its folder is missing or not writable, the file is read-only, or there is no room; a failure
-//! leaves what was there.
+//! What can fail: the path is a folder, its folder is missing or not writable, the file is
+//! read-only, or there is no room; a failure leaves the previous file unchanged.
 
 mod place;
 
@@ -18,41 +20,41 @@ use tempfile::NamedTempFile;
 
 use place::{Place, Same};
 
-/// A file that a command was told to use, and by which option.
+/// Name of an option, and the file that it gives to a command.
 pub type Named<'a> = (&'a str, &'a Path);
 
-/// Why outputs cannot be written where they were asked for.
+/// Reason why outputs cannot be written to the given paths.
 #[derive(Debug, thiserror::Error)]
 pub enum OutputError {
-    /// One of them is what is read.
+    /// An output is also an input.
     #[error("{output}: it is what {input} reads; name another file")]
     Input {
-        /// The output, with its option.
+        /// Output, with its option.
         output: String,
-        /// The option of the input.
+        /// Option of the input.
         input: String,
     },
-    /// Two of them are one file.
+    /// Two outputs are the same file.
     #[error("{output}: {other} writes the same file; name another")]
     Twice {
-        /// The second one, with its option.
+        /// Second output, with its option.
         output: String,
-        /// The option of the first one.
+        /// First output, with its option.
         other: String,
     },
-    /// One of them cannot be written.
+    /// An output cannot be written.
     #[error("{output}: cannot be written ({source}); name a file in an existing, writable folder")]
     Unwritable {
-        /// The output, with its option.
+        /// Output, with its option.
         output: String,
-        /// What the system says.
+        /// Error of the operating system.
         source: io::Error,
     },
 }
 
-/// Looks, before any work, whether all outputs can be written and none is an input or another output.
+/// Checks, before any work, that all outputs can be written and none is an input or another output.
 ///
-/// Devices may stand in more than one place. An empty option names an argument without one.
+/// Devices may be given more than once. An empty option name stands for a positional argument.
 pub fn check(inputs: &[Named], outputs: &[Named]) -> Result<(), OutputError> {
     apart(inputs, outputs)?;
     for output in outputs {
@@ -64,7 +66,7 @@ pub fn check(inputs: &[Named], outputs: &[Named]) -> Result<(), OutputError> {
     Ok(())
 }
 
-/// The part of [`check`] that writes nothing: whether all outputs differ from the inputs and from each other.
+/// Checks that all outputs differ from the inputs and from each other, without writing anything.
 pub fn apart(inputs: &[Named], outputs: &[Named]) -> Result<(), OutputError> {
     let inputs: Vec<_> = inputs
         .iter()
@@ -90,7 +92,7 @@ pub fn apart(inputs: &[Named], outputs: &[Named]) -> Result<(), OutputError> {
     Ok(())
 }
 
-/// The option and its file.
+/// Formats the option and its file.
 fn said((option, path): &Named) -> String {
     let gap = if option.is_empty() { "" } else { " " };
     format!("{option}{gap}{}", path.display())
@@ -101,14 +103,14 @@ fn option((option, _): &Named, otherwise: &str) -> String {
     named.to_owned()
 }
 
-/// A file on its way: nothing is at its place before [`commit`](Self::commit).
+/// A file that is being written: its path is untouched before [`commit`](Self::commit).
 #[derive(Debug)]
 pub struct Draft {
     file: NamedTempFile,
     place: Place,
 }
 
-/// Begins a file at `path`; also the check, made before any work, that this works.
+/// Starts writing a file at `path`; also checks, before any work, that this is possible.
 pub fn draft(path: &Path) -> io::Result<Draft> {
     let place = Place::of(path)?;
     let mut builder = tempfile::Builder::new();
@@ -131,7 +133,7 @@ pub fn draft(path: &Path) -> io::Result<Draft> {
     Ok(Draft { file, place })
 }
 
-/// The same, in a folder that is made where it is missing.
+/// Starts writing a file at `path`, in a folder that is made if it is missing.
 pub fn draft_with_folder(path: &Path) -> io::Result<Draft> {
     if let Some(folder) = path.parent() {
         fs::create_dir_all(folder)?;
@@ -147,17 +149,17 @@ pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
 }
 
 impl Draft {
-    /// Where it lies now, for a program that writes it.
+    /// Returns the temporary path of the file, for a program that writes it.
     pub fn path(&self) -> &Path {
         self.file.path()
     }
 
-    /// The file.
+    /// Returns the open file.
     pub fn as_file_mut(&mut self) -> &mut File {
         self.file.as_file_mut()
     }
 
-    /// Puts it in its place, complete.
+    /// Moves the complete file to its path.
     pub fn commit(self) -> io::Result<()> {
         match self.place {
             Place::File(path) => {

@@ -1,28 +1,30 @@
 //! Zeroed memory in large pages, where the operating system has them.
 //!
-//! At a robot's pace a control step finds little of its memory in the caches, and nothing of where its pages are in the processor's
-//! tables: a page of 4 KiB costs a walk through the operating system's, one of 2 MiB stands for 512 of them. Linux gives large pages to
-//! those who ask (`/sys/kernel/mm/transparent_hugepage/enabled`: `madvise` or `always`); elsewhere this is memory like any other.
+//! At a robot's rate a control step finds little of its memory in the caches, and none of its pages
+//! in the processor's translation tables: a page of 4 KiB costs a walk through the operating
+//! system's, one of 2 MiB stands for 512 of them. Linux gives large pages to those who ask
+//! (`/sys/kernel/mm/transparent_hugepage/enabled`: `madvise` or `always`); elsewhere this is
+//! ordinary memory.
 
 use std::io;
 
 use bytemuck::AnyBitPattern;
 use memmap2::MmapMut;
 
-/// Bytes of a large page, and what the memory starts at a multiple of.
+/// Size of a large page in bytes, and the alignment of the memory.
 const LARGE: usize = 2 << 20;
 
-/// Bytes at a multiple of 2 MiB, zero at first.
+/// Zeroed bytes at a multiple of 2 MiB.
 #[derive(Debug)]
 pub(crate) struct Pages {
-    /// The bytes start at `start`.
+    /// Mapping whose used bytes begin at `start`.
     map: MmapMut,
     start: usize,
     len: usize,
 }
 
 impl Pages {
-    /// So many of them; refused when the operating system has no such address space.
+    /// Allocates `len` bytes; fails if the operating system has no such address space.
     pub fn zeroed(len: usize) -> io::Result<Self> {
         let map = MmapMut::map_anon(len.saturating_add(LARGE))?;
         // A kernel without large pages refuses the advice, and nothing is lost.
@@ -32,12 +34,12 @@ impl Pages {
         Ok(Self { map, start, len })
     }
 
-    /// The bytes.
+    /// Returns the bytes.
     pub fn as_bytes(&self) -> &[u8] {
         &self.map[self.start..self.start + self.len]
     }
 
-    /// The bytes as numbers.
+    /// Returns the bytes as numbers.
     pub fn as_mut<T: AnyBitPattern + bytemuck::NoUninit>(&mut self) -> &mut [T] {
         bytemuck::cast_slice_mut(&mut self.map[self.start..self.start + self.len])
     }

@@ -1,8 +1,8 @@
-//! What a controller does not take, with the names of channel and element.
+//! Describes values that a controller refuses, with the names of channel and element.
 
 use lads_core::{ChannelId, Contract, InputError};
 
-/// What is wrong with the values of a channel, as one sentence without a full stop.
+/// Describes the error in the values of a channel, as one sentence without a full stop.
 pub fn refused(error: &InputError, contract: &Contract<'_>) -> String {
     let Some(channel) = contract.channel(ChannelId(error.channel())) else {
         return error.to_string();

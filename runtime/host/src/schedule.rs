@@ -1,6 +1,7 @@
-//! The schedule of a policy as a table: which programs run at which control steps, and what that costs.
+//! The schedule of a policy as a table: which programs run at which control steps, and their cost.
 //!
-//! It is worked out by going through the steps of a context, so it says what happens, not how the image writes it down.
+//! It is computed by walking the steps of a context, so it shows what runs, independent of the
+//! image's encoding.
 
 use std::collections::BTreeMap;
 
@@ -9,55 +10,55 @@ use lads_image::place::Place as PortPlace;
 use lads_image::records::{self, CallRecord, EntryRecord, Event, Repeat, SourceKind, When};
 use lads_image::{Chain, Program, Tables};
 
-/// Calls that run together: of an event, and at which of its control steps.
+/// Calls that run together, with their event and its control steps.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Place {
-    /// What makes them run.
+    /// Event that makes the calls run.
     pub event: Event,
-    /// At which control steps; [`Steps::All`] for other events.
+    /// Control steps at which the calls run; [`Steps::All`] for other events.
     pub steps: Steps,
-    /// In the order in which they run.
+    /// Calls in the order in which they run.
     pub calls: Vec<Call>,
 }
 
 /// Control steps of a context.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Steps {
-    /// All of them.
+    /// All control steps.
     All,
-    /// The first.
+    /// The first control step.
     First,
-    /// Every so many; the first among them unless it has a place of its own.
+    /// One control step in every so many; the first among them unless it has a place of its own.
     Every(u32),
-    /// Those that no other place names.
+    /// Control steps that no other place names.
     Other,
 }
 
-/// One call at its place.
+/// One call of a [`Place`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Call {
-    /// Name of its entry.
+    /// Name of the call's entry.
     pub entry: String,
-    /// The most runs of the entry.
+    /// Largest number of runs of the entry.
     pub runs: u32,
-    /// Name of the ring whose rows say how many runs there are, if one does.
+    /// Name of the ring whose rows determine the number of runs, if one does.
     pub per_row: Option<String>,
-    /// Name of the scores that an index is selected from afterwards, if one is.
+    /// Name of the scores that an index is selected from after the runs, if there are any.
     pub selects: Option<String>,
-    /// Names of the states that are cleared before.
+    /// Names of the states that are cleared before the runs.
     pub clears: Vec<String>,
-    /// Of all runs.
+    /// Cost of all runs.
     pub cost: Cost,
 }
 
-/// What calls cost at the largest context.
+/// Cost of calls at the largest context.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Cost {
-    /// Multiply-adds; an operation that goes over elements one by one counts one for each.
+    /// Number of multiply-adds; an operation that works element by element counts one for each.
     pub multiply_adds: u64,
-    /// Bytes of weights that are read.
+    /// Number of bytes of weights that are read.
     pub weight_bytes: u64,
-    /// Bytes of states that are read, and of KV caches that are written.
+    /// Number of bytes of states that are read, and of KV caches that are written.
     pub state_bytes: u64,
 }
 
@@ -81,14 +82,15 @@ impl Cost {
 }
 
 impl Place {
-    /// What all its calls cost.
+    /// Returns the cost of all calls of the place.
     pub fn cost(&self) -> Cost {
         let costs = self.calls.iter().map(|call| call.cost);
         costs.fold(Cost::default(), Cost::and)
     }
 }
 
-/// Control steps after which the schedule repeats, the first aside; 1 where nothing comes every so many steps.
+/// Returns the number of control steps after which the schedule repeats, not counting the first; 1
+/// if nothing is periodic.
 pub fn period(tables: &Tables) -> u32 {
     let steps = tables.calls().filter(|call| call.event == Event::Step);
     let every = steps.filter(|call| call.when == When::Every && call.every > 0);
@@ -102,7 +104,7 @@ fn gcd(a: u32, b: u32) -> u32 {
     if b == 0 { a } else { gcd(b, a % b) }
 }
 
-/// What one run of an entry costs.
+/// Returns the cost of one run of an entry.
 pub fn cost(tables: &Tables, entry: &EntryRecord) -> Cost {
     let ops = tables.ops(entry);
     let work = Program::trusted(ops, entry.arena_len, entry.tokens, 0).work();
@@ -124,7 +126,8 @@ pub fn cost(tables: &Tables, entry: &EntryRecord) -> Cost {
     }
 }
 
-/// All places of a policy, in the order of events and, among control steps, of the first at which they run.
+/// Returns all places of a policy, in the order of events and, among control steps, of the first at
+/// which they run.
 pub fn places(policy: &Policy) -> Vec<Place> {
     // A policy's image was checked.
     let Ok(tables) = Tables::new(policy.image()) else {
@@ -149,7 +152,7 @@ pub fn places(policy: &Policy) -> Vec<Place> {
     places
 }
 
-/// The steps of a context in groups at which the same calls run, each with its first.
+/// Groups the steps of a context at which the same calls run, each group with its first step.
 fn groups(tables: &Tables, last: u32) -> Vec<(Steps, u32)> {
     let mut groups: BTreeMap<Vec<usize>, Vec<u32>> = BTreeMap::new();
     for timestep in 0..last {

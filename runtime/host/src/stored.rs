@@ -1,11 +1,11 @@
-//! How the weights and the KV caches of an image are stored.
+//! Names the storage formats of an image's weights and KV caches.
 
 use lads_core::Policy;
 use lads_image::Tables;
 use lads_image::op::{CacheFormat, Op, WeightFormat};
 
-/// The formats that a policy's programs read, for example `f16 and f32 weights, f16 cache`; a policy without dense layers or without a
-/// cache names none of them.
+/// Names the formats that a policy's programs read, for example `f16 and f32 weights, f16 cache`; a
+/// policy without dense layers or without a cache names none of them.
 pub fn stored(policy: &Policy<'_>) -> String {
     // Opening the policy has read the same tables.
     let Ok(tables) = Tables::new(policy.image()) else {

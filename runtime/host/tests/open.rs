@@ -1,4 +1,4 @@
-//! Policies in either form, opened the one way: what they hold, what they do, and what is refused.
+//! Tests policies opened in either form: their content, their behaviour, and refusals.
 #![cfg(feature = "compile")]
 
 use std::fs;

@@ -1,4 +1,4 @@
-//! What a controller does not take is said with the names of channel and element.
+//! Tests that a refusal of a controller is described with the names of channel and element.
 #![cfg(feature = "compile")]
 
 use std::path::Path;

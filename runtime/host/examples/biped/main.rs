@@ -5,9 +5,10 @@
 //! cargo run --release -p lads-host --example biped -- stand.lads.onnx walk.lads.onnx 150
 //! ```
 //!
-//! The caller gives raw sensor values and gets joint targets; order, scales, the default posture and the last action are the image's.
-//! The hardware is a stand-in: joints follow their targets slowly, and every 40th read of the sensors is lost. Prints what the guard
-//! counted and a digest of all actions. `--fast` leaves the waiting out.
+//! The caller gives raw sensor values and gets joint targets; the image handles order, scales, the
+//! default posture and the last action. The hardware is simulated: joints follow their targets
+//! slowly, and every 40th read of the sensors is lost. The program prints the guard's counters and
+//! a digest of all actions. `--fast` skips the waiting.
 
 use std::error::Error;
 use std::process::ExitCode;
@@ -19,10 +20,10 @@ use lads_core::{
 };
 use lads_host::Loaded;
 
-/// Every so many periods a read is lost.
+/// Number of periods after which a read is lost.
 const LOST: u32 = 40;
 
-/// How fast a target may move, in radians per second.
+/// Largest rate of a joint target, in radians per second.
 const MAX_RATE: f32 = 8.0;
 
 fn main() -> ExitCode {
@@ -122,12 +123,12 @@ where
     Ok(guarded)
 }
 
-/// Joints that go a part of the way to their targets in every period.
+/// Simulated robot whose joints move part of the way to their targets in every period.
 struct Robot {
     observation: ChannelId,
     command: ChannelId,
     sensors: Vec<f32>,
-    /// For each joint, where its position and its velocity lie among the sensors.
+    /// Positions of each joint's position and velocity among the sensors.
     places: Vec<(usize, usize)>,
     period_s: f32,
 }
@@ -179,7 +180,7 @@ impl Robot {
     }
 }
 
-/// FNV-1a over the bits of all actions.
+/// FNV-1a hash over the bits of all actions.
 struct Digest(u32);
 
 impl Default for Digest {

@@ -1,26 +1,27 @@
-//! Where a path leads, and whether two lead to the same file.
+//! Resolves paths, and tells whether two lead to the same file.
 
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// The most symbolic links that are followed, as the kernel has it.
+/// Largest number of symbolic links that are followed, as in the Linux kernel.
 const MOST_LINKS: usize = 40;
 
-/// Where the system's own links stand, whose ends have no folder to rename in: `/dev/stdout`, `/proc/self/fd/1`.
+/// Folders of the system's own links, whose targets have no folder to rename in: `/dev/stdout`,
+/// `/proc/self/fd/1`.
 const SYSTEM: [&str; 2] = ["/dev", "/proc"];
 
-/// Where a path leads.
+/// Target of a path.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Place {
-    /// To a regular file, there already or not, behind all links.
+    /// A regular file, existing or not, with all links resolved.
     File(PathBuf),
-    /// To something that takes what is written into it.
+    /// A device, FIFO or socket that is written into.
     Stream(PathBuf),
 }
 
 impl Place {
-    /// Follows `path`; a folder is no place for a file.
+    /// Resolves `path`; a folder is an error.
     pub fn of(path: &Path) -> io::Result<Self> {
         match fs::metadata(path) {
             Ok(about) if about.is_dir() => Err(io::Error::new(
@@ -38,7 +39,7 @@ fn of_system(path: &Path) -> bool {
     SYSTEM.iter().any(|folder| path.starts_with(folder)) && !path.starts_with("/dev/shm")
 }
 
-/// The folder that a file lies in.
+/// Returns the folder of a file.
 pub fn folder(path: &Path) -> &Path {
     match path.parent() {
         Some(folder) if !folder.as_os_str().is_empty() => folder,
@@ -46,7 +47,7 @@ pub fn folder(path: &Path) -> &Path {
     }
 }
 
-/// The path behind all symbolic links of its last part, also where nothing is there yet.
+/// Resolves all symbolic links of the path's last part, also if the file does not exist yet.
 fn behind_links(path: &Path) -> io::Result<PathBuf> {
     let mut path = path.to_owned();
     for _ in 0..MOST_LINKS {
@@ -59,15 +60,16 @@ fn behind_links(path: &Path) -> io::Result<PathBuf> {
     Err(io::Error::other("too many symbolic links"))
 }
 
-/// What tells whether two paths are one file.
+/// Identity by which two paths are compared.
 #[derive(Debug)]
 pub enum Same {
-    /// It is there: device and inode.
+    /// An existing file: device and inode.
     #[cfg(unix)]
     There(u64, u64),
-    /// It is not there, or the system has no inodes: the folder, links resolved, and the name.
+    /// A file that does not exist yet, or a system without inodes: the folder, links resolved, and
+    /// the name.
     Named(PathBuf),
-    /// A device takes everything from everybody.
+    /// A device, which may be shared by all.
     Shared,
 }
 
