@@ -1,21 +1,21 @@
-//! Words of an image at an address as weights want it.
+//! Image words at an address with the alignment that weights need.
 
 use lads_image::format::WEIGHTS_ALIGN;
 
-/// Words in a line of weights.
+/// Number of words in a line of weights.
 const LINE: usize = WEIGHTS_ALIGN / size_of::<u32>();
 
 /// Words whose address is a multiple of [`WEIGHTS_ALIGN`].
 #[derive(Debug)]
 pub(crate) struct Aligned {
-    /// The words start at `start`; they do not move while this is moved.
+    /// Allocation whose used words begin at `start`; they do not move when this value is moved.
     words: Vec<u32>,
     start: usize,
     len: usize,
 }
 
 impl Aligned {
-    /// A copy of `words`.
+    /// Copies `words`.
     pub fn new(words: &[u32]) -> Self {
         let len = words.len();
         let mut room = vec![0; len + LINE];
@@ -28,7 +28,7 @@ impl Aligned {
         }
     }
 
-    /// The words as bytes.
+    /// Returns the words as bytes.
     pub fn as_bytes(&self) -> &[u8] {
         bytemuck::cast_slice(&self.words[self.start..self.start + self.len])
     }

@@ -1,7 +1,9 @@
-//! Opening a bundle: one ONNX file with its contract, its golden episode and the entry graphs of a policy.
+//! Opens a bundle: one ONNX file with its contract, its golden episode and the entry graphs of a
+//! policy.
 //!
-//! A [`Bundle`] is checked as a whole before anything is compiled: the file is an ONNX model, its contract reads, every entry that
-//! a policy of its kind needs is there, and the shapes that the entries declare are those of the contract. Nothing is written.
+//! A [`Bundle`] is checked as a whole before anything is compiled: the file is an ONNX model, its
+//! contract is valid, every entry that a policy of its kind needs is there, and the shapes that the
+//! entries declare match the contract. Nothing is written.
 
 use std::path::Path;
 
@@ -18,15 +20,16 @@ use crate::golden::Golden;
 use crate::onnx::{self, GraphProto, ModelProto};
 use crate::storage::{Tuned, without_record};
 
-/// How many instructions are offered when one is not known.
+/// Number of known instructions that are suggested for an unknown one.
 const NEAREST: usize = 3;
 
-/// A policy as the exporter wrote it.
+/// A checked bundle, as the exporter wrote it.
 #[derive(Debug, Clone)]
 pub struct Bundle {
     contract: Contract,
     golden: Golden,
-    /// How numbers are to be stored; or what is wrong with the record, which matters only to those who follow it.
+    /// Number formats that the bundle was tuned for, or the error in that record, which matters
+    /// only to callers that follow it.
     tuned: Result<Option<Tuned>, String>,
     sha256: String,
     untuned_sha256: String,
@@ -47,7 +50,7 @@ fn read_regular(path: &Path) -> std::io::Result<Vec<u8>> {
 }
 
 impl Bundle {
-    /// Reads a file. Errors name it.
+    /// Opens a bundle file. Errors name the file.
     pub fn open(path: &Path) -> Result<Self, BundleError> {
         let read = || Self::from_owned(&read_regular(path)?.into());
         read().map_err(|source| BundleError::File {
@@ -56,7 +59,7 @@ impl Bundle {
         })
     }
 
-    /// Reads a file's content.
+    /// Opens a bundle from a file's content.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, BundleError> {
         Self::from_owned(&Bytes::copy_from_slice(bytes))
     }
@@ -97,17 +100,18 @@ impl Bundle {
         })
     }
 
-    /// What the policy expects and promises.
+    /// Returns the contract: the policy's channels, states and instructions.
     pub fn contract(&self) -> &Contract {
         &self.contract
     }
 
-    /// The recorded episode.
+    /// Returns the recorded episode.
     pub fn golden(&self) -> &Golden {
         &self.golden
     }
 
-    /// How an image's numbers are to be stored, and on what evidence; `None` until the bundle is tuned. What can fail: the record.
+    /// Returns the number formats of an image and the evidence for them; `None` until the bundle is
+    /// tuned. Fails if the record is invalid.
     pub fn tuned(&self) -> Result<Option<&Tuned>, BundleError> {
         let tuned = self.tuned.as_ref().map(Option::as_ref);
         tuned.map_err(|problem| BundleError::Storage {
@@ -115,12 +119,13 @@ impl Bundle {
         })
     }
 
-    /// Names of the entry graphs whose outputs reach the action, not only the choice of an index.
+    /// Returns the names of the entry graphs whose outputs reach the action, not only the choice of
+    /// an index.
     pub fn acting_entries(&self) -> Vec<String> {
         self.entries_that(|_, entry| entry.acts)
     }
 
-    /// Names of the entry graphs that nothing but the trajectory encoder calls.
+    /// Returns the names of the entry graphs that nothing but the trajectory encoder calls.
     pub fn encoding_entries(&self) -> Vec<String> {
         self.entries_that(|blueprint, entry| {
             let mut events = blueprint.events_of(&entry.name).peekable();
@@ -141,22 +146,23 @@ impl Bundle {
         names
     }
 
-    /// SHA-256 of the file, hexadecimal.
+    /// Returns the SHA-256 of the file, hexadecimal.
     pub fn sha256(&self) -> &str {
         &self.sha256
     }
 
-    /// SHA-256 of the file as it was before it was tuned: what a reference names, from which the bundle was tuned.
+    /// Returns the SHA-256 of the file before it was tuned: a reference, by which a bundle is
+    /// tuned, names this one.
     pub fn untuned_sha256(&self) -> &str {
         &self.untuned_sha256
     }
 
-    /// Size of the file.
+    /// Returns the size of the file in bytes.
     pub fn len_bytes(&self) -> usize {
         self.bytes
     }
 
-    /// The value of a metadata key, for example `action_scale`.
+    /// Returns the value of a metadata key, for example `action_scale`.
     pub fn metadata(&self, key: &str) -> Option<&str> {
         self.model
             .metadata_props
@@ -165,7 +171,7 @@ impl Bundle {
             .map(|pair| pair.value.as_str())
     }
 
-    /// The entry graphs of the file, in the order of their first input.
+    /// Returns the names of the entry graphs of the file, in the order of their first input.
     pub fn entries(&self) -> Vec<&str> {
         let mut found: Vec<&str> = vec![];
         for value in &self.graph().input {
@@ -178,7 +184,8 @@ impl Bundle {
         found
     }
 
-    /// One entry as an ONNX model of its own, the names as in the bundle: to run it with another runtime.
+    /// Cuts one entry out as an ONNX model of its own, with the bundle's names, to run it with
+    /// another runtime.
     pub fn entry_onnx(&self, entry: &str) -> Result<Vec<u8>, BundleError> {
         let graph = self.graph();
         let prefix = format!("{entry}/");
@@ -230,7 +237,8 @@ impl Bundle {
         Ok(model.encode_to_vec())
     }
 
-    /// Indices of the instructions that a person means, by [the one rule](lads_core::instructions_called). Empty for none.
+    /// Returns the indices of the instructions that a person means, by [the one
+    /// rule](lads_core::instructions_called). The result is empty if there are none.
     pub fn instruction_indices(&self, text_or_id: &str) -> Vec<usize> {
         let known = self.contract.instructions.iter();
         let known = known.map(|known| (known.id.as_str(), known.text.as_str()));
@@ -239,7 +247,7 @@ impl Bundle {
             .collect()
     }
 
-    /// The known instructions that are most like a text, the best first.
+    /// Returns the known instructions that are most similar to a text, the best first.
     pub fn nearest_instructions(&self, text: &str) -> Vec<&str> {
         let wanted = plain(text);
         let mut scored: Vec<(f64, &str)> = self
@@ -274,7 +282,7 @@ impl Bundle {
     }
 }
 
-/// Lower case, single spaces.
+/// Normalises a text to lower case and single spaces.
 fn plain(text: &str) -> String {
     text.to_lowercase()
         .split_whitespace()

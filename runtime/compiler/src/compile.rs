@@ -1,4 +1,4 @@
-//! The whole way from a bundle to an image.
+//! Compiles a bundle to an image, through all stages.
 
 use std::collections::{HashMap, HashSet};
 
@@ -21,7 +21,7 @@ use crate::storage::Storage;
 use crate::tensor::Tensor;
 use crate::verify::verify;
 
-/// One program that was made.
+/// A compiled program with its entry.
 pub(crate) struct Made {
     /// Index into the blueprint's entries.
     pub entry: usize,
@@ -29,19 +29,21 @@ pub(crate) struct Made {
     pub tokens: usize,
 }
 
-/// What a compilation may choose.
+/// Options of a compilation.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Options {
-    /// How weights and caches are stored; left out, as the bundle was [tuned](Bundle::tuned), and with 32 bits where it was not.
+    /// Storage of weights and caches; if `None`, the formats that the bundle was
+    /// [tuned](Bundle::tuned) for, or 32 bits if it was not tuned.
     pub storage: Option<Storage>,
-    /// How far an action may be from the recorded one, instead of what the bundle says; the image's self-test keeps to it too.
+    /// Largest difference of an action from the recorded one, in place of the bundle's tolerance;
+    /// the image's self-test uses it too.
     pub tolerance: Option<f32>,
-    /// Whether an image is made even if the gate refuses it; its self-test then fails.
+    /// True to make an image even if the gate refuses it; its self-test then fails.
     pub force: bool,
 }
 
 impl Options {
-    /// Everything with 32 bits, whatever the bundle was tuned to.
+    /// Options for 32 bits everywhere, whatever the bundle was tuned for.
     pub fn exact() -> Self {
         Self {
             storage: Some(Storage::default()),
@@ -49,7 +51,8 @@ impl Options {
         }
     }
 
-    /// How the numbers of this bundle's image are stored. What can fail: the bundle's record, where nothing else is said.
+    /// Returns the storage of this bundle's image. Fails if the bundle's record is needed and
+    /// invalid.
     pub fn storage(&self, bundle: &Bundle) -> Result<Storage, BundleError> {
         if let Some(storage) = &self.storage {
             return Ok(storage.clone());
@@ -59,13 +62,15 @@ impl Options {
     }
 }
 
-/// Compiles a bundle, its numbers stored as it was [tuned](Bundle::tuned), or with 32 bits.
+/// Compiles a bundle with the number formats that it was [tuned](Bundle::tuned) for, or with 32
+/// bits.
 pub fn compile(bundle: &Bundle) -> Result<Image, CompileError> {
     compile_with(bundle, &Options::default())
 }
 
-/// Compiles a bundle. Weights or a cache of fewer bits have to pass a gate, unless forced: the image that was made replays the bundle's golden
-/// episode with the same indices, and with actions inside the episode's tolerance.
+/// Compiles a bundle with the given options. Weights or a cache of fewer bits have to pass a gate,
+/// unless forced: the compiled image replays the bundle's golden episode with the same indices, and
+/// with actions inside the episode's tolerance.
 pub fn compile_with(bundle: &Bundle, options: &Options) -> Result<Image, CompileError> {
     let contract = bundle.contract();
     let storage = options.storage(bundle).map_err(CompileError::Bundle)?;
@@ -157,7 +162,7 @@ pub fn compile_with(bundle: &Bundle, options: &Options) -> Result<Image, Compile
     Ok(image)
 }
 
-/// Refuses exceptions for entries and layers that there are not.
+/// Refuses exceptions for entries and layers that do not exist.
 fn known_parts(
     storage: &Storage,
     signatures: &[Signature],
@@ -179,7 +184,7 @@ fn known_parts(
     })
 }
 
-/// Refuses memory of more f32 elements than a policy gets.
+/// Refuses more f32 elements of memory than a policy may have.
 fn bounded(elements: usize) -> Result<(), CompileError> {
     let bytes = elements.saturating_mul(size_of::<f32>());
     if bytes > Policy::MEMORY_LIMIT {
@@ -188,7 +193,7 @@ fn bounded(elements: usize) -> Result<(), CompileError> {
     Ok(())
 }
 
-/// The golden episode, in memory of its own.
+/// Replays the golden episode, in memory of its own.
 fn gate(policy: &Policy, storage: &Storage, tolerance: f32) -> Result<(), CompileError> {
     bounded(policy.arena_len().saturating_add(policy.state_len()))?;
     let mut arena = vec![0.0; policy.arena_len()];
@@ -206,7 +211,7 @@ fn gate(policy: &Policy, storage: &Storage, tolerance: f32) -> Result<(), Compil
     })
 }
 
-/// The KV caches, with the rows that the longest context takes.
+/// Sizes the KV caches for the rows that the longest context takes.
 fn caches(
     bundle: &Bundle,
     blueprint: &Blueprint,
@@ -238,7 +243,7 @@ fn caches(
     Ok(caches)
 }
 
-/// The graph of an entry, ready to be lowered; `None` for one that the bundle leaves out.
+/// Returns the graph of an entry, ready to be lowered; `None` for one that the bundle leaves out.
 fn fused(
     model: &Model,
     signatures: &[Signature],
@@ -269,7 +274,7 @@ fn fused(
     }
 }
 
-/// The words of every known instruction: the entry is evaluated for each id.
+/// Computes the words of every known instruction by evaluating the entry for each id.
 fn instruction_words(
     bundle: &Bundle,
     model: &Model,

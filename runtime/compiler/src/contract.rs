@@ -1,7 +1,9 @@
-//! The contract of a bundle: what the policy expects and promises, as JSON in the model's metadata.
+//! The contract of a bundle: the policy's channels, states, instructions and family, as JSON in the
+//! model's metadata.
 //!
-//! [`Contract::parse`] checks it as a whole: every field there, every number in its range, no name twice. Fields that this
-//! version does not know are skipped; a change of meaning changes the version.
+//! [`Contract::parse`] checks it as a whole: every field present, every number in its range, no
+//! name twice. Fields that this version does not know are skipped; a change of meaning changes the
+//! version.
 
 mod channel;
 mod language;
@@ -22,111 +24,112 @@ pub const CONTRACT_VERSION: u32 = 2;
 /// The environment that the policy was made for.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 pub struct Environment {
-    /// For example `franka-kitchen`.
+    /// Name of the environment, for example `franka-kitchen`.
     pub id: String,
     /// Version of the environment.
     pub version: String,
 }
 
-/// How a state of a plain policy is kept.
+/// Way in which a state of a plain policy is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum StateKind {
-    /// As a whole.
+    /// Values replaced as a whole.
     Plain,
-    /// The last rows.
+    /// Ring of the last rows.
     Ring,
 }
 
-/// What clears a state.
+/// Event that clears a state.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ClearedBy {
     /// The end of an episode.
     #[default]
     Episode,
-    /// Another instruction.
+    /// The start of another instruction.
     Instruction,
 }
 
-/// What stands for rows that a ring does not have yet.
+/// Content of the rows that a ring does not have yet.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Fill {
     /// Zeros.
     #[default]
     Zero,
-    /// The oldest row.
+    /// Copies of the oldest row.
     First,
 }
 
-/// A state of a plain policy: what of one control step the next one reads.
+/// State of a plain policy: memory that one control step leaves for the next.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 pub struct State {
-    /// Name; the graph reads it by this name and gives `next_NAME`.
+    /// Name of the state; the graph reads it by this name and writes `next_NAME`.
     pub name: String,
-    /// How it is kept.
+    /// Way in which the state is stored.
     pub kind: StateKind,
     /// Shape of a plain state.
     #[serde(default)]
     pub shape: Vec<usize>,
-    /// Rows of a ring.
+    /// Number of rows of a ring.
     #[serde(default)]
     pub rows: usize,
-    /// The channel that is appended to a ring in every step, before the graph runs.
+    /// Channel whose values are appended to a ring in every step, before the graph runs.
     #[serde(default)]
     pub source: Option<String>,
-    /// What stands for missing rows of a ring.
+    /// Content of a ring's missing rows.
     #[serde(default)]
     pub fill: Fill,
-    /// What clears it.
+    /// Event that clears the state.
     #[serde(default)]
     pub cleared_by: ClearedBy,
 }
 
-/// What happens when the context is full.
+/// Behaviour when the context is full.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Beyond {
-    /// The words stay, time starts again at 0.
+    /// Keep the words and restart the time at 0.
     Restart,
-    /// The step is refused.
+    /// Refuse the step.
     Refuse,
 }
 
-/// What the transformer's context holds.
+/// Capacity of the transformer's context.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub struct Context {
-    /// Words of the longest instruction, `L`.
+    /// Number of words of the longest instruction, `L`.
     pub words: usize,
-    /// Control steps.
+    /// Number of control steps.
     pub steps: usize,
-    /// What happens then.
+    /// Behaviour after that many control steps.
     pub beyond: Beyond,
 }
 
 /// A known instruction; its position is its index in the table.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 pub struct Instruction {
-    /// Short name.
+    /// Short name of the instruction.
     pub id: String,
-    /// What the person says.
+    /// The instruction as a person says it.
     pub text: String,
 }
 
-/// How an instruction is evaluated.
+/// Evaluation of one instruction.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 pub struct Evaluated {
-    /// The sub-tasks that it asks for.
+    /// Names of the sub-tasks that the instruction asks for.
     pub sub_tasks: Vec<String>,
-    /// Name of the set that it belongs to: `seen` and `unseen`, or the benchmark's own names.
+    /// Name of the split that the instruction belongs to: `seen` and `unseen`, or the benchmark's
+    /// own names.
     pub split: String,
 }
 
-/// How the policy is evaluated; never part of an image.
+/// Evaluation of the policy; never part of an image.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
 pub struct Evaluation {
-    /// One for each instruction, in their order; or none at all.
+    /// Evaluation of each instruction, in their order; or none at all.
     #[serde(default)]
     pub instructions: Vec<Evaluated>,
 }
@@ -134,50 +137,51 @@ pub struct Evaluation {
 /// Sizes of the transformer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub struct Network {
-    /// Layers.
+    /// Number of layers.
     pub layers: usize,
-    /// Attention heads.
+    /// Number of attention heads.
     pub heads: usize,
-    /// Elements per head.
+    /// Number of elements per head.
     pub head_dim: usize,
 }
 
-/// What a policy expects and promises.
+/// The contract of a policy: its channels, states, instructions and family.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Contract {
-    /// Version of the contract's form.
+    /// Version of the contract's format.
     pub version: u32,
-    /// The family of policies that it belongs to, with that family's own fields.
+    /// Family of policies that the policy belongs to, with that family's own fields.
     pub family: Family,
-    /// The environment.
+    /// Environment that the policy was made for.
     pub environment: Environment,
-    /// Time from one control step to the next, in seconds.
+    /// Control period, the time from one control step to the next, in seconds.
     pub control_period_s: f32,
-    /// The values at its edge.
+    /// Inputs and outputs of the policy.
     pub channels: Vec<Channel>,
-    /// What a plain policy remembers.
+    /// States of a plain policy.
     #[serde(default)]
     pub states: Vec<State>,
-    /// The context; without one, time goes on without end.
+    /// Context of the transformer; without one, a policy runs without a bound on time.
     #[serde(default)]
     pub context: Option<Context>,
-    /// The known instructions.
+    /// Known instructions.
     #[serde(default)]
     pub instructions: Vec<Instruction>,
-    /// The language encoder, where there are instructions.
+    /// Language encoder, for policies with instructions.
     #[serde(default)]
     pub language: Option<Language>,
-    /// The transformer that reads the instruction.
+    /// Transformer that reads the instruction.
     #[serde(default)]
     pub network: Option<Network>,
-    /// How the policy is evaluated.
+    /// Evaluation of the policy.
     #[serde(default)]
     pub evaluation: Evaluation,
-    /// How the policy was trained: anything that the exporter wrote.
+    /// Record of how the policy was trained, in any form that the exporter wrote.
     pub provenance: serde_json::Value,
 }
 
-/// The largest length that a contract may claim. Generous, and small enough that products of a few fit 64 bits.
+/// Largest length that a contract may claim. It is generous, and small enough that products of a
+/// few lengths fit 64 bits.
 pub(crate) const MAX_LEN: usize = 1 << 20;
 
 impl Contract {
@@ -208,38 +212,41 @@ impl Contract {
         Ok(contract)
     }
 
-    /// The channel of a name.
+    /// Returns the channel with this name.
     pub fn channel(&self, name: &str) -> Option<&Channel> {
         self.channels.iter().find(|channel| channel.name == name)
     }
 
-    /// The channels that the caller gives in every control step, in their order.
+    /// Returns the channels that the caller gives in every control step, in their order.
     pub fn observations(&self) -> impl Iterator<Item = &Channel> {
         self.with(Role::Observation)
     }
 
-    /// The first channel that the caller gives in every control step, the only one of most policies.
+    /// Returns the first channel that the caller gives in every control step, the only one of most
+    /// policies.
     pub fn observation(&self) -> &Channel {
         self.known(Role::Observation)
     }
 
-    /// The action channel.
+    /// Returns the action channel.
     pub fn action(&self) -> &Channel {
         self.known(Role::Action)
     }
 
-    /// Words of the longest instruction, and elements of a word; `None` for a policy that takes none.
+    /// Returns the number of words of the longest instruction, and of elements of a word; `None`
+    /// for a policy that takes none.
     pub fn words(&self) -> Option<[usize; 2]> {
         let channel = self.with(Role::Instruction).next()?;
         Some([channel.shape[0], channel.shape[1]])
     }
 
-    /// Control steps from one selection to the next; `None` for a policy that selects nothing.
+    /// Returns the number of control steps from one selection to the next; `None` for a policy that
+    /// selects nothing.
     pub fn period(&self) -> Option<usize> {
         self.family.period()
     }
 
-    /// The sub-tasks and the split of an instruction; empty where the bundle does not say.
+    /// Returns the sub-tasks and the split of an instruction; empty where the bundle does not say.
     pub fn evaluated(&self, instruction: usize) -> (&[String], &str) {
         self.evaluation
             .instructions

@@ -1,10 +1,10 @@
-//! What files are known by.
+//! Digests that identify files.
 
 use std::fmt::Write as _;
 
 use sha2::{Digest, Sha256};
 
-/// The SHA-256 of some bytes, in hexadecimal digits.
+/// Returns the SHA-256 of some bytes, in hexadecimal digits.
 pub fn sha256(bytes: &[u8]) -> String {
     let mut text = String::new();
     for byte in Sha256::digest(bytes) {
@@ -18,7 +18,7 @@ pub fn sha256(bytes: &[u8]) -> String {
 mod tests {
     use super::sha256;
 
-    /// The first example of NIST's FIPS 180-2, appendix B.
+    /// Checks the first example of NIST's FIPS 180-2, appendix B.
     #[test]
     fn a_published_digest() {
         let digest = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";

@@ -1,8 +1,9 @@
-//! The graphs of a bundle: which values each reads and gives, and whether they are what the contract says.
+//! Graphs of a bundle: the values that each reads and writes, checked against the contract.
 //!
-//! The graphs lie in one ONNX graph; a value's name starts with its graph's. The contract's family says which graphs there are, and the
-//! names of their values what they are bound to. What can fail: a graph or a value is missing, means nothing, or is declared with
-//! another type or shape; [`signatures`] reports it together with the field of the contract.
+//! The graphs are parts of one ONNX graph; a value's name starts with its graph's. The contract's
+//! family determines which graphs there are, and the names of their values determine their
+//! bindings. What can fail: a graph or a value is missing, unknown, or declared with another type
+//! or shape; [`signatures`] reports it together with the field of the contract.
 
 use std::collections::HashMap;
 
@@ -12,21 +13,22 @@ use crate::family::{Blueprint, Bound, Entry, Keep};
 use crate::graph::{Dim, Type, show};
 use crate::onnx::{GraphProto, NodeProto, TensorTypeProto, ValueInfoProto, data_type};
 
-/// The table of known instructions: evaluated when a bundle is compiled.
+/// Name of the graph that holds the table of known instructions: evaluated when a bundle is
+/// compiled.
 pub(crate) const LOOKUP_INSTRUCTION: &str = "instruction/lookup";
 
-/// A value at the edge of a graph.
+/// An input or output of a graph.
 #[derive(Debug, Clone)]
 pub(crate) struct Value {
-    /// Without the graph's name.
+    /// Name of the value without the graph's name.
     pub name: String,
     pub ty: Type,
     pub shape: Vec<Dim>,
-    /// The fields of the contract that the shape comes from.
+    /// Fields of the contract that determine the shape.
     pub fields: String,
 }
 
-/// What a graph reads and gives.
+/// Inputs and outputs of a graph.
 #[derive(Debug, Clone)]
 pub(crate) struct Signature {
     pub entry: String,
@@ -35,7 +37,7 @@ pub(crate) struct Signature {
 }
 
 impl Signature {
-    /// Rows that a run appends to the KV cache.
+    /// Returns the number of rows that a run appends to the KV cache.
     pub fn tokens(&self) -> usize {
         let present = self
             .outputs
@@ -45,7 +47,8 @@ impl Signature {
     }
 }
 
-/// The signatures of all graphs that the contract's family has, checked against the contract.
+/// Returns the signatures of all graphs that the contract's family has, checked against the
+/// contract.
 pub(crate) fn signatures(
     graph: &GraphProto,
     contract: &Contract,
@@ -103,12 +106,13 @@ pub(crate) fn signatures(
     Ok(all)
 }
 
-/// Whether an output is kept, or part of the KV cache.
+/// Returns whether an output is kept, or part of the KV cache.
 fn is_used(entry: &Entry, output: &str) -> bool {
     output.starts_with("present.") || entry.outputs.iter().any(|kept| kept == output)
 }
 
-/// Every value belongs to a graph of the family. (A trajectory encoder may come with any of them, to be used elsewhere.)
+/// Checks that every value belongs to a graph of the family. (A bundle of any family may hold a
+/// trajectory encoder, to be used elsewhere.)
 fn unknown(graph: &GraphProto, contract: &Contract, known: &[Signature]) -> Result<(), String> {
     for declared in graph.input.iter().chain(&graph.output) {
         let initialized = graph
@@ -129,16 +133,17 @@ fn unknown(graph: &GraphProto, contract: &Contract, known: &[Signature]) -> Resu
     Ok(())
 }
 
-/// What has been seen of the values.
+/// Checker of declared values, with the widths found so far.
 struct Checker<'c> {
     contract: &'c Contract,
     blueprint: &'c Blueprint,
-    /// Elements of the states whose width no field says, by the first value that was bound to each.
+    /// Number of elements of the states whose width no field states, by the first value that was
+    /// bound to each.
     widths: HashMap<usize, (usize, String)>,
 }
 
 impl Checker<'_> {
-    /// A declared value, if it is what the contract says.
+    /// Returns a declared value, if it matches the contract.
     fn value(
         &mut self,
         graph: &str,
@@ -235,7 +240,8 @@ impl Checker<'_> {
         })
     }
 
-    /// Keys and values of every layer of the entry's transformer, and no others.
+    /// Checks the keys and values of every layer of the entry's transformer, and that there are no
+    /// others.
     fn cache(
         &self,
         cache: Option<&str>,
@@ -299,7 +305,7 @@ impl Checker<'_> {
     }
 }
 
-/// The table of instructions.
+/// Checks the table of instructions.
 fn lookup(graph: &GraphProto, [words, dim]: [usize; 2]) -> Result<Signature, String> {
     let wanted = |name: &str, ty, shape: &[usize]| Value {
         name: name.into(),
@@ -339,7 +345,7 @@ fn differs(name: &str, found: &[Dim], wanted: &str, fields: &str) -> String {
     )
 }
 
-/// The type and shape that a value declares: symbolic axes must be called `P` or `P+n`.
+/// Reads the type and shape that a value declares: symbolic axes must be called `P` or `P+n`.
 fn declaration(value: &ValueInfoProto) -> Result<(Type, Vec<Dim>), String> {
     let name = &value.name;
     let tensor = value.r#type.as_ref().and_then(|ty| ty.tensor_type.as_ref());
@@ -376,14 +382,14 @@ fn shape_of(tensor: &TensorTypeProto) -> Option<Vec<Dim>> {
     .collect()
 }
 
-/// The entry that a value's name starts with: its first two parts.
+/// Returns the entry that a value's name starts with: its first two parts.
 pub(crate) fn entry_of(name: &str) -> Option<&str> {
     let first = name.find('/')?;
     let second = name[first + 1..].find('/')?;
     Some(&name[..=first + second])
 }
 
-/// The nodes that some values need, in the graph's order.
+/// Returns the nodes that some values need, in the graph's order.
 pub(crate) fn needed<'g>(
     graph: &'g GraphProto,
     roots: impl Iterator<Item = &'g str>,
@@ -412,7 +418,7 @@ pub(crate) fn needed<'g>(
         .collect()
 }
 
-/// The length that a symbolic axis stands for: `P`, the rows of the cache, or `P+n`.
+/// Returns the length that a symbolic axis stands for: `P`, the rows of the cache, or `P+n`.
 pub(crate) fn past(name: &str) -> Option<Dim> {
     let rest = name.strip_prefix('P')?;
     let added = rest

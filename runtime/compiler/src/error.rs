@@ -1,4 +1,4 @@
-//! What can go wrong with a bundle: one line that names the thing and says what to do about it.
+//! Errors of a bundle and of its compilation: one line that names the thing and the remedy.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -34,134 +34,134 @@ impl fmt::Display for Line {
     }
 }
 
-/// Why a file is not a bundle that can be used.
+/// Reason why a file cannot be used as a bundle.
 #[derive(Debug, thiserror::Error)]
 pub enum BundleError {
     /// The file cannot be read.
     #[error("cannot be read: {0}; check the path")]
     Read(#[from] std::io::Error),
-    /// The file is something else.
+    /// The file is not an ONNX model.
     #[error("not an ONNX model: {problem}; give the .onnx bundle that the exporter wrote")]
     NotOnnx {
-        /// What does not fit.
+        /// Fault of the file.
         problem: Line,
     },
     /// The file ends too early.
     #[error("truncated: {needed} bytes are needed, the file has {got}; copy or export it again")]
     Truncated {
-        /// Bytes that the part before the end announces.
+        /// Number of bytes up to the end of the part that the file announces last.
         needed: u64,
-        /// Bytes that there are.
+        /// Number of bytes in the file.
         got: u64,
     },
-    /// An ONNX model without a policy's contract.
+    /// The ONNX model has no policy contract.
     #[error(
         "no `lads.contract` in the model's metadata, so it is not a policy bundle; `lads import` makes one of any ONNX policy"
     )]
     NoContract,
-    /// A contract that another version of this crate reads.
+    /// The contract is of another version than this crate reads.
     #[error(
         "the contract has version {found}, this program reads version {supported}; export the bundle again or use the matching release"
     )]
     ContractVersion {
         /// Version in the file.
         found: Line,
-        /// Version that is read.
+        /// Version that this crate reads.
         supported: u32,
     },
-    /// A contract of the first version.
+    /// The contract is of the first version.
     #[error(
         "the contract has version 1, this program reads version 2; upgrade it: `python -m lads_exporter upgrade FILE`"
     )]
     ContractV1,
-    /// A contract that misses something or contradicts itself.
+    /// The contract misses something or contradicts itself.
     #[error("contract: {problem}; export the bundle again")]
     Contract {
-        /// The field and what is wrong with it.
+        /// Name of the field, and its fault.
         problem: Line,
     },
-    /// A graph that contradicts the contract, or misses an entry.
+    /// A graph contradicts the contract, or misses an entry.
     #[error("{problem}; export the bundle again")]
     Entry {
-        /// The value and the field.
+        /// Name of the value, and the field of the contract.
         problem: Line,
     },
-    /// The recorded episode does not read.
+    /// The recorded episode is invalid.
     #[error("`lads.golden`: {problem}; export the bundle again")]
     Golden {
-        /// What is wrong with it.
+        /// Fault of the episode.
         problem: Line,
     },
-    /// The record of how an image's numbers are stored does not read.
+    /// The record of how an image's numbers are stored is invalid.
     #[error("`lads.storage`: {problem}; tune the bundle again: `lads-run tune`")]
     Storage {
-        /// What is wrong with it.
+        /// Fault of the record.
         problem: Line,
     },
-    /// One of the above, in a file.
+    /// Any other error of this type, with the path of the file.
     #[error("{path}: {source}", path = path.display())]
     File {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// Error of the file.
         source: Box<BundleError>,
     },
 }
 
-/// Why a bundle does not compile.
+/// Reason why a bundle does not compile.
 #[derive(Debug, thiserror::Error)]
 pub enum CompileError {
     /// The graphs contradict the contract.
     #[error(transparent)]
     Bundle(BundleError),
-    /// An operator that the compiler does not know, or uses of a known one that it does not.
+    /// An operator, or a use of it, that the compiler does not support.
     #[error("entry {entry}, node `{node}`: operator {operator} {problem}")]
     Operator {
-        /// The entry, for example `high_level/step`.
+        /// Name of the entry, for example `high_level/step`.
         entry: Line,
-        /// The ONNX operator.
+        /// Name of the ONNX operator.
         operator: Line,
-        /// The node's name, or its first output's.
+        /// Name of the node, or of its first output.
         node: Line,
-        /// What is not supported, and instead of what.
+        /// What is not supported, and what is supported instead.
         problem: Line,
     },
-    /// A value that is missing or has another shape than the contract says.
+    /// A value is missing or has another shape than the contract states.
     #[error("entry {entry}: {problem}; export the bundle again")]
     Entry {
-        /// The entry.
+        /// Name of the entry.
         entry: Line,
-        /// What is wrong with it.
+        /// Fault of the value.
         problem: Line,
     },
-    /// A memory plan that the verifier refused: a defect of this compiler.
+    /// The verifier refused a memory plan: a defect of this compiler.
     #[error(
         "program {program}: the memory plan is wrong ({fault}); this is a defect of the compiler, please report it with the bundle"
     )]
     Plan {
-        /// The program.
+        /// Name of the program.
         program: Line,
-        /// What the verifier found.
+        /// Fault that the verifier found.
         fault: crate::verify::PlanFault,
     },
-    /// Weights or a cache of fewer bits change what the policy does.
+    /// Weights or a cache of fewer bits change the policy's actions or indices.
     #[error(
         "with {stored} the golden episode does not replay: {error} (tolerance {tolerance:e}); store more bits, or name the tolerance that the machine can live with"
     )]
     Gate {
-        /// How weights and cache are stored.
+        /// Storage of weights and cache.
         stored: Line,
-        /// What came out otherwise than recorded.
+        /// Difference from the recorded episode.
         error: SelfTestError,
         /// Largest absolute difference of an action that counts as equal.
         tolerance: f32,
     },
-    /// Formats for parts that the bundle does not have.
+    /// Formats are given for parts that the bundle does not have.
     #[error(
         "the storage names {parts}, and the bundle has no entry and no layer of that name; tune the bundle again, or name others"
     )]
     UnknownParts {
-        /// All of them, with commas.
+        /// Names of all such parts, separated by commas.
         parts: Line,
     },
     /// The policy is too large for an image, whose offsets have 32 bits.
@@ -169,19 +169,19 @@ pub enum CompileError {
         "{what} is too large for a program image, whose offsets have 32 bits; use a smaller network"
     )]
     TooLarge {
-        /// What is too large.
+        /// Part of the policy that is too large.
         what: Line,
     },
-    /// A controller of the policy would ask for more memory than any policy gets.
+    /// A controller of the policy would need more memory than any policy may have.
     #[error(
         "the policy asks for a workspace of {bytes} bytes, and gets at most {most}; do not trust it, or export a bundle with a shorter context",
         most = Policy::MEMORY_LIMIT
     )]
     Excessive {
-        /// What it would ask for.
+        /// Number of bytes that the controller would need.
         bytes: usize,
     },
-    /// The image that was made does not load: a defect of this compiler.
+    /// The compiled image does not load: a defect of this compiler.
     #[error(
         "the compiled image does not load ({0}); this is a defect of the compiler, please report it with the bundle"
     )]

@@ -1,8 +1,10 @@
-//! Families of policies: which entries a bundle of each has, which states they share, and when each is called.
+//! Families of policies: the entries that a bundle of each has, the states that they share, and
+//! when each is called.
 //!
-//! A family is one file with the fields of its contract and its blueprint, and one row of the table below. Nothing else of this
-//! project knows families: the compiler writes the blueprint into the image as states, entries and calls, and the runtime runs
-//! those. What can fail: a contract whose fields make no such policy (`Kind::check`).
+//! A family is one file with the fields of its contract and its blueprint, and one row of the table
+//! below. No other part of this project depends on families: the compiler writes the blueprint into
+//! the image as states, entries and calls, and the runtime runs those. What can fail: a contract
+//! whose fields do not describe such a policy (`Kind::check`).
 
 mod blueprint;
 pub mod history;
@@ -22,19 +24,20 @@ use crate::contract::{Contract, MAX_LEN, Network};
 pub use blueprint::RESERVED;
 pub(crate) use blueprint::{Blueprint, Bound, Call, Entry, Keep, Origin, Times};
 
-/// What the table asks of a family.
+/// Interface of a family of policies.
 pub(crate) trait Kind {
-    /// Control steps from one selection to the next; `None` for a family that selects nothing.
+    /// Returns the number of control steps from one selection to the next; `None` for a family that
+    /// selects nothing.
     fn period(&self) -> Option<usize> {
         None
     }
 
-    /// How an index is picked.
+    /// Returns the rule by which an index is picked.
     fn selection(&self) -> Selection {
         Selection::default()
     }
 
-    /// Where noise comes from.
+    /// Returns the source of noise.
     fn noise(&self) -> Noise {
         Noise::default()
     }
@@ -42,20 +45,20 @@ pub(crate) trait Kind {
     /// Checks the family's own fields against the rest of the contract.
     fn check(&self, contract: &Contract) -> Result<(), String>;
 
-    /// The parts of a policy of this family.
+    /// Returns the parts of a policy of this family.
     fn blueprint(&self, contract: &Contract) -> Blueprint;
 }
 
-/// The enum of all families, and the dispatch to them.
+/// Defines the enum of all families, and the dispatch to them.
 macro_rules! families {
     ($($(#[$meta:meta])* $name:ident($kind:ty) = $tag:literal,)*) => {
-        /// A family with the fields of its contract.
+        /// Family of a policy, with the family's fields of the contract.
         #[derive(Debug, Clone, PartialEq, Deserialize)]
         #[serde(tag = "kind")]
         pub enum Family { $($(#[$meta])* #[serde(rename = $tag)] $name($kind),)* }
 
         impl Family {
-            /// Its name in a contract.
+            /// Returns the name of the family in a contract.
             pub fn name(&self) -> &'static str {
                 match self { $(Self::$name(_) => $tag,)* }
             }
@@ -68,26 +71,29 @@ macro_rules! families {
 }
 
 families! {
-    /// Words, latent plans held for a horizon, and a low level: LADS, and its ablations and baselines of the same shape.
+    /// LADS, with its ablations and baselines of the same shape: words, latent plans held for a
+    /// horizon, and a low level.
     Lads(lads::Lads) = "lads",
-    /// A transformer that gives the action itself, with no plan.
+    /// Lang DT: a transformer that outputs the action itself, without a plan.
     LangDt(lang_dt::LangDt) = "lang_dt",
-    /// Plans held for a horizon, and a low level that attends to the steps under its plan.
+    /// LISA: plans held for a horizon, and a low level that attends to the steps under its plan.
     Lisa(lisa::Lisa) = "lisa",
-    /// Plans that are vectors, by their mean or drawn.
+    /// VAE: plans that are vectors, by their mean or drawn.
     Vae(vae::Vae) = "vae",
-    /// A plan in every step, and an action by denoising.
+    /// LCSD: a plan in every step, and an action by denoising.
     Lcsd(lcsd::Lcsd) = "lcsd",
-    /// A chunk of states by denoising, and the actions between them.
+    /// SkillDiffuser: a chunk of states by denoising, and the actions between them.
     SkillDiffuser(skilldiffuser::SkillDiffuser) = "skilldiffuser",
-    /// Plans held for a horizon, and a low level that attends to a window of earlier steps as well.
+    /// LADS with a history: plans held for a horizon, and a low level that also attends to a window
+    /// of earlier steps.
     History(history::History) = "history",
-    /// One graph from observations to an action, with or without memory.
+    /// Plain policy: one graph from observations to an action, with or without memory.
     Plain(plain::Plain) = "plain",
 }
 
 impl Family {
-    /// Control steps from one selection to the next; `None` for a family that selects nothing.
+    /// Returns the number of control steps from one selection to the next; `None` for a family that
+    /// selects nothing.
     pub fn period(&self) -> Option<usize> {
         self.kind().period()
     }
@@ -97,31 +103,31 @@ impl Family {
     }
 }
 
-/// The codebook of latent plans.
+/// Sizes of the codebook of latent plans.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub struct Codebook {
-    /// Entries, `M`.
+    /// Number of entries, `M`.
     pub size: usize,
-    /// Elements of an entry, `D`.
+    /// Number of elements of an entry, `D`.
     pub dim: usize,
 }
 
-/// How an index is picked from scores.
+/// Rule by which an index is picked from scores.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Rule {
-    /// The largest score.
+    /// The index with the largest score.
     Argmax,
-    /// At random with the softmax of the scores over the temperature.
+    /// An index drawn at random with the softmax of the scores over the temperature.
     Sample,
 }
 
 /// The decision rule and its parameters.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 pub struct Decision {
-    /// How an index is picked.
+    /// Rule by which an index is picked.
     pub rule: Rule,
-    /// Divides the scores when sampling.
+    /// Divisor of the scores when sampling.
     #[serde(default = "one")]
     pub temperature: f32,
     /// Seed of the sampling.
@@ -156,20 +162,20 @@ impl Decision {
     }
 }
 
-/// Where the noise of a denoising family comes from.
+/// Source of the noise of a denoising family.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum NoiseKind {
-    /// Standard normals of a generator.
+    /// Standard normal numbers of a seeded generator.
     Seeded,
     /// Zeros.
     Zero,
 }
 
-/// Noise of a contract.
+/// Noise fields of a contract.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub struct NoiseSource {
-    /// Where it comes from.
+    /// Source of the noise.
     pub rule: NoiseKind,
     /// Seed of the generator.
     #[serde(default)]
@@ -188,14 +194,14 @@ impl NoiseSource {
     }
 }
 
-/// Denoising of a contract.
+/// Denoising fields of a contract.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub struct Denoise {
-    /// Runs of the denoising entry.
+    /// Number of runs of the denoising entry.
     pub steps: usize,
 }
 
-/// A selection as the image has it.
+/// Selection rule in the image's form.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Selection {
     pub rule: SelectionRule,
@@ -213,7 +219,7 @@ impl Default for Selection {
     }
 }
 
-/// Noise as the image has it.
+/// Noise rule in the image's form.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Noise {
     pub rule: NoiseRule,
@@ -229,7 +235,7 @@ impl Default for Noise {
     }
 }
 
-/// Refuses a length of zero, or beyond what any contract claims.
+/// Refuses a length of zero, or beyond [`MAX_LEN`](crate::contract::MAX_LEN).
 fn lengths<const N: usize>(fields: [(&str, usize); N]) -> Result<(), String> {
     for (field, len) in fields {
         if !(1..=MAX_LEN).contains(&len) {
@@ -241,7 +247,7 @@ fn lengths<const N: usize>(fields: [(&str, usize); N]) -> Result<(), String> {
     Ok(())
 }
 
-/// The sizes of a transformer, which the family cannot do without.
+/// Returns the sizes of a transformer that the family requires.
 fn network(network: Option<Network>, field: &str) -> Result<Network, String> {
     let sizes = network.ok_or_else(|| format!("missing field `{field}`"))?;
     for (part, len) in [
@@ -258,7 +264,8 @@ fn network(network: Option<Network>, field: &str) -> Result<Network, String> {
     Ok(sizes)
 }
 
-/// What every family with a transformer over words needs: an instruction channel, a context and the transformer's sizes.
+/// Checks the fields that every family with a transformer over words needs: an instruction channel,
+/// a context and the transformer's sizes.
 fn instructed(contract: &Contract) -> Result<(), String> {
     if contract.words().is_none() {
         return Err(format!(
@@ -273,7 +280,7 @@ fn instructed(contract: &Contract) -> Result<(), String> {
     Ok(())
 }
 
-/// A noise channel, if there is exactly one.
+/// Checks that there is exactly one noise channel.
 fn one_noise(contract: &Contract) -> Result<(), String> {
     let role = crate::contract::Role::Noise;
     let count = contract

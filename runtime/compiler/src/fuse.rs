@@ -1,7 +1,8 @@
-//! Passes over the graph, each of which makes a new graph: attention over the cache, channels of images, convolutions, rows that
-//! nobody reads, linear layers.
+//! Passes over the graph, each of which makes a new graph: attention over the cache, channels of
+//! images, convolutions, unused rows, linear layers.
 //!
-//! A pass changes how a value is computed, never which value it is, up to the rounding of folded scales.
+//! A pass changes how a value is computed, never the value itself, up to the rounding of folded
+//! scales.
 
 mod attention;
 mod columns;
@@ -19,17 +20,17 @@ use crate::import::Entry;
 #[derive(Debug)]
 pub(crate) struct Fused {
     pub graph: Graph,
-    /// All inputs, also those that nothing reads any more.
+    /// All inputs, including those that are no longer read.
     pub inputs: Vec<(String, Id)>,
-    /// The outputs that were asked for.
+    /// Requested outputs.
     pub outputs: Vec<(String, Id)>,
-    /// `Record` nodes of the layers whose attention is not computed.
+    /// Nodes of type `Record` for the layers whose attention is not computed.
     pub records: Vec<Id>,
-    /// Tokens that a run appends to the cache.
+    /// Number of tokens that a run appends to the cache.
     pub tokens: usize,
 }
 
-/// Fuses an entry of which only some outputs are wanted, besides the cache.
+/// Fuses an entry, of which only some outputs are wanted besides the cache.
 pub(crate) fn fuse(
     entry: Entry,
     signature: &Signature,
@@ -84,7 +85,7 @@ pub(crate) fn fuse(
 }
 
 impl Fused {
-    /// A program that only hands a value on: `output` is a copy of `input`.
+    /// Makes a program that only passes a value on: `output` is a copy of `input`.
     pub fn copy(input: &str, output: &str, shape: &[Dim]) -> Self {
         let mut graph = Graph::default();
         let id = graph.input(input, shape, Type::F32);
@@ -98,7 +99,8 @@ impl Fused {
     }
 }
 
-/// Which layers' attention the roots and the recording of the other layers need.
+/// Returns the layers whose attention is needed by the roots and by the recording of the other
+/// layers.
 fn live_attentions(graph: &Graph, roots: &[Id], layers: &[attention::Layer]) -> Vec<bool> {
     // A layer that only records needs the layers before it, so this is found from the last layer on.
     let mut live = vec![false; layers.len()];
@@ -116,7 +118,7 @@ fn live_attentions(graph: &Graph, roots: &[Id], layers: &[attention::Layer]) -> 
 }
 
 impl Fused {
-    /// Everything that has to be computed.
+    /// Returns all nodes that have to be computed.
     pub fn roots(&self) -> Vec<Id> {
         self.outputs
             .iter()
@@ -125,7 +127,7 @@ impl Fused {
             .collect()
     }
 
-    /// The same entry in another graph; the ids are mapped.
+    /// Moves the entry to another graph, mapping the ids.
     fn mapped(self, graph: Graph, of: impl Fn(Id) -> Id) -> Self {
         let named = |values: Vec<(String, Id)>| {
             values

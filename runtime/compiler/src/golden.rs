@@ -1,7 +1,8 @@
-//! The golden episode of a bundle: what was observed, and the indices and actions that the reference gave for it.
+//! Golden episode of a bundle: recorded observations, with the reference's indices and actions.
 //!
-//! Stored as base64 of a safetensors blob in the model's metadata. Invariant of a [`Golden`]: all parts have the length that the
-//! contract says, indices are inside the codebook, and every number is finite.
+//! It is stored as base64 of a safetensors blob in the model's metadata. Invariant of a [`Golden`]:
+//! all parts have the length that the contract states, indices are inside the codebook, and every
+//! number is finite.
 
 use base64::Engine as _;
 use safetensors::{Dtype, SafeTensors};
@@ -14,44 +15,45 @@ use crate::error::BundleError;
 pub struct Golden {
     /// Index of the instruction; `None` for a policy that takes none.
     pub instruction: Option<usize>,
-    /// The values of each observation channel over all steps, in the contract's order.
+    /// Values of each observation channel over all steps, in the contract's order.
     pub observations: Vec<Recorded>,
-    /// `[T]`: the index in force at each control step; empty for a policy that selects none.
+    /// Index in force at each control step, `[T]`; empty for a policy that selects none.
     pub selected: Vec<u32>,
-    /// `[T, N]`: all draws of noise of each step in the order in which they are used; empty for a policy without noise.
+    /// Draws of noise of each step in the order in which they are used, `[T, N]`; empty for a
+    /// policy without noise.
     pub noise: Vec<f32>,
-    /// `[T, A]`, after clipping to the contract's limits.
+    /// Actions after clipping to the contract's limits, `[T, A]`.
     pub actions: Vec<f32>,
     /// Largest absolute difference of an action that counts as equal.
     pub tolerance: f32,
     steps: usize,
 }
 
-/// The values of a channel over all steps, `[T, elements]`.
+/// Values of a channel over all steps, `[T, elements]`.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Recorded {
-    /// Of a channel of floats.
+    /// Values of a channel of floats.
     F32(Vec<f32>),
-    /// Of a channel of bytes.
+    /// Values of a channel of bytes.
     U8(Vec<u8>),
-    /// Of a channel of integers.
+    /// Values of a channel of integers.
     I32(Vec<i32>),
 }
 
 impl Golden {
-    /// Reads the metadata's value.
+    /// Decodes the episode from the metadata's value.
     pub fn parse(base64: &str, contract: &Contract) -> Result<Self, BundleError> {
         Self::read(base64, contract).map_err(|problem| BundleError::Golden {
             problem: problem.into(),
         })
     }
 
-    /// Control steps, `T`.
+    /// Returns the number of control steps, `T`.
     pub fn steps(&self) -> usize {
         self.steps
     }
 
-    /// Elements of noise of a step; 0 without noise.
+    /// Returns the number of elements of noise of a step; 0 without noise.
     pub fn noise_len(&self) -> usize {
         self.noise.len() / self.steps.max(1)
     }

@@ -3,7 +3,7 @@
 //! Invariants:
 //! - a node's operands have smaller ids than the node itself, so a graph has no cycles;
 //! - equal nodes are the same node (constants excepted), so two spellings of one value compare equal by id;
-//! - whatever depends on constants only is itself a constant;
+//! - a node that depends on constants only is itself a constant;
 //! - a reshape never follows a reshape, a transpose never a transpose, and transposes that move no element are reshapes.
 //!
 //! The only symbolic axis is the context length `P`, and a length is `n` or `P + n`.
@@ -70,7 +70,7 @@ impl fmt::Debug for Dim {
     }
 }
 
-/// A shape for messages: `[1, P+2, 32]`.
+/// Formats a shape for messages: `[1, P+2, 32]`.
 pub(crate) fn show(shape: &[Dim]) -> String {
     format!("{shape:?}")
 }
@@ -82,11 +82,11 @@ pub(crate) enum Type {
     I64,
 }
 
-/// A node, and the value that it gives.
+/// Identifies a node, and the value that it computes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) struct Id(u32);
 
-/// One of the core's enums as part of a key.
+/// Wrapper that makes one of the core's enums part of a hash key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Kind<T>(pub T);
 
@@ -123,7 +123,7 @@ pub(crate) struct Unary {
 }
 
 impl Unary {
-    /// One with a parameter.
+    /// Makes a non-linearity with a parameter.
     pub fn with(kind: UnaryKind, alpha: f32) -> Self {
         Self {
             kind: Kind(kind),
@@ -139,48 +139,49 @@ impl Unary {
     }
 }
 
-/// What a node computes. Floating-point attributes are kept as bits, so that nodes compare.
+/// Operation of a node. Floating-point attributes are kept as bits, so that nodes compare.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(crate) enum Op {
-    /// A value that the caller sets.
+    /// Value that the caller sets.
     Input,
-    /// The constant of that number.
+    /// Constant with this number.
     Const(usize),
     /// Product over the last two axes, the others broadcast.
     MatMul,
-    /// Elementwise, broadcast.
+    /// Elementwise binary operation, broadcast.
     Binary(Kind<BinaryKind>),
-    /// Elementwise.
+    /// Elementwise unary operation.
     Unary(Unary),
-    /// Over the last axis.
+    /// Softmax over the last axis.
     Softmax,
-    /// Over one axis, which is removed.
+    /// Reduction of one axis, which is removed.
     Reduce(Kind<ReduceKind>, usize),
-    /// Of `x, gamma, beta` over the last axis.
+    /// Layer normalisation of `x, gamma, beta` over the last axis.
     LayerNorm { eps: u32 },
-    /// The same elements in another shape.
+    /// Reshape: the same elements in another shape.
     Reshape,
-    /// Axis `i` of the result is axis `perm[i]` of the operand.
+    /// Transpose: axis `i` of the result is axis `perm[i]` of the operand.
     Transpose(Vec<usize>),
-    /// `start..start + len` of an axis.
+    /// Slice `start..start + len` of an axis.
     Slice { axis: usize, start: usize },
-    /// One operand after the other along an axis.
+    /// Concatenation of the operands along an axis.
     Concat { axis: usize },
     /// Broadcast to a larger shape.
     Expand,
-    /// Adds to an integer.
+    /// Addition of a constant to an integer.
     Shift(i64),
-    /// Rows of a constant `[rows, ..]` by an integer of one element; the result has shape `[..]`.
+    /// Lookup in a constant `[rows, ..]` by an integer of one element; the result has shape `[..]`.
     GatherRow,
-    /// A number of one element as an integer, without its fraction.
+    /// Conversion of a number of one element to an integer, truncated.
     ToIndex,
-    /// An integer of one element as a number.
+    /// Conversion of an integer of one element to a number.
     FromIndex,
-    /// Index of the first smallest or largest element of all, shape `[]`.
+    /// Index of the first smallest of all elements, shape `[]`.
     ArgMin,
-    /// See `ArgMin`.
+    /// Index of the first largest of all elements, shape `[]`.
     ArgMax,
-    /// `x·W + b` over the last axis of `x`, operands `x, W [k, n]`, then `b [n]` if `bias`, then what it is added to if `residual`.
+    /// Linear layer `x·W + b` over the last axis of `x`, operands `x, W [k, n]`, then `b [n]` if
+    /// `bias`, then the residual, to which the result is added, if `residual`.
     Linear {
         bias: bool,
         residual: bool,
@@ -192,18 +193,20 @@ pub(crate) enum Op {
         heads: usize,
         scale: u32,
     },
-    /// Convolution of images `x [N, rows, columns, C]` or sequences `[N, columns, C]`: operands `x`, `W [kernel * C / groups, n]`, `b [n]`,
-    /// then the padding's pixel `[C]` if `fill`, then what is added before the activation if `residual`.
+    /// Convolution of images `x [N, rows, columns, C]` or sequences `[N, columns, C]`: operands
+    /// `x`, `W [kernel * C / groups, n]`, `b [n]`, then the padding's pixel `[C]` if `fill`, then
+    /// the residual, which is added before the activation, if `residual`.
     Conv(ConvOp),
-    /// Windows over images or sequences, channels last.
+    /// Pooling of windows over images or sequences, channels last.
     Pool(Kind<PoolKind>, Windows),
-    /// Images `[N, rows, columns, C]` in another size, operands `x`, tables `[rows, 3]` and `[columns, 3]`.
+    /// Resizing of images `[N, rows, columns, C]`, operands `x`, tables `[rows, 3]` and
+    /// `[columns, 3]`.
     Resize,
-    /// Appends `k, v [tokens, w]` to the cache of a layer; gives nothing.
+    /// Appending of `k, v [tokens, w]` to the cache of a layer, without a result.
     Record { layer: usize, heads: usize },
 }
 
-/// One node.
+/// One node of the graph.
 #[derive(Debug, Clone)]
 pub(crate) struct Node {
     pub op: Op,
@@ -222,22 +225,22 @@ pub(crate) struct Graph {
     nodes: Vec<Node>,
     consts: Vec<Arc<Tensor>>,
     seen: HashMap<Key, Id>,
-    /// What the nodes came from: operator and name of ONNX nodes.
+    /// Operator and name of the ONNX nodes that the nodes came from.
     origins: Vec<(String, String)>,
-    /// The origin of the nodes that are built now.
+    /// Origin of the nodes that are being built.
     current: usize,
-    /// What constant folding has cost so far, see [`cost`](eval::cost).
+    /// Cost of constant folding so far, see [`cost`](eval::cost).
     folded: usize,
 }
 
 impl Graph {
-    /// Says which ONNX node the nodes built from now on belong to.
+    /// Sets the ONNX node that the nodes built from now on come from.
     pub fn set_origin(&mut self, operator: &str, name: &str) {
         self.current = self.origins.len();
         self.origins.push((operator.into(), name.into()));
     }
 
-    /// Operator and name of the ONNX node that a node came from.
+    /// Returns operator and name of the ONNX node that a node came from.
     pub fn origin(&self, id: Id) -> (&str, &str) {
         self.origins
             .get(self.node(id).origin)
@@ -260,12 +263,12 @@ impl Graph {
         self.node(id).ty
     }
 
-    /// The shape, if it does not depend on the context length.
+    /// Returns the shape, if it does not depend on the context length.
     pub fn known_shape(&self, id: Id) -> Option<Vec<usize>> {
         self.shape(id).iter().map(|dim| dim.known()).collect()
     }
 
-    /// The constant that a node is.
+    /// Returns the constant of a node, if it is one.
     pub fn constant(&self, id: Id) -> Option<&Arc<Tensor>> {
         match self.node(id).op {
             Op::Const(number) => self.consts.get(number),
@@ -273,18 +276,18 @@ impl Graph {
         }
     }
 
-    /// All ids, operands before users.
+    /// Returns all ids, operands before users.
     pub fn ids(&self) -> impl ExactSizeIterator<Item = Id> + use<> {
         (0..self.nodes.len()).map(|i| Id(i as u32))
     }
 
-    /// A value that the caller sets.
+    /// Adds a value that the caller sets.
     pub fn input(&mut self, name: &str, shape: &[Dim], ty: Type) -> Id {
         self.set_origin("Input", name);
         self.push(Op::Input, vec![], shape.to_vec(), ty)
     }
 
-    /// A constant.
+    /// Adds a constant.
     pub fn add_const(&mut self, tensor: Arc<Tensor>) -> Id {
         let shape = tensor.shape.iter().map(|&dim| Dim::of(dim)).collect();
         let ty = match tensor.data {
@@ -303,7 +306,7 @@ impl Graph {
         self.add(Op::Const(number), vec![], shape, ty)
     }
 
-    /// A node that is there already, or a new one.
+    /// Returns an equal node if there is one, or adds a new one.
     fn add(&mut self, op: Op, inputs: Vec<Id>, shape: Vec<Dim>, ty: Type) -> Id {
         let key = (op, inputs, shape, ty);
         if let Some(&id) = self.seen.get(&key) {

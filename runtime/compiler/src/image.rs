@@ -1,4 +1,5 @@
-//! Writing the program image: the records of [`lads_image::records`] in the sections of [`lads_image::format`].
+//! Writes the program image: the records of [`lads_image::records`] in the sections of
+//! [`lads_image::format`].
 
 mod schedule;
 mod states;
@@ -26,7 +27,7 @@ use schedule::{call_words, entry_words};
 pub(crate) use states::rows_len;
 use states::states;
 
-/// A compiled policy.
+/// A compiled policy image.
 #[derive(Debug)]
 pub struct Image {
     bytes: Aligned,
@@ -34,12 +35,12 @@ pub struct Image {
 }
 
 impl Image {
-    /// The image; its address is a multiple of 64.
+    /// Returns the image; its address is a multiple of 64.
     pub fn as_bytes(&self) -> &[u8] {
         self.bytes.as_bytes()
     }
 
-    /// Sizes of what was compiled.
+    /// Returns the sizes of the compiled programs.
     pub fn report(&self) -> &CompileReport {
         &self.report
     }
@@ -54,14 +55,14 @@ impl Image {
     }
 }
 
-/// Words of a record.
+/// Appends the words of a record.
 fn put<T: Field>(out: &mut Vec<u32>, record: &T) {
     let start = out.len();
     out.resize(start + T::WORDS, 0);
     record.put(&mut Writer::new(&mut out[start..]));
 }
 
-/// All texts, each once.
+/// All texts, each stored once.
 #[derive(Default)]
 struct Strings {
     bytes: Vec<u8>,
@@ -83,18 +84,18 @@ impl Strings {
     }
 }
 
-/// What goes into an image besides what the bundle says.
+/// Parts of an image that the bundle does not contain.
 pub(crate) struct Parts<'a> {
     pub blueprint: &'a Blueprint,
-    /// By the names of their states.
+    /// KV caches by the names of their states.
     pub caches: &'a HashMap<String, Cache>,
     pub made: &'a [Made],
-    /// Words of each instruction: how many, and where.
+    /// Number and place of the words of each instruction.
     pub words: &'a [(u32, WeightSpan)],
     pub weights: &'a [f32],
-    /// Of the golden episode's actions.
+    /// Tolerance of the golden episode's actions.
     pub tolerance: f32,
-    /// Multiply-adds of the worst step.
+    /// Number of multiply-adds of the worst step.
     pub work: u64,
 }
 
@@ -157,7 +158,7 @@ pub(crate) fn write(
 }
 
 fn contract_words(bundle: &Bundle, parts: &Parts, strings: &mut Strings) -> Vec<u32> {
-    /// Above any similarity: no other sentence is followed.
+    /// Threshold above any similarity: no other sentence is followed.
     const NEVER: f32 = 2.0;
     let c: &Contract = bundle.contract();
     let kind = c.family.kind();
@@ -191,7 +192,7 @@ fn contract_words(bundle: &Bundle, parts: &Parts, strings: &mut Strings) -> Vec<
     out
 }
 
-/// The channels and their elements.
+/// Encodes the channels and their elements.
 fn channel_words(contract: &Contract, strings: &mut Strings) -> (Vec<u32>, Vec<u32>) {
     let (mut channels, mut elements) = (vec![], vec![]);
     let mut count = 0;
@@ -250,7 +251,7 @@ fn channel_words(contract: &Contract, strings: &mut Strings) -> (Vec<u32>, Vec<u
     (channels, elements)
 }
 
-/// The shape, with ones behind it.
+/// Returns the shape, padded with ones at the end.
 fn dims(channel: &Channel) -> [u32; 4] {
     let mut dims = [1; 4];
     for (to, &dim) in dims.iter_mut().zip(&channel.shape) {

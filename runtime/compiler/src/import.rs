@@ -1,8 +1,9 @@
-//! ONNX to the compiler's graph: an entry is cut out of the bundle by its outputs and built node by node.
+//! Imports ONNX to the compiler's graph: an entry is cut out of the bundle by its outputs and built
+//! node by node.
 //!
-//! Every attribute of every node is read or refused, and an operator without a translation is an error that names the
-//! operator, the node and the entry: nothing is ever dropped in silence. Shapes follow from the inputs; the only symbolic axis is
-//! the context length.
+//! Every attribute of every node is read or refused, and an operator without a translation is an
+//! error that names the operator, the node and the entry: nothing is dropped silently. Shapes
+//! follow from the inputs; the only symbolic axis is the context length.
 
 mod activations;
 mod arithmetic;
@@ -40,10 +41,10 @@ pub(crate) use trial::{Declared, trial};
 /// Operator sets that the translations were written for.
 const OPSETS: std::ops::RangeInclusive<i64> = 7..=28;
 
-/// The most nodes that an entry may have; an LSTM counts its steps.
+/// Largest number of nodes of an entry; an LSTM counts its steps.
 const MAX_NODES: usize = 1 << 16;
 
-/// The initializers of a model, read once each, so that entries share them.
+/// Initializers of a model, read once each, so that entries share them.
 pub(crate) struct Model<'m> {
     graph: &'m GraphProto,
     opset: i64,
@@ -54,7 +55,7 @@ pub(crate) struct Model<'m> {
 /// One entry as a graph.
 pub(crate) struct Entry {
     pub graph: Graph,
-    /// By their short names, in the signature's order.
+    /// Inputs by their short names, in the signature's order.
     pub inputs: Vec<(String, Id)>,
     pub outputs: Vec<(String, Id)>,
 }
@@ -82,7 +83,7 @@ impl<'m> Model<'m> {
         Ok(Self::of(graph, opset))
     }
 
-    /// A graph of whatever operator set.
+    /// Reads a graph of any operator set.
     fn of(graph: &'m GraphProto, opset: i64) -> Self {
         let protos = graph
             .initializer
@@ -110,7 +111,7 @@ impl<'m> Model<'m> {
         Ok(Some(tensor))
     }
 
-    /// Builds an entry. Inputs that are in `bindings` are constants.
+    /// Builds the graph of an entry. Inputs that are in `bindings` are constants.
     pub fn import(
         &self,
         signature: &Signature,
@@ -179,7 +180,7 @@ impl<'m> Model<'m> {
     }
 }
 
-/// A node's name, or its first output's.
+/// Returns a node's name, or its first output's.
 fn node_name(node: &NodeProto) -> &str {
     if node.name.is_empty() {
         node.output.first().map_or("", String::as_str)
@@ -188,13 +189,13 @@ fn node_name(node: &NodeProto) -> &str {
     }
 }
 
-/// What is wrong with a node of another domain than ONNX' own.
+/// Returns the fault of a node of another domain than ONNX' own.
 fn foreign(node: &NodeProto) -> Option<String> {
     (!node.domain.is_empty() && node.domain != "ai.onnx")
         .then(|| format!("of domain {} is not supported", node.domain))
 }
 
-/// The values of an entry that were built so far.
+/// Values of an entry that were built so far.
 struct Builder<'b, 'm> {
     model: &'b Model<'m>,
     graph: Graph,
@@ -255,7 +256,7 @@ impl Builder<'_, '_> {
         }
     }
 
-    /// A node that reads or gives a sequence.
+    /// Builds a node that reads or writes a sequence.
     fn sequence(
         &mut self,
         node: &NodeProto,
@@ -277,12 +278,12 @@ impl Builder<'_, '_> {
     }
 }
 
-/// What a node reads.
+/// Operands of a node.
 struct Operands {
     inputs: Vec<Option<Id>>,
-    /// How many outputs the node has.
+    /// Number of outputs of the node.
     outputs: usize,
-    /// The operator set that says what the node means.
+    /// Operator set that defines the node's meaning.
     opset: i64,
 }
 
@@ -296,7 +297,7 @@ impl Operands {
         self.inputs.get(i).copied().flatten()
     }
 
-    /// All inputs, none of them left out.
+    /// Returns all inputs, none of which may be left out.
     fn all(&self) -> Result<Vec<Id>, String> {
         (0..self.inputs.len()).map(|i| self.get(i)).collect()
     }

@@ -4,12 +4,13 @@
 //! bundle ─► family ─► import ─► graph ─► fuse ─► lower ─► plan ─► verify ─► image
 //! ```
 //!
-//! A [`Bundle`] is one ONNX file that holds a whole policy: the entry graphs, a contract and a golden episode. [`compile`] makes it
-//! an [`Image`] that `lads-core` runs without allocating. Runs on the host and may allocate; what it reads may be hostile, so
-//! every error is a value that names the thing and the remedy.
+//! A [`Bundle`] is one ONNX file that holds a whole policy: the entry graphs, a contract and a
+//! golden episode. [`compile`] turns it into an [`Image`] that `lads-core` runs without allocating.
+//! The crate runs on the host and may allocate; its input may be hostile, so every error is a value
+//! that names the thing and the remedy.
 //!
-//! Operators of the default ONNX domain that are compiled (operator sets 7 to 28, each by what its set says); anything else is an
-//! error that names the operator, the node and the entry:
+//! Operators of the default ONNX domain that are compiled (operator sets 7 to 28, each by the rules
+//! of its set); anything else is an error that names the operator, the node and the entry:
 //!
 //! ```text
 //! Abs Add And ArgMax ArgMin AveragePool BatchNormalization Cast Celu Clip Concat ConcatFromSequence Constant ConstantOfShape Conv
@@ -21,9 +22,10 @@
 //! Split SplitToSequence Sqrt Squeeze Sub Sum Swish Tanh ThresholdedRelu Tile Transpose Unsqueeze Where Xor
 //! ```
 //!
-//! A program computes with 32-bit floats, whatever width the file's have: constants are rounded as the file says, what is computed
-//! keeps its bits. Integers are indices, or whole numbers exact up to 2^24; truth values are numbers that are 0 or 1. Shapes are
-//! static. GRU and LSTM over several steps are unrolled, 512 at most.
+//! A program computes with 32-bit floats, whatever width the file's numbers have: constants are
+//! rounded as the file states, computed values keep 32 bits. Integers are indices, or whole numbers
+//! exact up to 2^24; truth values are numbers that are 0 or 1. Shapes are static. GRU and LSTM over
+//! several steps are unrolled, 512 at most.
 #![forbid(unsafe_code)]
 
 mod aligned;

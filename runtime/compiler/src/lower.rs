@@ -1,10 +1,11 @@
-//! Graph to ops: every value gets a place, every computing node its op.
+//! Lowers a graph to ops: every value gets a place, every computing node its op.
 //!
 //! The arena is virtual here: each buffer has addresses of its own, so nothing overlaps by construction; the memory plan then
 //! moves the buffers together. Reshapes, transposes, slices and broadcasts are views and cost nothing where the op that reads
 //! them takes strides; the parts of a concatenation are computed where they belong.
 //!
-//! In place are: a residual that nobody else reads any more, and elementwise ops whose operand nobody else reads any more.
+//! Two kinds of nodes work in place: a residual connection and an elementwise op whose operand has
+//! no later reader.
 
 mod cached;
 mod compute;
@@ -26,7 +27,7 @@ use crate::report::LayerReport;
 use view::View;
 pub(crate) use weights::Weights;
 
-/// The largest virtual arena: 2 GiB.
+/// Size of the largest virtual arena, in elements: 2 GiB.
 const MAX_VIRTUAL: u32 = 1 << 29;
 
 /// A program over a virtual arena.
@@ -41,7 +42,8 @@ pub(crate) struct Lowered {
     pub layers: Vec<LayerReport>,
 }
 
-/// A KV cache: for each layer keys, in whole blocks of sixteen tokens, then values, `[capacity, heads * head_dim]`.
+/// Layout of a KV cache: for each layer keys, in whole blocks of sixteen tokens, then values,
+/// `[capacity, heads * head_dim]`.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Cache {
     pub format: CacheFormat,
@@ -52,7 +54,7 @@ pub(crate) struct Cache {
 }
 
 impl Cache {
-    /// Room for so many rows.
+    /// Makes a cache with room for `capacity` rows.
     pub fn new(network: Network, capacity: usize, format: CacheFormat) -> Self {
         Self {
             format,
@@ -63,7 +65,7 @@ impl Cache {
         }
     }
 
-    /// The cache of an entry that has none.
+    /// The cache of an entry without one.
     pub const NONE: Self = Self {
         format: CacheFormat::F32,
         capacity: 0,
@@ -76,14 +78,14 @@ impl Cache {
         self.heads * self.head_dim
     }
 
-    /// Words of one layer's keys and of its values.
+    /// Returns the number of words of one layer's keys and of its values.
     fn words(&self) -> Option<[usize; 2]> {
         let keys = keys_len(self.capacity, self.width());
         let values = self.width().checked_mul(self.capacity)?;
         Some([keys, values].map(|elements| self.format.words(elements)))
     }
 
-    /// Words of all layers.
+    /// Returns the number of words of all layers.
     pub fn len(&self) -> Option<u32> {
         let [keys, values] = self.words()?;
         let layer = values.checked_add(keys)?;
@@ -104,7 +106,7 @@ impl Cache {
     }
 }
 
-/// Lowers an entry.
+/// Lowers an entry to ops.
 pub(crate) fn lower(
     entry: &str,
     fused: &Fused,
@@ -162,12 +164,13 @@ pub(crate) fn lower(
     })
 }
 
-/// Whether a value at the edge belongs to the KV cache, which attention reads and appends to by itself.
+/// Returns whether an input or output belongs to the KV cache, which attention reads and appends to
+/// by itself.
 fn is_cache(name: &str) -> bool {
     name.starts_with("past_key_values.") || name.starts_with("present.")
 }
 
-/// An entry on its way to ops.
+/// State of lowering an entry to ops.
 struct Lowering<'a, 's> {
     g: &'a Graph,
     weights: &'a mut Weights<'s>,
@@ -177,22 +180,23 @@ struct Lowering<'a, 's> {
     /// End of the virtual arena; saturates.
     end: u32,
     views: HashMap<Id, View>,
-    /// Integers: slot, and what is added to it.
+    /// Slot of each integer, and the number that is added to it.
     ints: HashMap<Id, (IntSlot, i64)>,
     slots: u8,
-    /// Uses that are still to come; outputs count as one that never comes.
+    /// Number of remaining uses; an output counts as one that never happens.
     pending: HashMap<Id, usize>,
-    /// The nodes whose views lie in a buffer.
+    /// Nodes whose views lie in each buffer.
     residents: Vec<Vec<Id>>,
     /// Values that are computed inside a concatenation: buffer and offset.
     placed: HashMap<Id, (usize, usize)>,
-    /// Rows above, columns to the left, rows below and columns to the right that the readers of an image want around it.
+    /// Border that the readers of an image need: rows above, columns to the left, rows below and
+    /// columns to the right.
     wanted: HashMap<Id, [usize; 4]>,
-    /// Those that there are.
+    /// Borders that the images have.
     borders: HashMap<Id, [usize; 4]>,
     input_ports: Vec<(String, Place)>,
     output_ports: Vec<(String, Place)>,
-    /// The dense layers, in their order.
+    /// Dense layers, in their order.
     layers: Vec<LayerReport>,
 }
 
@@ -226,7 +230,7 @@ impl<'a, 's> Lowering<'a, 's> {
         }
     }
 
-    /// A buffer of its own.
+    /// Allocates a buffer of its own.
     fn buffer(&mut self, len: usize) -> usize {
         let len = u32::try_from(len).unwrap_or(u32::MAX);
         self.buffers.push(Span {
@@ -238,7 +242,7 @@ impl<'a, 's> Lowering<'a, 's> {
         self.buffers.len() - 1
     }
 
-    /// The shape of a value; all are static by now.
+    /// Returns the shape of a value; all shapes are static at this stage.
     fn shape(&self, id: Id) -> Result<Vec<usize>, String> {
         self.g
             .known_shape(id)
@@ -273,7 +277,8 @@ impl<'a, 's> Lowering<'a, 's> {
         }
     }
 
-    /// A residual that only its layer reads is computed where the layer belongs, so that the layer is added in place.
+    /// Places a residual that only its layer reads where the layer's result goes, so that the layer
+    /// is added in place.
     fn place_residuals(&mut self, order: &[Id]) {
         // Users first, so that a chain of residuals shares one place.
         for &id in order.iter().rev() {
@@ -296,7 +301,8 @@ impl<'a, 's> Lowering<'a, 's> {
         }
     }
 
-    /// Whether a value is written by an op of its own or by the caller, and so can be written anywhere.
+    /// Returns whether a value is written by an op of its own or by the caller, and so can be
+    /// written anywhere.
     fn computes(&self, id: Id) -> bool {
         let moves = matches!(
             self.g.op(id),
@@ -320,7 +326,7 @@ impl<'a, 's> Lowering<'a, 's> {
         View::contiguous(buffer, offset, shape)
     }
 
-    /// Says where a value lies.
+    /// Sets the view of a value.
     fn set(&mut self, id: Id, view: View) {
         if let Some(buffer) = view.buffer() {
             self.residents[buffer].push(id);
@@ -328,7 +334,7 @@ impl<'a, 's> Lowering<'a, 's> {
         self.views.insert(id, view);
     }
 
-    /// True when no later node reads the buffer, the node that is being lowered aside.
+    /// Returns true if no later node reads the buffer, except for the node that is being lowered.
     fn dies_here(&self, buffer: usize, at: Id) -> bool {
         let reads = |id: Id| {
             self.g
@@ -401,7 +407,7 @@ impl<'a, 's> Lowering<'a, 's> {
         Ok(())
     }
 
-    /// Elements of the arena, from the first of a view.
+    /// Returns the `len` elements of the arena from the first of a view.
     fn span(&self, view: &View, len: usize) -> Span {
         let base = view
             .buffer()
@@ -412,7 +418,7 @@ impl<'a, 's> Lowering<'a, 's> {
         }
     }
 
-    /// The view of a value; constants are put into the weights.
+    /// Returns the view of a value; constants are put into the weights.
     fn view(&mut self, id: Id) -> Result<View, String> {
         if let Some(view) = self.views.get(&id) {
             return Ok(view.clone());
@@ -432,7 +438,7 @@ impl<'a, 's> Lowering<'a, 's> {
         Ok(view)
     }
 
-    /// An operand of `len` elements from the first of a view.
+    /// Returns an operand of `len` elements from the first of a view.
     fn operand(&self, view: &View, len: usize) -> Operand {
         match view.buffer() {
             Some(_) => self.span(view, len).into(),
@@ -444,7 +450,7 @@ impl<'a, 's> Lowering<'a, 's> {
         }
     }
 
-    /// A value as contiguous elements of the arena: copied if it is not.
+    /// Returns a value as contiguous elements of the arena, copied if necessary.
     fn contiguous(&mut self, id: Id) -> Result<Span, String> {
         let shape = self.shape(id)?;
         let view = self.view(id)?;
@@ -454,7 +460,7 @@ impl<'a, 's> Lowering<'a, 's> {
         self.copied(id)
     }
 
-    /// A contiguous copy in a buffer of its own.
+    /// Copies a value to a contiguous buffer of its own.
     fn copied(&mut self, id: Id) -> Result<Span, String> {
         let shape = self.shape(id)?;
         let buffer = self.buffer(shape.iter().product());

@@ -1,9 +1,10 @@
 //! The part of the ONNX file format that a bundle uses, as protocol-buffer messages.
 //!
-//! Field numbers are those of `onnx.proto3` (IR version 8). Fields that are not listed are skipped when reading; whatever
-//! changes a graph's meaning (sparse initializers, external data, subgraphs, local functions) is listed, so that the importer can refuse it.
+//! Field numbers are those of `onnx.proto3` (IR version 8). Fields that are not listed are skipped
+//! when reading; fields that change a graph's meaning (sparse initializers, external data,
+//! subgraphs, local functions) are listed, so that the importer can refuse it.
 //!
-//! What can fail: [`decode`] tells a file that is no ONNX model from one that was cut off.
+//! What can fail: [`decode`] distinguishes a file that is not an ONNX model from a truncated one.
 
 #![allow(missing_docs, reason = "`onnx.proto3` names and explains the fields")]
 
@@ -40,7 +41,7 @@ pub struct OperatorSetIdProto {
     pub version: i64,
 }
 
-/// A key and a value of the metadata.
+/// A key-value pair of the metadata.
 #[derive(Clone, PartialEq, Message)]
 pub struct StringStringEntryProto {
     #[prost(string, tag = "1")]
@@ -49,7 +50,7 @@ pub struct StringStringEntryProto {
     pub value: String,
 }
 
-/// Nodes in topological order, what they read and what they give.
+/// A graph: nodes in topological order, its inputs and outputs.
 #[derive(Clone, PartialEq, Message)]
 pub struct GraphProto {
     #[prost(message, repeated, tag = "1")]
@@ -66,7 +67,7 @@ pub struct GraphProto {
     pub output: Vec<ValueInfoProto>,
 }
 
-/// One operator.
+/// A node: one operator.
 #[derive(Clone, PartialEq, Message)]
 pub struct NodeProto {
     #[prost(string, repeated, tag = "1")]
@@ -83,7 +84,7 @@ pub struct NodeProto {
     pub attribute: Vec<AttributeProto>,
 }
 
-/// An attribute of an operator. `kind` says which of the fields holds the value.
+/// An attribute of an operator. `kind` states which of the fields holds the value.
 #[derive(Clone, PartialEq, Message)]
 pub struct AttributeProto {
     #[prost(string, tag = "1")]
@@ -146,14 +147,14 @@ pub struct ValueInfoProto {
     pub r#type: Option<TypeProto>,
 }
 
-/// A type: only tensors are read.
+/// Type of a value; only tensors are read.
 #[derive(Clone, PartialEq, Message)]
 pub struct TypeProto {
     #[prost(message, optional, tag = "1")]
     pub tensor_type: Option<TensorTypeProto>,
 }
 
-/// Element type and shape.
+/// Element type and shape of a tensor.
 #[derive(Clone, PartialEq, Message)]
 pub struct TensorTypeProto {
     #[prost(int32, tag = "1")]
@@ -162,7 +163,7 @@ pub struct TensorTypeProto {
     pub shape: Option<TensorShapeProto>,
 }
 
-/// The axes.
+/// Axes of a tensor.
 #[derive(Clone, PartialEq, Message)]
 pub struct TensorShapeProto {
     #[prost(message, repeated, tag = "1")]
@@ -178,7 +179,7 @@ pub struct DimensionProto {
     pub dim_param: Option<String>,
 }
 
-/// A message of which only the presence matters.
+/// A message whose content does not matter, only its presence.
 #[derive(Clone, PartialEq, Message)]
 pub struct Opaque {}
 
@@ -197,7 +198,7 @@ pub mod data_type {
     pub const UINT32: i32 = 12;
     pub const BFLOAT16: i32 = 16;
 
-    /// The name of an element type, for messages.
+    /// Returns the name of an element type, for messages.
     pub fn name(code: i32) -> String {
         let known = [
             "undefined",

@@ -1,4 +1,5 @@
-//! The memory plan: moves the buffers of a program together, so that only what lives at the same time lies apart.
+//! Plans the memory of a program: moves its buffers together, so that only those that live at the
+//! same time are kept apart.
 //!
 //! A buffer lives from the first op that touches it to the last; inputs from the start, outputs to the end. Buffers are placed
 //! from the largest to the smallest, each in the smallest gap that fits among those that live at the same time (greedy best
@@ -8,7 +9,7 @@ use lads_image::op::{Op, Place, Span};
 
 use crate::lower::Lowered;
 
-/// Buffers start at multiples of this many elements: a cache line.
+/// Alignment of buffers in elements: a cache line.
 const ALIGN: u32 = 16;
 
 /// A program whose spans lie in the real arena.
@@ -18,11 +19,13 @@ pub(crate) struct Placed {
     pub inputs: Vec<(String, Place)>,
     pub outputs: Vec<(String, Place)>,
     pub arena_len: u32,
-    /// Largest sum of the lengths of buffers that live at the same time: no plan needs less.
+    /// Lower bound of the arena: the largest sum of the lengths of buffers that live at the same
+    /// time.
     pub lower_bound: u32,
 }
 
-/// When a buffer lives: time 0 is before the first op, op `i` runs at time `i + 1`. `None` until it is touched.
+/// Lifetime of a buffer: time 0 is before the first op, op `i` runs at time `i + 1`. It is `None`
+/// until the buffer is touched.
 type Life = Option<(usize, usize)>;
 
 /// Plans a program's memory.
@@ -78,7 +81,7 @@ pub(crate) fn plan(lowered: &Lowered) -> Placed {
     }
 }
 
-/// The buffer that holds a span. Buffers are in the order of their offsets.
+/// Returns the buffer that holds a span. Buffers are sorted by their offsets.
 fn buffer_of(buffers: &[Span], span: Span) -> usize {
     buffers.partition_point(|buffer| buffer.offset <= span.offset) - 1
 }
@@ -108,7 +111,7 @@ fn lives(lowered: &Lowered) -> Vec<Life> {
     lives
 }
 
-/// The offset of each buffer; of those that nobody touches, anything.
+/// Returns the offset of each buffer; for unused buffers, any number.
 fn place(buffers: &[Span], lives: &[Life]) -> Vec<u32> {
     let mut offsets = vec![0; buffers.len()];
     let mut order: Vec<usize> = (0..buffers.len()).filter(|&i| lives[i].is_some()).collect();

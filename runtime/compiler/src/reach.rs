@@ -1,5 +1,6 @@
-//! Which rows of its tables an entry can ask for: a timestep, a phase, a pass, a selected index or an integer of the caller beyond the
-//! last row would stop the policy in the middle of an episode, so it is refused here, with the field of the contract that is too large.
+//! Bounds the rows that an entry can read from its tables: a timestep, a phase, a pass, a selected
+//! index or an integer of the caller beyond the last row would stop the policy in the middle of an
+//! episode, so it is refused at compile time, with the field of the contract that is too large.
 
 use std::collections::HashMap;
 
@@ -10,7 +11,7 @@ use crate::error::CompileError;
 use crate::family::{Blueprint, Bound, Entry, Keep, Times};
 use crate::lower::Lowered;
 
-/// The smallest and the largest value of an integer; nothing before the first.
+/// Smallest and largest value of an integer; `None` before the first.
 #[derive(Debug, Clone, Copy, Default)]
 struct Range(Option<(i64, i64)>);
 
@@ -22,7 +23,7 @@ impl Range {
     }
 }
 
-/// What the integers of an entry can be.
+/// Ranges of the integers of an entry.
 #[derive(Debug, Clone, Copy, Default)]
 struct Integers {
     timestep: Range,
@@ -30,14 +31,14 @@ struct Integers {
     pass: Range,
 }
 
-/// What the integers of all entries can be.
+/// Ranges of the integers of all entries.
 #[derive(Debug)]
 pub(crate) struct Reach {
     entries: HashMap<String, Integers>,
 }
 
 impl Reach {
-    /// Goes through the schedule of the longest context.
+    /// Computes the ranges by walking the schedule of the longest context.
     pub fn new(contract: &Contract, blueprint: &Blueprint) -> Self {
         let mut entries: HashMap<String, Integers> = HashMap::new();
         blueprint.walk(contract, |call, entry, timestep| {
@@ -59,7 +60,7 @@ impl Reach {
         Self { entries }
     }
 
-    /// Refuses a table with fewer rows than the schedule asks for.
+    /// Refuses a table with fewer rows than the schedule reads.
     pub fn check(
         &self,
         contract: &Contract,
@@ -98,7 +99,8 @@ fn ring_rows(blueprint: &Blueprint, ring: &str) -> usize {
     }
 }
 
-/// Rows of every table that an integer chooses from, and what is added to the integer.
+/// Returns the number of rows of every table that an integer indexes, and the number that is added
+/// to the integer.
 fn tables(lowered: &Lowered, slot: IntSlot) -> impl Iterator<Item = (i64, i64)> {
     lowered.ops.iter().filter_map(move |op| match op {
         Op::GatherRow(op) if op.index == slot => Some((i64::from(op.rows), i64::from(op.shift))),
@@ -106,7 +108,7 @@ fn tables(lowered: &Lowered, slot: IntSlot) -> impl Iterator<Item = (i64, i64)> 
     })
 }
 
-/// What chooses a row, in words, and what it can be; `None` for what chooses none.
+/// Describes the integer that chooses a row, with its range; `None` if nothing chooses one.
 fn chooser(
     contract: &Contract,
     blueprint: &Blueprint,

@@ -1,8 +1,10 @@
-//! A plain policy computed in double precision, straight from its graph: what a compiled policy is compared with.
+//! Computes a plain policy in double precision, straight from its graph, as the reference for a
+//! compiled policy.
 //!
-//! Nothing is fused or planned, and nothing but folded constants is rounded to 32 bits: of the compiler only the reading of ONNX and the folding of constants are shared with
-//! what is compared. What can fail: the bytes are no bundle of the family `plain`, or a value has another shape than the
-//! contract says.
+//! Nothing is fused or planned, and only folded constants are rounded to 32 bits: the reference
+//! shares only the reading of ONNX and the folding of constants with the compiled policy. What can
+//! fail: the bytes are not a bundle of the family `plain`, or a value has another shape than the
+//! contract states.
 
 use std::collections::HashMap;
 
@@ -25,7 +27,7 @@ pub struct Reference {
     /// Nodes that the outputs need, operands first.
     order: Vec<Id>,
     constants: HashMap<Id, Value<f64>>,
-    /// Plain states as a whole; the rows of rings that have been seen.
+    /// Values of plain states, and the rows that rings have seen.
     states: HashMap<String, ArrayD<f64>>,
 }
 
@@ -72,17 +74,18 @@ impl Reference {
         Ok(reference)
     }
 
-    /// The contract of the policy.
+    /// Returns the contract of the policy.
     pub fn contract(&self) -> &Contract {
         &self.contract
     }
 
-    /// Starts an episode: every state is as it was at first.
+    /// Starts an episode: every state returns to its initial value.
     pub fn reset(&mut self) {
         self.states.clear();
     }
 
-    /// The action for the values of each observation channel, in the contract's order, inside the action's limits.
+    /// Returns the action for the values of each observation channel, in the contract's order,
+    /// inside the action's limits.
     pub fn step(&mut self, observations: &[Vec<f64>]) -> Result<Vec<f64>, CompileError> {
         let channels: HashMap<&str, &Vec<f64>> = self
             .contract
@@ -159,7 +162,7 @@ impl Reference {
         Ok(action)
     }
 
-    /// The rows of a ring, the missing ones put in front.
+    /// Returns the rows of a ring, with the missing ones in front.
     fn filled(&self, name: &str, rows: &ArrayD<f64>) -> Vec<f64> {
         let Some(state) = self.contract.states.iter().find(|state| state.name == name) else {
             return vec![];
@@ -195,7 +198,7 @@ fn refused(problem: String) -> CompileError {
     }
 }
 
-/// The rows of a ring with one more, at most so many.
+/// Appends a row to the rows of a ring, keeping at most `most`.
 fn appended(known: Option<&ArrayD<f64>>, row: &[f64], most: usize) -> Result<ArrayD<f64>, String> {
     let row = ArrayD::from_shape_vec(IxDyn(&[1, row.len()]), row.to_vec());
     let row = row.map_err(|error| error.to_string())?;

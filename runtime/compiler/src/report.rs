@@ -1,4 +1,4 @@
-//! Sizes of what was compiled.
+//! Sizes of compiled programs.
 
 use std::fmt;
 use std::ops::Range;
@@ -8,46 +8,47 @@ use lads_image::op::WeightFormat;
 /// One dense layer of a program.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LayerReport {
-    /// Name of the ONNX node that it was made from, or of that node's first output.
+    /// Name of the ONNX node that the layer was made from, or of that node's first output.
     pub node: String,
     /// Number of weights.
     pub weights: usize,
-    /// How they are stored.
+    /// Storage format of the weights.
     pub format: WeightFormat,
-    /// Where: the 4-byte words of the image's weights. Layers of several programs may share them.
+    /// Range of 4-byte words that the layer takes in the image's weights. Layers of several
+    /// programs may share them.
     pub words: Range<usize>,
 }
 
 /// One program of an image.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ProgramReport {
-    /// For example `high_level/record`.
+    /// Name of the program, for example `high_level/record`.
     pub name: String,
-    /// The graph it was compiled from; empty for one that only copies.
+    /// Name of the graph that it was compiled from; empty for a program that only copies.
     pub entry: String,
     /// Number of ops.
     pub ops: usize,
-    /// Elements of arena that the memory plan needs.
+    /// Number of elements of arena that the memory plan needs.
     pub arena_len: usize,
-    /// Largest sum of values that live at the same time: no plan needs less.
+    /// Lower bound of the arena: the largest sum of values that live at the same time.
     pub arena_lower_bound: usize,
-    /// Its dense layers, in their order.
+    /// Dense layers of the program, in their order.
     pub layers: Vec<LayerReport>,
 }
 
-/// What a compilation made.
+/// Sizes of the programs that a compilation made.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CompileReport {
-    /// The programs, in the image's order.
+    /// Programs, in the image's order.
     pub programs: Vec<ProgramReport>,
-    /// Bytes of weights, tables and word embeddings, each content once.
+    /// Number of bytes of weights, tables and word embeddings, each content once.
     pub weight_bytes: usize,
-    /// 4-byte words of state that KV caches take.
+    /// Number of 4-byte words of state that KV caches take.
     pub cache_len: usize,
 }
 
 impl CompileReport {
-    /// Elements of arena that the largest program needs.
+    /// Returns the number of elements of arena that the largest program needs.
     pub fn arena_len(&self) -> usize {
         self.programs
             .iter()
@@ -57,7 +58,7 @@ impl CompileReport {
     }
 }
 
-/// A table, one line per program.
+/// Formats a table, one line per program.
 impl fmt::Display for CompileReport {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         writeln!(

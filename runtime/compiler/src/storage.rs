@@ -1,7 +1,9 @@
-//! How the numbers of an image are stored, and on what evidence: `lads.storage` in a bundle's metadata.
+//! Storage formats of an image's numbers, and the evidence for them: `lads.storage` in a bundle's
+//! metadata.
 //!
-//! Fewer bits make a control step faster and can make a policy another one. `lads-run tune` finds the smallest that keep it and writes
-//! them, with what it saw, into the bundle, where [`compile`](crate::compile) finds them. What can fail: text that is no such record, a
+//! Fewer bits make a control step faster and can change the policy. `lads-run tune` finds the
+//! smallest formats that keep its behaviour and writes them, with the evidence, into the bundle,
+//! where [`compile`](crate::compile) finds them. What can fail: text that is not such a record, a
 //! format that does not exist, a part that the bundle does not have.
 
 use std::collections::BTreeMap;
@@ -15,29 +17,31 @@ use crate::bundle::Bundle;
 use crate::error::BundleError;
 use crate::onnx::{StringStringEntryProto, fields};
 
-/// The metadata key.
+/// Key of the metadata.
 const KEY: &str = "lads.storage";
 
-/// The version of the record that is read and written.
+/// Version of the record that is read and written.
 const VERSION: u32 = 1;
 
-/// The number of a `ModelProto`'s field that holds its metadata.
+/// Number of a `ModelProto`'s field that holds its metadata.
 const METADATA_FIELD: u64 = 14;
 
-/// How the weights of dense layers and the KV caches of an image are stored; 32-bit floats where nothing else is said.
+/// Storage formats of the weights of dense layers and of the KV caches of an image; all other
+/// numbers are 32-bit floats.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(into = "Names", try_from = "Names")]
 pub struct Storage {
-    /// The weights of all dense layers that `parts` does not name.
+    /// Format of the weights of all dense layers that `parts` does not name.
     pub weights: WeightFormat,
-    /// Exceptions: the name of an entry graph, for example `low_level/act`, or of one ONNX node in it, which comes first.
+    /// Exceptions for parts: by the name of an entry graph, for example `low_level/act`, or of one
+    /// ONNX node in it, which takes precedence.
     pub parts: BTreeMap<String, WeightFormat>,
-    /// The KV caches.
+    /// Format of the KV caches.
     pub cache: CacheFormat,
 }
 
 impl Storage {
-    /// All weights in one format, the caches with 32 bits.
+    /// Makes a storage of all weights in one format, and of the caches with 32 bits.
     pub fn of_weights(weights: WeightFormat) -> Self {
         Self {
             weights,
@@ -45,34 +49,34 @@ impl Storage {
         }
     }
 
-    /// The same with an exception.
+    /// Adds an exception for an entry graph or an ONNX node.
     #[must_use]
     pub fn with_part(mut self, part: &str, weights: WeightFormat) -> Self {
         self.parts.insert(part.to_owned(), weights);
         self
     }
 
-    /// The same with other caches.
+    /// Sets the format of the KV caches.
     #[must_use]
     pub fn with_cache(mut self, cache: CacheFormat) -> Self {
         self.cache = cache;
         self
     }
 
-    /// Whether nothing is stored with fewer bits than it was computed with.
+    /// Returns whether all numbers are stored with 32 bits.
     pub fn is_exact(&self) -> bool {
         let mut weights = self.parts.values().chain([&self.weights]);
         weights.all(|&format| format == WeightFormat::F32) && self.cache == CacheFormat::F32
     }
 
-    /// How the weights of the layer that was made from `node` of `entry` are stored.
+    /// Returns the format of the weights of the layer that was made from `node` of `entry`.
     pub fn of(&self, entry: &str, node: &str) -> WeightFormat {
         let part = self.parts.get(node).or_else(|| self.parts.get(entry));
         part.copied().unwrap_or(self.weights)
     }
 }
 
-/// For example `f16 weights (low_level/act f32) and an f16 cache`.
+/// Formats the storage, for example `f16 weights (low_level/act f32) and an f16 cache`.
 impl fmt::Display for Storage {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} weights", self.weights.name())?;
@@ -91,20 +95,21 @@ impl fmt::Display for Storage {
     }
 }
 
-/// What a person says of formats. Whoever names `weights` sets all aside that the bundle was tuned to; else what is left out is as it was
-/// tuned, and with 32 bits where it was not.
+/// Formats that a person chooses. Naming `weights` discards everything that the bundle was tuned
+/// for; else formats that are left out are as tuned, and 32 bits if it was not tuned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Formats {
-    /// Of all weights.
+    /// Format of all weights.
     pub weights: Option<WeightFormat>,
-    /// Of the weights of what is in the action and does not only select an index, if otherwise.
+    /// Format of the weights that the action depends on, not only the choice of an index, if it
+    /// differs.
     pub low_level: Option<WeightFormat>,
-    /// Of the KV caches.
+    /// Format of the KV caches.
     pub cache: Option<CacheFormat>,
 }
 
 impl Formats {
-    /// What that is in this bundle; `None` if nothing was said.
+    /// Returns the chosen storage for this bundle; `None` if nothing was chosen.
     pub fn storage(self, bundle: &Bundle) -> Result<Option<Storage>, BundleError> {
         if self == Self::default() {
             return Ok(None);
@@ -130,48 +135,52 @@ impl Formats {
     }
 }
 
-/// What was seen when a policy answered recorded questions with such numbers, beside itself with 32 bits.
+/// Evidence for a storage: the policy's answers to recorded questions with these formats, compared
+/// with its answers with 32 bits.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Evidence {
     /// SHA-256 of the file with the questions, hexadecimal.
     pub reference_sha256: String,
-    /// Episodes replayed.
+    /// Number of episodes replayed.
     pub episodes: usize,
-    /// Control steps in them.
+    /// Number of control steps in the episodes.
     pub steps: usize,
-    /// Decisions in them; every one selected the same index.
+    /// Number of decisions in the episodes; every one selected the same index.
     pub decisions: usize,
-    /// The smallest lead of a selected index over the second best, with 32 bits, in logits; left out where no decision has two logits.
+    /// Smallest lead of a selected index over the second best, with 32 bits, in logits; left out if
+    /// no decision has two logits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub smallest_margin: Option<f64>,
     /// Largest difference of a logit, up to a constant added to all of a decision's.
     pub largest_logit_error: f64,
-    /// Segments of them that the trajectory encoder saw; it saw the same plan in every one.
+    /// Number of segments of the episodes that the trajectory encoder saw; it chose the same plan
+    /// for every one.
     pub segments: usize,
-    /// Share of the decisions with two logits or more whose margin is more than `margin_factor` times that difference.
+    /// Share of the decisions with two logits or more whose margin is more than `margin_factor`
+    /// times the largest logit error.
     pub clear_share: f64,
-    /// The factor.
+    /// Factor of the largest logit error in `clear_share`.
     pub margin_factor: f64,
     /// Largest difference of an action's element, in the action's units.
     pub largest_action_error: f64,
-    /// What it may be.
+    /// Largest difference of an action's element that is allowed, in the action's units.
     pub action_tolerance: f64,
 }
 
-/// The record in a bundle.
+/// The record of a tuned bundle: storage formats and their evidence.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tuned {
     version: u32,
-    /// How the numbers are stored.
+    /// Storage formats of the numbers.
     pub storage: Storage,
-    /// Why that is enough.
+    /// Evidence that the formats suffice.
     pub evidence: Evidence,
 }
 
 impl Tuned {
-    /// A record of this version.
+    /// Makes a record of this version.
     pub fn new(storage: Storage, evidence: Evidence) -> Self {
         Self {
             version: VERSION,
@@ -180,12 +189,12 @@ impl Tuned {
         }
     }
 
-    /// The record of a bundle, whose metadata is given by key; `None` for one that has none, and what is wrong with one that does not
-    /// read.
+    /// Finds the record of a bundle, whose metadata is given by key; `None` if it has none, an
+    /// error if it is invalid.
     pub(crate) fn find<'m>(
         property: impl Fn(&str) -> Option<&'m str>,
     ) -> Result<Option<Self>, String> {
-        /// What all versions have.
+        /// Fields that all versions have.
         #[derive(Deserialize)]
         struct Head {
             version: u32,
@@ -205,7 +214,7 @@ impl Tuned {
             .map_err(|error| error.to_string())
     }
 
-    /// A bundle's file with this record instead of the one that it may have; all other bytes stay what they are.
+    /// Returns a bundle's file with this record in place of its own; all other bytes are unchanged.
     pub fn written_into(&self, bundle: &[u8]) -> Result<Vec<u8>, BundleError> {
         let mut written = without_record(bundle)?;
         let pair = StringStringEntryProto {
@@ -219,7 +228,7 @@ impl Tuned {
     }
 }
 
-/// A bundle's file as it was before it was tuned.
+/// Returns a bundle's file as it was before it was tuned.
 pub(crate) fn without_record(bundle: &[u8]) -> Result<Vec<u8>, BundleError> {
     let mut rest = Vec::with_capacity(bundle.len() + 1024);
     for field in fields(bundle)? {
@@ -232,7 +241,7 @@ pub(crate) fn without_record(bundle: &[u8]) -> Result<Vec<u8>, BundleError> {
     Ok(rest)
 }
 
-/// Formats by their names, as the record has them.
+/// Names of the formats in the record.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Names {
@@ -271,7 +280,7 @@ impl TryFrom<Names> for Storage {
     }
 }
 
-/// The format of that name; else the names that there are.
+/// Returns the format with this name; else the known names.
 pub fn named<T: Copy, const N: usize>(
     name: &str,
     known: [T; N],

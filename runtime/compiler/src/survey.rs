@@ -1,7 +1,9 @@
-//! What a file misses to become a policy, all at once: operators that the compiler does not take, and fields of the contract.
+//! Surveys what a file lacks to become a policy, all at once: operators that the compiler does not
+//! support, and fields of the contract.
 //!
-//! [`survey`] takes any ONNX model. Of one without a contract it lists what a person has to say: nothing is guessed. What can fail: the
-//! bytes are no ONNX model, or a bundle of another version.
+//! [`survey`] takes any ONNX model. For a model without a contract it lists what a person has to
+//! state: nothing is guessed. What can fail: the bytes are not an ONNX model, or a bundle of
+//! another version.
 
 use std::collections::HashMap;
 
@@ -16,7 +18,7 @@ use crate::graph::{Dim, Type, show};
 use crate::import::{Declared, Model, trial};
 use crate::onnx::{self, GraphProto, ModelProto, TensorTypeProto, ValueInfoProto, data_type};
 
-/// Top-level fields without which no contract reads.
+/// Top-level fields that every contract requires.
 const FIELDS: [(&str, &str); 6] = [
     ("version", "the version of the contract's form, 2"),
     (
@@ -35,78 +37,78 @@ const FIELDS: [(&str, &str); 6] = [
     ("provenance", "how the policy was trained: anything, or {}"),
 ];
 
-/// What a file holds and what it misses.
+/// Content of a file, and what it lacks to become a policy.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Survey {
-    /// ONNX operator set.
+    /// Version of the ONNX operator set.
     pub opset: Option<i64>,
-    /// What wrote the file.
+    /// Name of the program that wrote the file.
     pub producer: String,
-    /// Operators in the graph.
+    /// Number of operators in the graph.
     pub nodes: usize,
-    /// What the graph reads.
+    /// Inputs of the graph.
     pub inputs: Vec<Value>,
-    /// What the graph gives.
+    /// Outputs of the graph.
     pub outputs: Vec<Value>,
     /// Keys of the metadata.
     pub metadata: Vec<String>,
-    /// What is missing.
+    /// Missing operators and fields.
     pub missing: Missing,
 }
 
-/// A value at the edge of a graph.
+/// An input or output of a graph.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Value {
-    /// Name.
+    /// Name of the value.
     pub name: String,
-    /// Type of its elements, as ONNX calls it.
+    /// Type of the value's elements, by ONNX' name.
     pub dtype: String,
-    /// Lengths of its axes, or their names.
+    /// Lengths of the value's axes, or their names.
     pub shape: Vec<String>,
 }
 
-/// What stands between a file and a policy; both lists are empty for a bundle that compiles.
+/// Gaps between a file and a policy; both lists are empty for a bundle that compiles.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Missing {
-    /// Nodes that the compiler does not take, in the graph's order.
+    /// Nodes that the compiler does not support, in the graph's order.
     pub operators: Vec<Operator>,
-    /// What a contract has to say and none does.
+    /// Fields that the contract lacks.
     pub contract: Vec<Field>,
 }
 
-/// A node that the compiler does not take.
+/// A node that the compiler does not support.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Operator {
-    /// The ONNX operator.
+    /// Name of the ONNX operator.
     pub operator: String,
-    /// The node's name, or its first output's.
+    /// Name of the node, or of its first output.
     pub node: String,
-    /// What it reads.
+    /// Operands of the node.
     pub inputs: Vec<Operand>,
-    /// What is not supported.
+    /// What the compiler does not support.
     pub problem: String,
 }
 
-/// What a node reads.
+/// Operand of a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Operand {
     /// Name of the value.
     pub name: String,
-    /// Its shape, `?` where nothing says it.
+    /// Shape of the value, `?` if it is unknown.
     pub shape: String,
 }
 
-/// A field of the contract, or what takes the place of one.
+/// A field that a contract lacks, or a step in place of one.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Field {
-    /// Which one.
+    /// Name of the field.
     pub field: String,
-    /// What it has to say, or what is wrong with it.
+    /// Content that the field needs, or its fault.
     pub needed: String,
 }
 
 impl Missing {
-    /// Whether nothing is.
+    /// Returns whether nothing is missing.
     pub fn is_empty(&self) -> bool {
         self.operators.is_empty() && self.contract.is_empty()
     }
@@ -119,12 +121,12 @@ impl Missing {
     }
 }
 
-/// Names in a hostile file hold anything.
+/// Escapes a name, because names in a hostile file may hold anything.
 fn line(text: &str) -> String {
     Line::from(text).to_string()
 }
 
-/// Shapes of values inside a graph, which the compiler works out itself and only a survey reads.
+/// Shapes of values inside a graph, which the compiler computes itself and only a survey reads.
 #[derive(Clone, PartialEq, Message)]
 struct Inner {
     #[prost(message, optional, tag = "7")]
@@ -137,7 +139,7 @@ struct InnerGraph {
     value_info: Vec<ValueInfoProto>,
 }
 
-/// Lists what a file holds and what it misses to become a policy.
+/// Lists the content of a file and what it lacks to become a policy.
 pub fn survey(bytes: &[u8]) -> Result<Survey, BundleError> {
     let bytes = Bytes::copy_from_slice(bytes);
     let model = onnx::decode(&bytes)?;
@@ -210,7 +212,8 @@ fn tensor(value: &ValueInfoProto) -> Option<&TensorTypeProto> {
     value.r#type.as_ref()?.tensor_type.as_ref()
 }
 
-/// A value's type and shape as the compiler takes them; a named axis that is not the context's length counts as 1.
+/// Returns a value's type and shape as the compiler reads them; a named axis that is not the
+/// context's length counts as 1.
 fn taken(value: &ValueInfoProto) -> Option<(Type, Vec<Dim>)> {
     let tensor = tensor(value)?;
     let ty = match tensor.elem_type {
@@ -235,7 +238,7 @@ fn taken(value: &ValueInfoProto) -> Option<(Type, Vec<Dim>)> {
     Some((ty, dims.collect::<Option<_>>()?))
 }
 
-/// A value as the file declares it.
+/// Returns a value as the file declares it.
 fn value(value: &ValueInfoProto) -> Value {
     let tensor = tensor(value);
     let shape = tensor.and_then(|tensor| tensor.shape.as_ref());
@@ -254,7 +257,8 @@ fn value(value: &ValueInfoProto) -> Value {
     }
 }
 
-/// What is wrong with a contract that is there. One of another version is refused: its remedy is another program.
+/// Lists the faults of a bundle's contract. A contract of another version is refused: its remedy is
+/// another program.
 fn of_bundle(
     model: &ModelProto,
     graph: &GraphProto,
@@ -299,7 +303,7 @@ fn of_bundle(
 
 const GOLDEN: &str = "a recorded episode, with which every target tests itself: what was observed, the actions, and how far an action may be from them";
 
-/// What has to be said of a graph that comes without a contract.
+/// Lists the fields that a person has to state for a graph without a contract.
 fn of_stranger(inputs: &[&ValueInfoProto], graph: &GraphProto, missing: &mut Missing) {
     for (name, needed) in FIELDS {
         if name != "channels" {

@@ -1,4 +1,4 @@
-//! Constant tensors: what initializers hold and what constant folding computes.
+//! Constant tensors: initializers and the results of constant folding.
 //!
 //! Invariant: the number of elements is the product of the shape.
 
@@ -8,10 +8,10 @@ use lads_kernels::stored;
 
 use crate::onnx::{TensorProto, data_type};
 
-/// The most elements that an initializer or a folded constant may have: 256 MiB of `f32`.
+/// Largest number of elements of an initializer or a folded constant: 256 MiB of `f32`.
 pub(crate) const MAX_ELEMENTS: usize = 1 << 26;
 
-/// The most axes that a value may have.
+/// Largest number of axes of a value.
 pub(crate) const MAX_RANK: usize = 8;
 
 /// Elements of a constant.
@@ -21,14 +21,14 @@ pub(crate) enum Data {
     I64(Vec<i64>),
 }
 
-/// A constant.
+/// Constant tensor.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Tensor {
     pub shape: Vec<usize>,
     pub data: Data,
 }
 
-/// The number of elements of a shape, if it is not beyond [`MAX_ELEMENTS`].
+/// Returns the number of elements of a shape, if it is not beyond [`MAX_ELEMENTS`].
 pub(crate) fn elements(shape: &[usize]) -> Option<usize> {
     let product = shape
         .iter()
@@ -36,7 +36,7 @@ pub(crate) fn elements(shape: &[usize]) -> Option<usize> {
     (product <= MAX_ELEMENTS).then_some(product)
 }
 
-/// Strides of a contiguous layout.
+/// Returns the strides of a contiguous layout.
 pub(crate) fn strides(shape: &[usize]) -> Vec<usize> {
     let mut strides = vec![1; shape.len()];
     for i in (1..shape.len()).rev() {
@@ -80,7 +80,7 @@ impl Tensor {
         }
     }
 
-    /// The number of elements.
+    /// Returns the number of elements.
     pub fn len(&self) -> usize {
         match &self.data {
             Data::F32(data) => data.len(),
@@ -88,7 +88,7 @@ impl Tensor {
         }
     }
 
-    /// The value, if all elements are the same one.
+    /// Returns the value of all elements, if they are equal.
     pub fn uniform(&self) -> Option<f32> {
         let data = self.as_f32()?;
         let &first = data.first()?;
@@ -97,7 +97,7 @@ impl Tensor {
             .then_some(first)
     }
 
-    /// Reads a tensor of a model file. The error says what is wrong with it.
+    /// Reads a tensor of a model file. The error describes the fault.
     pub fn from_proto(proto: &TensorProto) -> Result<Arc<Self>, String> {
         if proto.data_location != 0 || !proto.external_data.is_empty() {
             return Err(
@@ -129,7 +129,8 @@ impl Tensor {
     }
 }
 
-/// The elements of a tensor: floats of all widths as `f32`, integers as `i64`, truth values as 0 and 1.
+/// Returns the elements of a tensor: floats of all widths as `f32`, integers as `i64`, truth values
+/// as 0 and 1.
 fn elements_of(proto: &TensorProto) -> Result<Data, String> {
     use data_type::{
         BFLOAT16, BOOL, DOUBLE, FLOAT, FLOAT16, INT8, INT16, INT32, INT64, UINT8, name,
@@ -170,7 +171,7 @@ fn elements_of(proto: &TensorProto) -> Result<Data, String> {
     })
 }
 
-/// Doubles as `f32`.
+/// Rounds doubles to `f32`.
 fn singles(doubles: Vec<f64>) -> Result<Data, String> {
     let lost = |x: f64| x.is_finite() && !(x as f32).is_finite();
     if let Some(x) = doubles.iter().find(|&&x| lost(x)) {
@@ -179,7 +180,7 @@ fn singles(doubles: Vec<f64>) -> Result<Data, String> {
     Ok(Data::F32(doubles.into_iter().map(|x| x as f32).collect()))
 }
 
-/// Little-endian words.
+/// Reads little-endian words.
 fn words<T, const N: usize>(raw: &[u8], read: impl Fn([u8; N]) -> T) -> Result<Vec<T>, String> {
     let (words, rest) = raw.as_chunks::<N>();
     if !rest.is_empty() {

@@ -1,4 +1,5 @@
-//! Tests of the stages against oracles: tract for what a graph means, a plain interpreter for what ops do.
+//! Tests of the stages against oracles: tract for the meaning of a graph, a plain interpreter for
+//! the effect of ops.
 
 mod attention;
 mod bombs;
@@ -31,14 +32,14 @@ use crate::plan::{Placed, plan};
 use crate::storage::Storage;
 use crate::verify::verify;
 
-/// A program as far as the stages before the image take it.
+/// A program after all stages before the image.
 struct Compiled {
     lowered: Lowered,
     placed: Placed,
     weights: Vec<f32>,
 }
 
-/// Compiles one entry, the named outputs only, and proves its memory plan.
+/// Compiles one entry, with the named outputs only, and proves its memory plan.
 fn compiled(
     model: &ModelProto,
     signature: &Signature,
@@ -69,7 +70,8 @@ struct Program {
     compiled: Compiled,
 }
 
-/// The programs of a bundle that are compiled from its graphs, with a KV cache of so many rows.
+/// Returns the programs of a bundle that are compiled from its graphs, with a KV cache of `rows`
+/// rows.
 fn programs(bundle: &Bundle, rows: usize) -> Vec<Program> {
     let contract = bundle.contract();
     let blueprint = contract.family.kind().blueprint(contract);

@@ -1,9 +1,10 @@
-//! Proves a memory plan, element by element, knowing nothing of how it was made.
+//! Proves a memory plan, element by element, independent of how it was made.
 //!
-//! The program over the virtual arena, in which nothing overlaps, and the placed one are run side by side without computing:
-//! every write says which virtual element, in which generation, an element of the arena now holds; every read asks whether it
-//! still is the one meant. So if two values that are both still read overlapped, or something was read that nobody had written,
-//! some read would find something else. The ops themselves must be the same but for their offsets.
+//! The program over the virtual arena, in which nothing overlaps, and the placed one are run side
+//! by side without computing: every write records which virtual element, in which generation, an
+//! element of the arena now holds; every read checks that it is still the expected one. So if two
+//! live values overlapped, or an unwritten element was read, some read would find a different one.
+//! The ops themselves must be the same but for their offsets.
 
 use lads_image::op::{INT_SLOTS, Op, Place, Span};
 use lads_image::{Access, AccessKind};
@@ -11,7 +12,7 @@ use lads_image::{Access, AccessKind};
 use crate::lower::Lowered;
 use crate::plan::Placed;
 
-/// What is wrong with a memory plan.
+/// Fault of a memory plan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum PlanFault {
     /// The plan changed more of an op than its offsets, or the number of ops or ports.
@@ -20,31 +21,31 @@ pub enum PlanFault {
         /// Index of the op; the number of ops for a port.
         op: usize,
     },
-    /// An element outside the arena.
+    /// An op touches an element outside the arena.
     #[error("op {op} reaches element {element}, beyond the arena")]
     Bounds {
         /// Index of the op; the number of ops for a port.
         op: usize,
-        /// The element.
+        /// Index of the element.
         element: usize,
     },
-    /// An element is read that nobody wrote.
+    /// An element is read that was never written.
     #[error("op {op} reads element {element}, which was never written")]
     Unwritten {
         /// Index of the op; the number of ops for an output.
         op: usize,
-        /// The element.
+        /// Index of the element.
         element: usize,
     },
-    /// An element is read after something else was written over it.
+    /// An element is read after another value was written over it.
     #[error("op {op} reads element {element} after it was overwritten")]
     Overwritten {
         /// Index of the op; the number of ops for an output.
         op: usize,
-        /// The element.
+        /// Index of the element.
         element: usize,
     },
-    /// An integer is read that nobody set.
+    /// An integer is read that was never set.
     #[error("op {op} reads an integer that was never set")]
     Unset {
         /// Index of the op; the number of ops for an output.
@@ -52,17 +53,18 @@ pub enum PlanFault {
     },
 }
 
-/// What an element of the arena holds: a virtual element and its generation. Generation 0 is nothing.
+/// Content of an element of the arena: a virtual element and its generation. Generation 0 means
+/// unwritten.
 type Content = (usize, u32);
 
 struct State {
-    /// How often each virtual element was written.
+    /// Number of writes of each virtual element.
     generations: Vec<u32>,
     arena: Vec<Content>,
     ints: [bool; INT_SLOTS],
 }
 
-/// Proves that the placed program computes what the program over the virtual arena does.
+/// Proves that the placed program computes the same as the program over the virtual arena.
 pub(crate) fn verify(planned: &Lowered, placed: &Placed) -> Result<(), PlanFault> {
     let end = planned
         .buffers
@@ -97,7 +99,7 @@ pub(crate) fn verify(planned: &Lowered, placed: &Placed) -> Result<(), PlanFault
     Ok(())
 }
 
-/// The places of the same ports.
+/// Pairs the places of the same ports.
 fn ports(
     planned: &[(String, Place)],
     placed: &[(String, Place)],
@@ -115,14 +117,14 @@ fn ports(
         .collect())
 }
 
-/// An op with all its offsets zero.
+/// Returns an op with all its offsets zero.
 fn without_offsets(op: &Op) -> Op {
     let mut op = *op;
     op.each_span(&mut |span| span.offset = 0);
     op
 }
 
-/// What an op reads, then what it writes.
+/// Returns the elements that an op reads, then those that it writes.
 fn accesses(op: &Op) -> Vec<Access> {
     let mut all = vec![];
     op.accesses(&mut |access| all.push(access));
@@ -199,7 +201,7 @@ impl State {
         Ok(())
     }
 
-    /// Touches the elements of a port that is no integer.
+    /// Touches the elements of a port that is not an integer.
     fn port(&mut self, from: Place, to: Place, last: usize, touch: Touch) -> Result<(), PlanFault> {
         match (from, to) {
             (Place::Span(from), Place::Span(to)) if from.len == to.len => {

@@ -1,4 +1,5 @@
-//! The calibrations of free sentences that ship, against the words in the bundles: what the exporter counted, counted again by the runtime.
+//! Compares the shipped calibrations of free sentences with the words in the bundles: the runtime
+//! repeats the exporter's counts.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -8,7 +9,7 @@ use lads_core::similarity::{UNLIKE, alignment, nearest};
 use lads_core::{KnownInstruction, Policy};
 use serde::Deserialize;
 
-/// Of a `models/NAME.acceptance.json`, what is compared here.
+/// Part of a `models/NAME.acceptance.json` that is compared here.
 #[derive(Deserialize)]
 struct Calibration {
     acceptance: Acceptance,
@@ -93,7 +94,7 @@ fn known_instructions_are_like_themselves_and_noise_is_like_none() {
     }
 }
 
-/// Number `i` of a fixed stream of numbers between -1 and 1 (splitmix64).
+/// Returns number `i` of a fixed stream of numbers between -1 and 1 (splitmix64).
 fn noise(i: u64) -> f32 {
     let mut x = (i + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
     x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);

@@ -1,4 +1,4 @@
-//! Bundles from the outside: what opens, what is refused and how, and whole episodes.
+//! Tests bundles from the outside: opening, refusals, and whole episodes.
 
 use std::path::Path;
 
@@ -8,7 +8,8 @@ use lads_core::{Controller, Instruction, Policy, Workspace};
 
 const TINY: &[u8] = include_bytes!("data/tiny.onnx");
 
-/// The tiny bundle with one byte string of its content replaced by another of the same length.
+/// Returns the tiny bundle with one byte string of its content replaced by another of the same
+/// length.
 fn edited(from: &str, to: &str) -> Vec<u8> {
     assert_eq!(from.len(), to.len());
     let mut bytes = TINY.to_vec();
@@ -280,7 +281,7 @@ fn a_channel_of_another_shape_names_itself_and_the_value() {
     );
 }
 
-/// The tiny bundle's contract as JSON.
+/// Returns the tiny bundle's contract as JSON.
 fn contract() -> serde_json::Value {
     let start = br#"{"version""#;
     let at = TINY.windows(start.len()).position(|part| part == start);
@@ -336,7 +337,7 @@ fn more_steps_than_the_table_of_timesteps_has_rows_are_refused() {
     assert!(!message.contains('\n'), "{message}");
 }
 
-/// The tiny bundle's contract with this `language.acceptance`.
+/// Parses the tiny bundle's contract with this `language.acceptance`.
 fn with_acceptance(acceptance: serde_json::Value) -> Result<Contract, BundleError> {
     let mut contract = contract();
     contract["language"]["acceptance"] = acceptance;

@@ -1,11 +1,12 @@
-//! Contracts that miss something, or contradict themselves, are refused by the field.
+//! Tests that contracts that miss something, or contradict themselves, are refused by the field.
 
 use lads_compiler::Contract;
 use serde_json::Value;
 
 const TINY: &[u8] = include_bytes!("data/tiny.onnx");
 
-/// Where the contract is changed, what is written there as JSON (nothing: it is removed), and what is then said.
+/// A broken contract: the place of the change, the JSON written there (nothing: it is removed), and
+/// the expected parts of the error.
 type Broken = (&'static str, &'static str, &'static [&'static str]);
 
 const BROKEN: &[Broken] = &[
@@ -108,7 +109,7 @@ const BROKEN: &[Broken] = &[
     ("/provenance", "", &["`provenance`"]),
 ];
 
-/// The small bundle's contract.
+/// Returns the small bundle's contract.
 fn contract() -> Value {
     let start = br#"{"version""#;
     let at = TINY.windows(start.len()).position(|part| part == start);
@@ -117,7 +118,7 @@ fn contract() -> Value {
     values.next().unwrap().unwrap()
 }
 
-/// Writes a value, or removes what is there.
+/// Writes a value, or removes the existing one.
 fn change(contract: &mut Value, pointer: &str, value: &str) {
     let (parent, last) = pointer.rsplit_once('/').expect("a pointer");
     let parent = contract.pointer_mut(parent).expect("it is there");

@@ -1,4 +1,5 @@
-//! Whatever the bytes of a bundle are, opening and compiling it ends with a value: a policy that loads or one clear line.
+//! Tests that opening and compiling any bytes ends with a value: a policy that loads or one clear
+//! line.
 
 use lads_compiler::{Bundle, compile};
 use lads_core::Policy;
@@ -6,7 +7,7 @@ use proptest::prelude::*;
 
 const TINY: &[u8] = include_bytes!("data/tiny.onnx");
 
-/// Opens and compiles; panics are what the tests look for.
+/// Opens and compiles; the tests fail on panics.
 fn survive(bytes: &[u8]) {
     let message = match Bundle::from_bytes(bytes) {
         Err(error) => error.to_string(),
@@ -21,7 +22,7 @@ fn survive(bytes: &[u8]) {
     assert!(!message.is_empty() && !message.contains('\n'), "{message}");
 }
 
-/// Where the graph's nodes are: names, attributes and shapes, not weights.
+/// Generates offsets of the graph's nodes: names, attributes and shapes, not weights.
 fn structure() -> impl Strategy<Value = usize> {
     let end = TINY
         .windows(8)

@@ -1,4 +1,4 @@
-//! Weights and caches of fewer bits: what an image with them holds, does, and has to pass.
+//! Tests of weights and caches of fewer bits: the image's content, its behaviour, and its gate.
 
 use std::path::Path;
 
@@ -22,7 +22,7 @@ fn options(weights: WeightFormat, tolerance: f32) -> Options {
     }
 }
 
-/// Puts a policy to work in memory of its own.
+/// Runs a policy in memory of its own.
 fn at_work<T>(policy: &Policy, isa: Isa, work: impl FnOnce(&mut Controller) -> T) -> T {
     let (mut arena, mut state) = (vec![0.0; policy.arena_len()], vec![0.0; policy.state_len()]);
     let workspace = Workspace::new(policy, &mut arena, &mut state).unwrap();
@@ -37,7 +37,8 @@ fn self_test(policy: &Policy) -> Result<SelfTest, SelfTestError> {
     at_work(policy, Isa::detect(), |controller| controller.self_test())
 }
 
-/// Every action of the golden episode, on chosen instructions, and of every decision how clear it was.
+/// Replays the golden episode on a chosen instruction set and returns every action and the margin
+/// of every decision.
 fn replayed(image: &Image, isa: Isa) -> (Vec<f32>, Vec<f32>) {
     let policy = Policy::new_checked(image.as_bytes()).unwrap();
     let golden = policy.golden().unwrap();
@@ -59,7 +60,7 @@ fn actions(image: &Image, isa: Isa) -> Vec<f32> {
     replayed(image, isa).0
 }
 
-/// How the dense layers of an entry are stored.
+/// Returns the storage formats of the dense layers of an entry.
 fn layers(image: &Image, name: &str) -> Vec<WeightFormat> {
     let tables = Tables::new(image.as_bytes()).unwrap();
     let mut entries = (0..tables.entries_len()).map(|i| tables.entry(i).unwrap());
@@ -157,7 +158,8 @@ fn what_changes_the_policy_is_refused_unless_forced() {
     assert!(self_test(&policy).is_err());
 }
 
-/// The cache is in no action, and of the weights only the low level's are: what is rounded may only change which plan is chosen.
+/// Rounds weights that no action depends on, the cache and all but the low level's, which may only
+/// change the chosen plan.
 #[test]
 fn what_only_chooses_plans_may_take_fewer_bits_and_no_tolerance() {
     let bundle = tiny();

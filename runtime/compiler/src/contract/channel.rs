@@ -1,13 +1,13 @@
-//! Channels of a contract: the values at a policy's edge.
+//! Channels of a contract: the inputs and outputs of a policy.
 
 use serde::Deserialize;
 
 use super::distinct;
 
-/// The most elements of a channel.
+/// Largest number of elements of a channel.
 const MAX_CHANNEL_LEN: usize = 1 << 26;
 
-/// What a channel is for.
+/// Purpose of a channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Role {
@@ -35,36 +35,36 @@ pub enum DType {
     I32,
 }
 
-/// A value at the policy's edge.
+/// One channel: an input or output of the policy.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Channel {
-    /// Name.
+    /// Name of the channel.
     pub name: String,
-    /// What it is for.
+    /// Purpose of the channel.
     pub role: Role,
-    /// Type of its elements.
+    /// Type of the channel's elements.
     pub dtype: DType,
-    /// Lengths of its axes, one to four.
+    /// Lengths of the channel's axes, one to four.
     pub shape: Vec<usize>,
-    /// Order of quaternions in it.
+    /// Order of the components of the channel's quaternions.
     #[serde(default)]
     pub quaternion_order: QuaternionOrder,
-    /// What the values are relative to, in words.
+    /// Description of the reference that the values are relative to.
     #[serde(default)]
     pub reference: String,
-    /// Its elements; none for images, instructions and the like.
+    /// Elements of the channel; none for images, instructions and the like.
     #[serde(default)]
     pub elements: Vec<Element>,
     /// Smallest value of any element, for a channel without elements of its own.
     #[serde(default)]
     pub min: Option<f32>,
-    /// Largest value of any element.
+    /// Largest value of any element, for a channel without elements of its own.
     #[serde(default)]
     pub max: Option<f32>,
 }
 
 impl Channel {
-    /// How many elements it has.
+    /// Returns the number of elements of the channel.
     #[expect(
         clippy::len_without_is_empty,
         reason = "a checked channel has an element at least"
@@ -73,7 +73,8 @@ impl Channel {
         self.shape.iter().product()
     }
 
-    /// The limits of a channel without elements of its own: what was said, or all that the type holds.
+    /// Returns the limits of a channel without elements of its own: those stated, or the whole
+    /// range of its type.
     pub(crate) fn limits(&self) -> (f32, f32) {
         let (min, max) = match self.dtype {
             DType::F32 => (f32::MIN, f32::MAX),
@@ -122,24 +123,24 @@ impl Channel {
 /// One element of a channel.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Element {
-    /// Name.
+    /// Name of the element.
     pub name: String,
-    /// Unit, `1` for none.
+    /// Unit of the element; `1` for a dimensionless one.
     pub unit: String,
-    /// Smallest value.
+    /// Smallest value that the contract allows.
     pub min: f32,
-    /// Largest value.
+    /// Largest value that the contract allows.
     pub max: f32,
-    /// The joint that it belongs to.
+    /// Joint that the element belongs to.
     #[serde(default)]
     pub joint: Option<String>,
-    /// What of the joint: position, velocity, effort.
+    /// Quantity of the joint: position, velocity, effort.
     #[serde(default)]
     pub interface: Option<String>,
-    /// Physical value of one unit: physical = reference + offset + scale * value.
+    /// Physical value of one unit of the element: physical = reference + offset + scale * value.
     #[serde(default = "one")]
     pub scale: f32,
-    /// Physical value of zero, on top of the channel's reference.
+    /// Physical value for an element of zero, without the channel's reference.
     #[serde(default)]
     pub offset: f32,
     /// Unit of the physical value.
@@ -148,7 +149,7 @@ pub struct Element {
     /// Proportional gain of the joint's own controller with which the policy was trained, per unit of the action.
     #[serde(default)]
     pub stiffness: Option<f32>,
-    /// Derivative gain of the same.
+    /// Derivative gain of the joint's own controller with which the policy was trained.
     #[serde(default)]
     pub damping: Option<f32>,
 }
@@ -161,7 +162,7 @@ fn one() -> f32 {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum QuaternionOrder {
-    /// There are none.
+    /// No quaternions.
     #[default]
     None,
     /// Scalar first.

@@ -1,54 +1,57 @@
-//! The language encoder of a contract, and which sentences outside the table of instructions are followed.
+//! Language encoder of a contract, and its rule for sentences outside the table of instructions.
 
 use serde::Deserialize;
 
-/// What becomes of the words of an instruction.
+/// Pooling of the words of an instruction.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Pooling {
-    /// Each is heard.
+    /// Every word is kept.
     #[default]
     None,
-    /// The mean of the encoder's last layer over all tokens is heard, as one word.
+    /// The mean of the encoder's last layer over all tokens, as one word.
     Mean,
 }
 
-/// How the likeness of a sentence and a known instruction is measured.
+/// Measure of the similarity of a sentence and a known instruction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Similarity {
-    /// [`lads_core::similarity::alignment`].
+    /// Measured by [`lads_core::similarity::alignment`].
     Alignment,
 }
 
-/// Which sentences outside the table of instructions are followed, as the exporter calibrated it.
+/// Rule for following sentences outside the table of instructions, as the exporter calibrated it.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 pub struct Acceptance {
-    /// The measure.
+    /// Measure of similarity.
     pub similarity: Similarity,
-    /// Similarity to the nearest known instruction from which on a sentence is followed.
+    /// Smallest similarity to the nearest known instruction at which a sentence is followed.
     pub threshold: f32,
-    /// Share of the calibration's sentences that ask for what the policy knows that it accepts.
+    /// Share of accepted sentences among the calibration's sentences that ask for something that
+    /// the policy knows.
     pub accepted_known: f32,
-    /// Share of the calibration's sentences that ask for something else, or for nothing, that it accepts all the same.
+    /// Share of accepted sentences among the calibration's sentences that ask for something else,
+    /// or for nothing.
     pub accepted_other: f32,
 }
 
-/// The language encoder that made the word embeddings.
+/// Language encoder that made the word embeddings.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Language {
-    /// Its name.
+    /// Name of the encoder.
     pub encoder: String,
-    /// SHA-256 of its weights.
+    /// SHA-256 of the encoder's weights.
     pub sha256: String,
-    /// Elements of a word embedding, `E`.
+    /// Number of elements of a word embedding, `E`.
     pub dim: usize,
-    /// The hidden layer that is read; negative counts from the last.
+    /// Index of the hidden layer that is read; negative counts from the last.
     pub layer: i32,
-    /// What becomes of the words; left out, nothing.
+    /// Pooling of the words; none if left out.
     #[serde(default)]
     pub pooling: Pooling,
-    /// Which sentences outside the table are followed; left out, none without the caller's insistence.
+    /// Rule for following sentences outside the table; if left out, none is followed unless the
+    /// caller insists.
     #[serde(default)]
     pub acceptance: Option<Acceptance>,
 }

@@ -1,20 +1,20 @@
-//! How a policy is put together, before shapes are known: states, entries and calls by their names.
+//! Structure of a policy before shapes are known: states, entries and calls by their names.
 
 use lads_image::records::{Event, Fill, Scope, When};
 
 use crate::contract::{Contract, Network, Role};
 
-/// The parts of a policy.
+/// States, entries and calls of a policy.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Blueprint {
     pub states: Vec<State>,
     pub entries: Vec<Entry>,
     pub calls: Vec<Call>,
-    /// Control steps of a phase, where an entry reads one.
+    /// Number of control steps of a phase, if an entry reads one.
     pub period: usize,
 }
 
-/// How a state is kept.
+/// Way in which a state is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Keep {
     Plain,
@@ -23,24 +23,24 @@ pub(crate) enum Keep {
 }
 
 impl Blueprint {
-    /// What makes an entry run.
+    /// Returns the events that make an entry run.
     pub fn events_of(&self, entry: &str) -> impl Iterator<Item = Event> {
         let calls = self.calls.iter().filter(move |call| call.entry == entry);
         calls.map(|call| call.event)
     }
 }
 
-/// A state whose width follows from the values that are bound to it.
+/// State whose width follows from the values that are bound to it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct State {
     pub name: String,
     pub keep: Keep,
     pub scope: Scope,
-    /// Elements of it or of its row, and the field of the contract that says so.
+    /// Number of elements of the state or of its row, and the field of the contract that states it.
     pub width: Option<(usize, String)>,
 }
 
-/// What a program is compiled from.
+/// Source that a program is compiled from.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Origin {
     /// Graph of the bundle.
@@ -49,28 +49,28 @@ pub(crate) enum Origin {
     Copy { channel: String },
 }
 
-/// One program.
+/// One program of the policy.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Entry {
     pub name: String,
     pub origin: Origin,
     /// Outputs of the graph that are kept, besides the cache.
     pub outputs: Vec<String>,
-    /// KV cache that it appends to.
+    /// Name of the KV cache that the entry appends to.
     pub cache: Option<String>,
-    /// Whether its weights are in the action.
+    /// True if the action depends on the entry's weights.
     pub acts: bool,
-    /// Whether a bundle may leave its graph out.
+    /// True if a bundle may leave the entry's graph out.
     pub optional: bool,
 }
 
 impl Entry {
-    /// An entry under its graph's name.
+    /// Makes an entry under its graph's name.
     pub fn new(graph: &str, outputs: &[&str]) -> Self {
         Self::variant(graph, graph, outputs)
     }
 
-    /// An entry that keeps only some outputs of its graph.
+    /// Makes an entry that keeps only some outputs of its graph.
     pub fn variant(name: &str, graph: &str, outputs: &[&str]) -> Self {
         Self {
             name: name.into(),
@@ -97,7 +97,7 @@ impl Entry {
         self
     }
 
-    /// The graph that it is compiled from, if it is one.
+    /// Returns the graph that the entry is compiled from, if it is compiled from one.
     pub fn graph(&self) -> Option<&str> {
         match &self.origin {
             Origin::Graph(graph) => Some(graph),
@@ -106,7 +106,7 @@ impl Entry {
     }
 }
 
-/// How often a call runs its entry.
+/// Number of times that a call runs its entry.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Times {
     Times(usize),
@@ -128,7 +128,7 @@ pub(crate) struct Call {
 }
 
 impl Call {
-    /// A call of an event, at all times.
+    /// Makes a call that runs at every occurrence of an event.
     pub fn on(event: Event, entry: &str) -> Self {
         Self {
             event,
@@ -142,24 +142,24 @@ impl Call {
         }
     }
 
-    /// A call of every control step.
+    /// Makes a call that runs in every control step.
     pub fn step(entry: &str) -> Self {
         Self::on(Event::Step, entry)
     }
 
-    /// Only in the first step of a context.
+    /// Restricts the call to the first step of a context.
     pub fn first(mut self) -> Self {
         self.when = When::First;
         self
     }
 
-    /// Only at multiples of a period.
+    /// Restricts the call to multiples of a period.
     pub fn every(mut self, period: usize) -> Self {
         (self.when, self.every) = (When::Every, period);
         self
     }
 
-    /// Only if nothing before it in its chain has run.
+    /// Restricts the call to steps in which no earlier call of its chain has run.
     pub fn otherwise(mut self) -> Self {
         self.otherwise = true;
         self
@@ -186,14 +186,14 @@ impl Call {
     }
 }
 
-/// What a value at an entry's edge is bound to.
+/// Binding of a graph's input or output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Bound {
     /// Index into the contract's channels.
     Channel(usize),
     /// Index into the blueprint's states.
     State(usize),
-    /// A row of the ring of this index.
+    /// A row of the ring with this index.
     Row(usize),
     Timestep,
     Phase,
@@ -203,7 +203,7 @@ pub(crate) enum Bound {
     Cache,
 }
 
-/// Names that mean the same in every graph: no observation and no state is called so.
+/// Names with the same meaning in every graph; no observation or state may have one of them.
 pub const RESERVED: [&str; 6] = [
     "action",
     "previous_action",
@@ -224,7 +224,7 @@ impl Blueprint {
         self
     }
 
-    /// Says how wide the last state is, and which field of the contract has it from.
+    /// Sets the width of the last state, and the field of the contract that states it.
     pub fn wide(mut self, width: usize, field: &str) -> Self {
         if let Some(state) = self.states.last_mut() {
             state.width = Some((width, field.into()));
@@ -232,7 +232,7 @@ impl Blueprint {
         self
     }
 
-    /// A KV cache.
+    /// Adds a KV cache.
     pub fn kv(self, name: &str, network: Option<Network>) -> Self {
         // Contracts without one were refused.
         let network = network.unwrap_or(Network {
@@ -243,12 +243,12 @@ impl Blueprint {
         self.state(name, Keep::Kv(network), Scope::Episode)
     }
 
-    /// A state that is taken over as a whole and lasts an episode.
+    /// Adds a state that is replaced as a whole and lasts an episode.
     pub fn plain(self, name: &str) -> Self {
         self.state(name, Keep::Plain, Scope::Episode)
     }
 
-    /// A value that one entry hands to another within a step.
+    /// Adds a value that one entry hands to another within a step.
     pub fn handed(self, name: &str) -> Self {
         self.state(name, Keep::Plain, Scope::Step)
     }
@@ -263,7 +263,7 @@ impl Blueprint {
         self
     }
 
-    /// What a value of an entry's graph is bound to, by its name; `None` for a name that means nothing.
+    /// Returns the binding of a value of an entry's graph, by its name; `None` for an unknown name.
     pub fn bind(&self, contract: &Contract, entry: &str, name: &str, input: bool) -> Option<Bound> {
         let channel = |found: &dyn Fn(&crate::contract::Channel) -> bool| {
             contract.channels.iter().position(found).map(Bound::Channel)
@@ -310,8 +310,9 @@ impl Blueprint {
         })
     }
 
-    /// Rows that each KV cache needs, in the order of the states: the schedule is gone through step by step with the longest
-    /// instruction. `tokens` says how many rows a run of an entry appends.
+    /// Returns the number of rows that each KV cache needs, in the order of the states, by walking
+    /// the schedule step by step with the longest instruction. `tokens` returns the number of rows
+    /// that a run of an entry appends.
     pub fn rows(&self, contract: &Contract, tokens: impl Fn(&Entry) -> usize) -> Vec<usize> {
         let (mut now, mut most) = (vec![0; self.states.len()], vec![0; self.states.len()]);
         let index = |name: &str| self.states.iter().position(|state| state.name == name);
@@ -339,8 +340,8 @@ impl Blueprint {
         most
     }
 
-    /// Goes through an instruction and all control steps of a context, or one period without a context, and shows each call that runs,
-    /// with its entry and the timestep.
+    /// Walks an instruction and all control steps of a context, or one period without a context,
+    /// and reports each call that runs, with its entry and the timestep.
     pub fn walk(&self, contract: &Contract, mut see: impl FnMut(&Call, &Entry, usize)) {
         let mut run = |event: Event, timestep: usize| {
             let mut taken = false;

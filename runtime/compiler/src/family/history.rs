@@ -1,4 +1,5 @@
-//! A low level that attends to a window of earlier steps and to those under its plan (the paper's Kitchen setting with images).
+//! LADS with a history: a low level that attends to a window of earlier steps and to those under
+//! its plan (the paper's Kitchen setting with images).
 //!
 //! The window is kept as a ring of rows. When the plan changes the low level's cache is emptied and filled again: with the plan, then
 //! with the rows of the window, the oldest first, then with the steps as they come.
@@ -14,24 +15,24 @@ use crate::contract::{Contract, Network};
 /// Sizes of a row of the window.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub struct Memory {
-    /// Elements, `R`.
+    /// Number of elements, `R`.
     pub dim: usize,
 }
 
-/// The fields of the family.
+/// Contract fields of the family with a history.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct History {
-    /// Control steps from one decision to the next, `H`.
+    /// Number of control steps from one decision to the next, `H`.
     pub horizon: usize,
-    /// The codebook of latent plans.
+    /// Sizes of the codebook of latent plans.
     pub codebook: Codebook,
-    /// How plans are picked.
+    /// Rule by which plans are picked.
     pub decision: Decision,
-    /// Steps of the window, `W`.
+    /// Number of steps of the window, `W`.
     pub window: usize,
     /// Sizes of a row of the window.
     pub memory: Memory,
-    /// The low level's transformer.
+    /// Sizes of the low level's transformer.
     pub low_level: Network,
 }
 

@@ -1,4 +1,5 @@
-//! LADS (section 4 of the paper), and what has its shape: without semantic regularisation, without categorical planning, Cluster.
+//! LADS (section 4 of the paper), and policies of its shape: without semantic regularisation,
+//! without categorical planning, Cluster.
 //!
 //! ```text
 //! t = 0        start:  s_0               -> logits, select
@@ -14,14 +15,14 @@ use serde::Deserialize;
 use super::{Blueprint, Call, Codebook, Decision, Entry, Kind, Selection, instructed, lengths};
 use crate::contract::Contract;
 
-/// The fields of the family.
+/// Contract fields of LADS.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Lads {
-    /// Control steps from one decision to the next, `H`.
+    /// Number of control steps from one decision to the next, `H`.
     pub horizon: usize,
-    /// The codebook of latent plans.
+    /// Sizes of the codebook of latent plans.
     pub codebook: Codebook,
-    /// How plans are picked.
+    /// Rule by which plans are picked.
     pub decision: Decision,
 }
 

@@ -1,4 +1,5 @@
-//! Lang DT: a causal transformer over words, observations and actions that gives the action itself, in every step.
+//! Lang DT: a causal transformer over words, observations and actions that outputs the action
+//! itself, in every step.
 
 use lads_image::records::Event;
 use serde::Deserialize;
@@ -6,7 +7,7 @@ use serde::Deserialize;
 use super::{Blueprint, Call, Entry, Kind, instructed};
 use crate::contract::Contract;
 
-/// The family has no fields of its own.
+/// Contract fields of Lang DT, which has none of its own.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct LangDt {}
 

@@ -9,16 +9,16 @@ use super::{
 };
 use crate::contract::Contract;
 
-/// The fields of the family.
+/// Contract fields of LCSD.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Lcsd {
-    /// The codebook of latent plans.
+    /// Sizes of the codebook of latent plans.
     pub codebook: Codebook,
-    /// How plans are picked.
+    /// Rule by which plans are picked.
     pub decision: Decision,
     /// Denoising of an action.
     pub denoise: Denoise,
-    /// Where its noise comes from.
+    /// Source of the denoising's noise.
     pub noise: NoiseSource,
 }
 

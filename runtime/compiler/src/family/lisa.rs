@@ -15,16 +15,16 @@ use super::{
 };
 use crate::contract::{Contract, Network};
 
-/// The fields of the family.
+/// Contract fields of LISA.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Lisa {
-    /// Control steps from one decision to the next, `H`.
+    /// Number of control steps from one decision to the next, `H`.
     pub horizon: usize,
-    /// The codebook of latent plans.
+    /// Sizes of the codebook of latent plans.
     pub codebook: Codebook,
-    /// How plans are picked.
+    /// Rule by which plans are picked.
     pub decision: Decision,
-    /// The low level's transformer.
+    /// Sizes of the low level's transformer.
     pub low_level: Network,
 }
 

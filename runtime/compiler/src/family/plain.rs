@@ -1,7 +1,8 @@
-//! One graph from observations to an action: memoryless, recurrent, or over the last observations.
+//! Plain policies: one graph from observations to an action, memoryless, recurrent, or over the
+//! last observations.
 //!
-//! What the graph remembers stands in the contract's `states`. A ring with a source gets that channel's values appended before the
-//! graph runs, by a program of its own that only copies.
+//! The contract's `states` describe the graph's memory. A ring with a source gets that channel's
+//! values appended before the graph runs, by a program of its own that only copies.
 
 use lads_image::records::{self, Scope};
 use serde::Deserialize;
@@ -9,10 +10,10 @@ use serde::Deserialize;
 use super::{Blueprint, Call, Entry, Keep, Kind, Origin};
 use crate::contract::{Channel, ClearedBy, Contract, Fill, StateKind};
 
-/// The one graph.
+/// Name of the only graph.
 const ACT: &str = "policy/act";
 
-/// The family has no fields of its own.
+/// Contract fields of a plain policy, which has none of its own.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Plain {}
 

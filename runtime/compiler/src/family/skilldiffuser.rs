@@ -9,18 +9,18 @@ use super::{
 };
 use crate::contract::Contract;
 
-/// The fields of the family.
+/// Contract fields of `SkillDiffuser`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct SkillDiffuser {
-    /// Actions of a chunk, and control steps from one decision to the next.
+    /// Number of actions of a chunk, and of control steps from one decision to the next.
     pub horizon: usize,
-    /// The codebook of latent plans.
+    /// Sizes of the codebook of latent plans.
     pub codebook: Codebook,
-    /// How plans are picked.
+    /// Rule by which plans are picked.
     pub decision: Decision,
     /// Denoising of a chunk.
     pub denoise: Denoise,
-    /// Where its noise comes from.
+    /// Source of the denoising's noise.
     pub noise: NoiseSource,
 }
 

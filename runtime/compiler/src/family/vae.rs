@@ -1,4 +1,5 @@
-//! VAE, and LADS with a VAE: the plan is a vector, the mean of what the high level says or a draw from it.
+//! VAE, and LADS with a VAE: the plan is a vector, the mean of the high level's distribution or a
+//! draw from it.
 
 use lads_image::records::{Event, NoiseRule};
 use serde::Deserialize;
@@ -9,38 +10,38 @@ use crate::contract::Contract;
 /// Sizes of a plan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub struct Plan {
-    /// Elements, `D`.
+    /// Number of elements, `D`.
     pub dim: usize,
 }
 
-/// Which plan is taken.
+/// Rule by which a plan is taken from the distribution.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum VaeRule {
-    /// The mean.
+    /// The mean of the distribution.
     Mean,
-    /// A draw.
+    /// A draw from the distribution.
     Sample,
 }
 
 /// The decision rule and its seed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub struct VaeDecision {
-    /// Which plan is taken.
+    /// Rule by which a plan is taken.
     pub rule: VaeRule,
     /// Seed of the draws.
     #[serde(default)]
     pub seed: u64,
 }
 
-/// The fields of the family.
+/// Contract fields of the VAE family.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Vae {
-    /// Control steps from one plan to the next, `H`.
+    /// Number of control steps from one plan to the next, `H`.
     pub horizon: usize,
     /// Sizes of a plan.
     pub plan: Plan,
-    /// Which plan is taken.
+    /// Rule by which a plan is taken.
     pub decision: VaeDecision,
 }
 

@@ -1,4 +1,4 @@
-//! Finds the attention of each layer and makes it one node over the cache.
+//! Finds the attention of each layer and turns it into one node over the cache.
 //!
 //! The anchors are the names of the cache's inputs and outputs. With `k`, `v` the new keys and values `[1, heads, N, head_dim]`:
 //!
@@ -9,9 +9,10 @@
 //! out             = softmax(scores)·present.n.value
 //! ```
 //!
-//! All of it is verified: both products read the same `q`, both scales are the same number, and the mask is zero on and below
-//! the diagonal and at most [`MASKED`] above. The scale may stand at any of the factors. What does not match is an error that
-//! names the layer, because a cache that is read in another way cannot be compiled.
+//! All of it is verified: both products read the same `q`, both scales are the same number, and the
+//! mask is zero on and below the diagonal and at most [`MASKED`] above. The scale may be applied to
+//! any of the factors. A mismatch is an error that names the layer, because a cache that is read in
+//! another way cannot be compiled.
 
 use std::collections::HashMap;
 
@@ -21,29 +22,31 @@ use super::Fused;
 use crate::error::CompileError;
 use crate::graph::{Dim, Graph, Id, Kind, Op, Rewriter, show, topological};
 
-/// What the mask must be at most where it hides a token: such a score vanishes in the softmax beside any unmasked one.
+/// Largest value of the mask that hides a token: such a score vanishes in the softmax beside any
+/// unmasked one.
 const MASKED: f32 = -1e4;
 
-/// How much two scales of the same attention may differ, relatively: the rounding of a folded product.
+/// Largest relative difference of two scales of the same attention: the rounding of a folded
+/// product.
 const SCALE_TOLERANCE: f32 = 1e-6;
 
 /// One layer of the cache.
 pub(super) struct Layer {
-    /// Appends the layer's new keys and values.
+    /// Node that appends the layer's new keys and values.
     pub record: Id,
 }
 
-/// An entry whose cache is only read and written by attentions.
+/// An entry whose cache is read and written only by attentions.
 pub(super) struct Cached {
     pub graph: Graph,
     pub inputs: Vec<(String, Id)>,
     pub layers: Vec<Layer>,
     pub tokens: usize,
-    /// What the old nodes became.
+    /// New nodes by the old nodes that they replace.
     pub copies: HashMap<Id, Id>,
 }
 
-/// Why the cache cannot be compiled, at which ONNX node.
+/// Reason why the cache cannot be compiled, with the ONNX node.
 pub(super) struct Fault {
     operator: String,
     node: String,
@@ -61,11 +64,11 @@ impl Fault {
     }
 }
 
-/// The new keys, values and the attention of a layer, in the old graph.
+/// New keys, values and the attention of a layer, in the old graph.
 struct Found {
     k: Id,
     v: Id,
-    /// What is replaced: `softmax(scores)·present.value`.
+    /// Match of the part to replace: `softmax(scores)·present.value`.
     out: Option<Match>,
     heads: usize,
 }
@@ -76,12 +79,12 @@ struct Match {
     scale: f32,
 }
 
-/// A product of queries and keys.
+/// Parts of a product of queries and keys.
 struct Scores {
     q: Id,
     k: Id,
     scale: f32,
-    /// Added after scaling, with the scale that was applied to it.
+    /// Mask that is added after scaling, with the scale that was applied to it.
     mask: Option<(Id, f32)>,
 }
 
@@ -123,7 +126,7 @@ fn fault(graph: &Graph, at: Id, layer: usize, problem: &str) -> Fault {
     }
 }
 
-/// Finds one layer's parts.
+/// Finds the parts of one layer.
 fn locate(g: &mut Graph, past: [Option<Id>; 2], key: Id, value: Id) -> Result<Found, String> {
     let [past_key, past_value] = past;
     let new = |g: &Graph, past: Option<Id>, present: Id| match (past, g.op(present)) {
@@ -243,7 +246,7 @@ fn expect(condition: bool, problem: &str) -> Result<(), String> {
     }
 }
 
-/// The mask is exactly triangular; one token alone needs none.
+/// Checks that the mask is exactly triangular; a single token needs no mask.
 fn causal(g: &Graph, scores: &Scores, k: Id) -> Result<(), String> {
     let n = g.known_shape(k).map_or(0, |shape| shape[2]);
     let Some((mask, scale)) = scores.mask else {
@@ -273,7 +276,7 @@ fn causal(g: &Graph, scores: &Scores, k: Id) -> Result<(), String> {
     )
 }
 
-/// Takes a product of queries and keys apart.
+/// Splits a product of queries and keys into its parts.
 fn scores(g: &mut Graph, mut at: Id) -> Result<Scores, String> {
     let mut scale = 1.0f32;
     let mut mask = None;
@@ -324,7 +327,7 @@ fn scores(g: &mut Graph, mut at: Id) -> Result<Scores, String> {
     Ok(Scores { q, k, scale, mask })
 }
 
-/// `x` and `c` of a node that is `x * c` or `x / c` with a scalar constant.
+/// Returns `x` and `c` of a node that computes `x * c` or `x / c` with a scalar constant.
 fn scalar_factor(g: &Graph, id: Id) -> Option<(Id, f32)> {
     let inputs = &g.node(id).inputs;
     let scalar = |id: Id| {
@@ -345,7 +348,8 @@ fn scalar_factor(g: &Graph, id: Id) -> Option<(Id, f32)> {
     }
 }
 
-/// Copies everything that does not read the cache into a new graph, the attentions as single nodes.
+/// Copies the nodes that do not read the cache into a new graph, with the attentions as single
+/// nodes.
 fn rebuild(
     mut old: Graph,
     found: &[Found],
@@ -413,7 +417,7 @@ struct Replaced {
     out: Option<Id>,
 }
 
-/// The nodes that stand for a layer: one row per token, the heads side by side.
+/// Makes the nodes that replace a layer: one row per token, the heads side by side.
 fn replaced(g: &mut Graph, layer: usize, one: &Found) -> Result<Replaced, String> {
     let shape = g.known_shape(one.k).unwrap_or_default();
     let &[_, heads, tokens, head_dim] = &shape[..] else {

@@ -1,11 +1,13 @@
-//! A layer that reads columns in another order than they lie in reads them as they lie, with the rows of its matrix in that order.
+//! Moves a permutation of a layer's input columns into the rows of its matrix, so that the layer
+//! reads the columns in their stored order.
 //!
-//! Joints in a policy's order are columns picked one by one out of what the robot gives in its own. The sum of a layer is the same in any
-//! order of its terms, up to rounding, so nothing has to be moved at run time.
+//! Joints in a policy's order are columns picked one by one from the robot's order. The sum of a
+//! layer is the same in any order of its terms, up to rounding, so nothing has to be moved at run
+//! time.
 
 use crate::graph::{Graph, Id, Op};
 
-/// Columns `start..start + len` of a value, which rows from `row` on of the matrix belong to.
+/// Columns `start..start + len` of a value, with the matrix rows from `row` on that belong to them.
 #[derive(Debug, Clone, Copy)]
 struct Piece {
     source: Id,
@@ -14,7 +16,7 @@ struct Piece {
     row: usize,
 }
 
-/// The operands of `x·W` with fewer pieces, if there are fewer.
+/// Returns the operands of `x·W` with fewer pieces, if possible.
 pub(super) fn sorted(g: &mut Graph, x: Id, matrix: Id) -> Result<Option<(Id, Id)>, String> {
     let Some(axis) = g.shape(x).len().checked_sub(1) else {
         return Ok(None);
@@ -52,7 +54,7 @@ pub(super) fn sorted(g: &mut Graph, x: Id, matrix: Id) -> Result<Option<(Id, Id)
     Ok(Some((g.concat(&parts, axis)?, g.concat(&rows, 0)?)))
 }
 
-/// The pieces that a value is put together of; `None` if a length is not known.
+/// Splits a value into its pieces; `None` if a length is not known.
 fn take(g: &Graph, x: Id, axis: usize, pieces: &mut Vec<Piece>) -> Option<()> {
     let len = g.shape(x)[axis].known()?;
     let row = pieces.last().map_or(0, |last| last.row + last.len);

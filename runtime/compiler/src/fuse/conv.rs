@@ -1,5 +1,5 @@
-//! Convolutions take in what stands before and behind them: scales and shifts of their input and of their output, a residual connection,
-//! an activation with its upper bound.
+//! Fuses convolutions with the nodes around them: scales and shifts of their input and of their
+//! output, a residual connection, an activation with its upper bound.
 //!
 //! ```text
 //! conv(pad(x, 0))        = conv'(x)   with more padding
@@ -8,7 +8,7 @@
 //! min(relu(conv + r), u)              as one operation
 //! ```
 //!
-//! A value that somebody else reads too is not taken in.
+//! A value that has another reader is not fused.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -71,7 +71,7 @@ pub(super) fn fuse(fused: Fused) -> Result<Fused, String> {
     Ok(fused.mapped(graph, |id| copies[&id]))
 }
 
-/// A constant as one number per channel of `x`, if that is what it is.
+/// Returns a constant as one number per channel of `x`, if it has that form.
 fn per_channel(g: &Graph, x: Id, constant: Id) -> Option<Vec<f64>> {
     let tensor = g.constant(constant)?.clone();
     let (shape, data) = (&tensor.shape, tensor.as_f32()?);
@@ -86,7 +86,8 @@ fn per_channel(g: &Graph, x: Id, constant: Id) -> Option<Vec<f64>> {
     }
 }
 
-/// `kind(x, column)` as a scale and a shift of each channel; with `swapped`, the column is the first operand.
+/// Converts `kind(x, column)` to a scale and a shift of each channel; with `swapped`, the column is
+/// the first operand.
 fn affine(kind: BinaryKind, swapped: bool, column: Vec<f64>) -> Option<Vec<[f64; 2]>> {
     let one: fn(f64) -> [f64; 2] = match (kind, swapped) {
         (BinaryKind::Add, _) => |c| [1.0, c],
@@ -104,7 +105,7 @@ fn affine(kind: BinaryKind, swapped: bool, column: Vec<f64>) -> Option<Vec<[f64;
         .then_some(all)
 }
 
-/// A node as a scale and a shift of each channel of its operand.
+/// Converts a node to a scale and a shift of each channel of its operand.
 fn affine_of(g: &Graph, id: Id) -> Option<(Id, Vec<[f64; 2]>)> {
     let Op::Binary(kind) = *g.op(id) else {
         return None;
@@ -132,7 +133,8 @@ fn numbers(g: &Graph, id: Id) -> Option<Vec<f64>> {
     Some(tensor.as_f32()?.iter().copied().map(f64::from).collect())
 }
 
-/// A convolution with the zeros around its input as padding of its own, and what they are around.
+/// Moves the zeros around a convolution's input into its padding, and returns the input without
+/// them.
 fn with_padding(g: &Graph, mut conv: ConvOp, mut x: Id) -> (ConvOp, Id) {
     let zeros = |id: Id| g.constant(id).and_then(|tensor| tensor.uniform()) == Some(0.0);
     while let Op::Concat { axis } = *g.op(x) {
@@ -159,7 +161,7 @@ fn with_padding(g: &Graph, mut conv: ConvOp, mut x: Id) -> (ConvOp, Id) {
     (conv, x)
 }
 
-/// A convolution without the scales and shifts of its input.
+/// Folds the scales and shifts of a convolution's input into its weights.
 fn with_input(g: &mut Graph, mut conv: ConvOp, mut x: Vec<Id>, alone: bool) -> Result<Id, String> {
     let mut total: Option<Vec<[f64; 2]>> = None;
     let mut source = x[0];
@@ -203,7 +205,7 @@ fn with_input(g: &mut Graph, mut conv: ConvOp, mut x: Vec<Id>, alone: bool) -> R
     g.conv(conv, x)
 }
 
-/// The convolution that a value is, if nothing came after its sum yet.
+/// Returns the convolution that computes a value, if nothing is fused after its sum yet.
 fn bare(g: &Graph, id: Id) -> Option<ConvOp> {
     match *g.op(id) {
         Op::Conv(conv) if conv.activation.is_none() && !conv.residual => Some(conv),
@@ -211,7 +213,7 @@ fn bare(g: &Graph, id: Id) -> Option<ConvOp> {
     }
 }
 
-/// A convolution and something: a scale, a shift, a residual connection, or a bound.
+/// Fuses a convolution with a scale, a shift, a residual connection, or a bound.
 fn combined(
     g: &mut Graph,
     kind: BinaryKind,
@@ -264,7 +266,7 @@ fn combined(
     Ok(None)
 }
 
-/// `max(conv, 0)` and `min(relu(conv), u)` with `u > 0`: what ONNX' `Clip` becomes.
+/// Fuses `max(conv, 0)` and `min(relu(conv), u)` with `u > 0`, which ONNX' `Clip` becomes.
 fn bounded(g: &mut Graph, kind: BinaryKind, own: Id, other: Id) -> Result<Option<Id>, String> {
     let relu = Unary::of(UnaryKind::Relu);
     let uniform = g.constant(other).and_then(|tensor| tensor.uniform());
@@ -294,7 +296,7 @@ fn bounded(g: &mut Graph, kind: BinaryKind, own: Id, other: Id) -> Result<Option
     g.conv(conv, inputs).map(Some)
 }
 
-/// An activation after a convolution that has none yet.
+/// Fuses an activation after a convolution that has none yet.
 fn activated(g: &mut Graph, unary: Unary, x: Id) -> Result<Option<Id>, String> {
     let Op::Conv(conv) = *g.op(x) else {
         return Ok(None);

@@ -1,12 +1,13 @@
-//! Images with their channels last: ONNX has them second, so every convolution stands between two turns. Here the turns move behind what
-//! works element by element, where they meet the next operator's and cancel out.
+//! Moves the channels of images to the last axis: ONNX has them second, so every convolution stands
+//! between two transposes. This pass moves the transposes past elementwise nodes, where they meet
+//! the next operator's and cancel out.
 //!
 //! ```text
 //! f(first(x))                    = first(f(x))              elementwise, slices, concatenations, sums along an axis
 //! flat(first(x))·W               = flat(x)·W'               W' are the rows of W in another order
 //! ```
 //!
-//! An entry without images stays as it is.
+//! An entry without images is unchanged.
 
 use std::collections::HashMap;
 
@@ -43,7 +44,7 @@ pub(super) fn channels_to_the_end(fused: Fused) -> Result<Fused, String> {
     Ok(fused.mapped(graph, |id| copies[&id]))
 }
 
-/// The value with channels last of which `id` is the turned view.
+/// Returns the value with channels last whose transposed view is `id`.
 fn inner(g: &Graph, id: Id) -> Option<Id> {
     let shape = g.known_shape(id).filter(|shape| shape.len() >= 3)?;
     let source = *g.node(id).inputs.first()?;
@@ -66,14 +67,15 @@ fn inner(g: &Graph, id: Id) -> Option<Id> {
     is_turn.then_some(source)
 }
 
-/// Whether axes in this order have the channels last.
+/// Returns whether axes in this order have the channels last.
 fn is_last(perm: &[usize]) -> bool {
     perm.iter()
         .copied()
         .eq([0].into_iter().chain(2..perm.len()).chain([1]))
 }
 
-/// A value with its channels last; what lies between constants, as padding makes it, turns itself, and not with them.
+/// Returns a value with its channels last; a value between constants, as padding makes it, is
+/// transposed alone, without them.
 fn padded(g: &mut Graph, x: Id) -> Result<Id, String> {
     let Op::Concat { axis } = *g.op(x) else {
         return channels_last(g, x);
@@ -88,7 +90,7 @@ fn padded(g: &mut Graph, x: Id) -> Result<Id, String> {
     g.concat(&last, axis_of(rank, axis))
 }
 
-/// Where an axis of a turned view is in the value with channels last.
+/// Returns the position of a transposed view's axis in the value with channels last.
 fn axis_of(rank: usize, axis: usize) -> usize {
     match axis {
         0 => 0,
@@ -97,7 +99,7 @@ fn axis_of(rank: usize, axis: usize) -> usize {
     }
 }
 
-/// A node whose operands are turned views, as the turned view of another one.
+/// Rebuilds a node whose operands are transposed views as the transposed view of another node.
 fn turned(g: &mut Graph, old: &Graph, id: Id, x: &[Id]) -> Result<Option<Id>, String> {
     let whole: Option<Vec<Id>> = x.iter().map(|&id| inner(g, id)).collect();
     let new = match (old.op(id), whole) {
@@ -146,7 +148,7 @@ fn turned(g: &mut Graph, old: &Graph, id: Id, x: &[Id]) -> Result<Option<Id>, St
     channels_first(g, new).map(Some)
 }
 
-/// Two operands, one of which at least is a turned view of the result's rank.
+/// Rebuilds a binary node, at least one operand of which is a transposed view of the result's rank.
 fn binary(g: &mut Graph, kind: BinaryKind, x: &[Id]) -> Result<Option<Id>, String> {
     let rank = g.shape(x[0]).len().max(g.shape(x[1]).len());
     let is_turned = |&id: &Id| g.shape(id).len() == rank && inner(g, id).is_some();
@@ -165,7 +167,7 @@ fn binary(g: &mut Graph, kind: BinaryKind, x: &[Id]) -> Result<Option<Id>, Strin
     g.binary(kind, last[0], last[1]).map(Some)
 }
 
-/// A turned view, flattened, times a constant matrix.
+/// Rebuilds the product of a flattened transposed view with a constant matrix.
 fn product(g: &mut Graph, x: &[Id]) -> Result<Option<Id>, String> {
     let (flat, matrix) = (x[0], x[1]);
     if *g.op(flat) != Op::Reshape || g.constant(matrix).is_none() {

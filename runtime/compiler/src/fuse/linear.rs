@@ -1,7 +1,9 @@
-//! Products with constant matrices become linear layers, and take in what follows them: scale, bias, activation, residual.
+//! Turns products with constant matrices into linear layers, and fuses the nodes after them: scale,
+//! bias, activation, residual.
 //!
-//! `(x·W) * s + t` is `x·(W s) + t`: so batch normalisation disappears. A value that somebody else reads too is not taken in.
-//! A reshape between a layer and what follows it, as vectors without a batch axis have it, moves behind both.
+//! `(x·W) * s + t` is `x·(W s) + t`: so batch normalisation disappears. A value that has another
+//! reader is not fused. A reshape between a layer and the node after it, as vectors without a batch
+//! axis have it, moves behind both.
 
 use std::collections::HashMap;
 
@@ -55,7 +57,7 @@ pub(super) fn fuse(fused: Fused) -> Result<Fused, String> {
     Ok(fused.mapped(graph, |id| copies[&id]))
 }
 
-/// `x·W` with a constant matrix.
+/// Makes a linear layer of `x·W` with a constant matrix.
 fn product(g: &mut Graph, x: &[Id]) -> Result<Option<Id>, String> {
     let matrix = g.constant(x[1]).is_some() && g.shape(x[1]).len() == 2;
     let rows = g.known_shape(x[0]).is_some() && g.constant(x[0]).is_none();
@@ -74,7 +76,7 @@ fn product(g: &mut Graph, x: &[Id]) -> Result<Option<Id>, String> {
     .map(Some)
 }
 
-/// The layer that a value is, if it still can take something in.
+/// Returns the layer that computes a value, if another node can still be fused with it.
 fn layer(g: &Graph, id: Id) -> Option<(bool, Option<Unary>)> {
     match *g.op(id) {
         Op::Linear {
@@ -86,7 +88,7 @@ fn layer(g: &Graph, id: Id) -> Option<(bool, Option<Unary>)> {
     }
 }
 
-/// The value that a reshape gives another shape, or the value itself.
+/// Returns the operand of a reshape, or the value itself.
 fn unshaped(g: &Graph, id: Id) -> Id {
     match g.op(id) {
         Op::Reshape => g.node(id).inputs[0],
@@ -94,7 +96,7 @@ fn unshaped(g: &Graph, id: Id) -> Id {
     }
 }
 
-/// A linear layer and something: a scale, a bias or a residual.
+/// Fuses a linear layer with a scale, a bias or a residual.
 fn combined(
     g: &mut Graph,
     kind: BinaryKind,
@@ -143,7 +145,7 @@ fn combined(
     Ok(None)
 }
 
-/// The constant as one value per output of the layer, if that is what it is.
+/// Returns the constant as one value per output of the layer, if it has that form.
 fn per_output(g: &mut Graph, layer: Id, constant: Id) -> Result<Option<Id>, String> {
     let shape = g.shape(constant).to_vec();
     if g.constant(constant).is_none()
@@ -195,7 +197,7 @@ fn folded(
     .map(Some)
 }
 
-/// Whether layers and convolutions compute it at their end.
+/// Returns whether layers and convolutions can apply the function to their results.
 pub(super) fn is_activation(unary: Unary) -> bool {
     matches!(
         unary.kind.0,
@@ -209,7 +211,7 @@ pub(super) fn is_activation(unary: Unary) -> bool {
     )
 }
 
-/// An activation after a layer that has none yet.
+/// Fuses an activation after a layer that has none yet.
 fn activated(g: &mut Graph, unary: Unary, x: Id) -> Result<Option<Id>, String> {
     let own = unshaped(g, x);
     let Some((bias, None)) = layer(g, own).filter(|_| is_activation(unary)) else {

@@ -1,5 +1,5 @@
-//! Computes only what somebody reads: of the last layer's tokens, the one that decides; of queries, keys and values, where a
-//! layer only records, keys and values.
+//! Narrows values to the parts that are read: of the last layer's tokens, the one that decides; of
+//! queries, keys and values, where a layer only records, keys and values.
 //!
 //! From the outputs back, each value is told which part of one axis its users need: the smallest range that holds all of their
 //! slices. Operations that work row by row pass it on to their operands, a product passes columns on to its matrix.
@@ -9,7 +9,7 @@ use std::collections::HashMap;
 use super::Fused;
 use crate::graph::{Dim, Graph, Id, Op, Rewriter, topological};
 
-/// What is read of a value.
+/// Part of a value that is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Demand {
     Whole,
@@ -21,7 +21,7 @@ enum Demand {
 }
 
 impl Demand {
-    /// The smallest part that holds both.
+    /// Returns the smallest part that holds both.
     fn with(self, other: Self) -> Self {
         match (self, other) {
             (
@@ -45,7 +45,7 @@ impl Demand {
     }
 }
 
-/// Narrows an entry.
+/// Narrows the values of an entry.
 pub(super) fn narrow(fused: Fused) -> Result<Fused, String> {
     let old = &fused.graph;
     let mut roots = fused.roots();
@@ -99,7 +99,8 @@ pub(super) fn narrow(fused: Fused) -> Result<Fused, String> {
     Ok(fused.mapped(graph, |id| copies[&id]))
 }
 
-/// What is computed of a value: what is asked for if the operation works row by row along that axis, else all of it.
+/// Returns the part of a value that is computed: the part asked for if the operation works row by
+/// row along that axis, else all of it.
 fn computed(g: &Graph, id: Id, asked: Demand) -> Demand {
     let Demand::Part { axis, start, len } = asked else {
         return Demand::Whole;
@@ -118,7 +119,7 @@ fn computed(g: &Graph, id: Id, asked: Demand) -> Demand {
     if can { asked } else { Demand::Whole }
 }
 
-/// What a node of which `demand` is computed reads of its operand `i`.
+/// Returns the part of operand `i` that a node reads to compute `demand`.
 fn passed_on(g: &Graph, id: Id, demand: Demand, i: usize) -> Demand {
     let node = g.node(id);
     if let Op::Slice { axis, start } = node.op {
@@ -150,7 +151,7 @@ fn passed_on(g: &Graph, id: Id, demand: Demand, i: usize) -> Demand {
     }
 }
 
-/// The axis of `from` that a reshape leaves as axis `axis` of `to`.
+/// Returns the axis of `from` that a reshape leaves as axis `axis` of `to`.
 fn same_axis(from: &[Dim], to: &[Dim], axis: usize) -> Option<usize> {
     let volume = |dims: &[Dim]| {
         dims.iter()

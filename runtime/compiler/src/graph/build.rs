@@ -1,4 +1,5 @@
-//! The constructors of nodes. Each checks the shapes, folds constants and simplifies; see the invariants of [`graph`](super).
+//! Constructors of nodes. Each constructor checks the shapes, folds constants and simplifies; see
+//! the invariants of [`graph`](super).
 
 use std::sync::Arc;
 
@@ -7,10 +8,10 @@ use lads_image::op::{BinaryKind, ReduceKind};
 use super::{Dim, Graph, Id, Kind, MAX_FOLDING, Op, Type, Unary, cost, fold, show};
 use crate::tensor::{MAX_RANK, Tensor, elements};
 
-/// A node, or why its operands do not fit.
+/// A node, or the reason why its operands do not fit.
 type Built = Result<Id, String>;
 
-/// The shape that two shapes broadcast to, as numpy does.
+/// Returns the shape that two shapes broadcast to, as in numpy.
 pub(super) fn broadcast(a: &[Dim], b: &[Dim]) -> Result<Vec<Dim>, String> {
     let rank = a.len().max(b.len());
     let dim = |shape: &[Dim], i: usize| {
@@ -32,7 +33,7 @@ pub(super) fn broadcast(a: &[Dim], b: &[Dim]) -> Result<Vec<Dim>, String> {
         .collect()
 }
 
-/// The number of elements as a polynomial in `P`: `None` when it is not linear.
+/// Returns the number of elements as a polynomial in `P`; `None` if it is not linear.
 fn volume(shape: &[Dim]) -> Option<(usize, Vec<usize>)> {
     let mut known = 1usize;
     let mut past = vec![];
@@ -48,7 +49,7 @@ fn volume(shape: &[Dim]) -> Option<(usize, Vec<usize>)> {
 }
 
 impl Graph {
-    /// The shape that a shape and a value broadcast to.
+    /// Returns the shape that a shape and a value broadcast to.
     pub fn broadcast(&self, shape: &[Dim], x: Id) -> Result<Vec<Dim>, String> {
         broadcast(shape, self.shape(x))
     }
@@ -98,7 +99,7 @@ impl Graph {
             .ok_or_else(|| format!("axis {axis} of {} does not exist", show(self.shape(x))))
     }
 
-    /// Elementwise with broadcast.
+    /// Adds an elementwise binary operation with broadcast.
     pub fn binary(&mut self, kind: BinaryKind, a: Id, b: Id) -> Built {
         let shape = broadcast(self.shape(a), self.shape(b))?;
         if self.ty(a) == Type::I64 && self.ty(b) == Type::I64 {
@@ -123,7 +124,8 @@ impl Graph {
         self.fold(Op::Binary(Kind(kind)), vec![a, b], shape, Type::F32)
     }
 
-    /// Sums and differences of an integer and a constant become shifts; of constants, constants.
+    /// Builds sums and differences of an integer and a constant as shifts; of constants, as
+    /// constants.
     fn integers(&mut self, kind: BinaryKind, a: Id, b: Id, shape: Vec<Dim>) -> Built {
         let single = |graph: &Self, id: Id| match graph.constant(id)?.as_i64()? {
             &[value] => Some(value),
@@ -163,14 +165,14 @@ impl Graph {
         Ok(self.add(Op::Shift(by), vec![x], shape, Type::I64))
     }
 
-    /// Elementwise.
+    /// Adds an elementwise unary operation.
     pub fn unary(&mut self, unary: Unary, x: Id) -> Built {
         self.floats(&[x])?;
         let shape = self.shape(x).to_vec();
         self.fold(Op::Unary(unary), vec![x], shape, Type::F32)
     }
 
-    /// Product over the last two axes.
+    /// Adds a product over the last two axes.
     pub fn matmul(&mut self, a: Id, b: Id) -> Built {
         self.floats(&[a, b])?;
         let (sa, sb) = (self.shape(a).to_vec(), self.shape(b).to_vec());
@@ -193,7 +195,7 @@ impl Graph {
         self.fold(Op::MatMul, vec![a, b], shape, Type::F32)
     }
 
-    /// `exp(x) / sum(exp(x))` over an axis.
+    /// Adds a softmax, `exp(x) / sum(exp(x))`, over an axis.
     pub fn softmax(&mut self, x: Id, axis: usize) -> Built {
         self.floats(&[x])?;
         self.axis_len(x, axis)?;
@@ -206,7 +208,7 @@ impl Graph {
         self.transpose(y, &perm)
     }
 
-    /// Over one axis, which is removed.
+    /// Adds a reduction of one axis, which is removed.
     pub fn reduce(&mut self, kind: ReduceKind, x: Id, axis: usize) -> Built {
         self.floats(&[x])?;
         self.axis_len(x, axis)?;
@@ -215,7 +217,7 @@ impl Graph {
         self.fold(Op::Reduce(Kind(kind), axis), vec![x], shape, Type::F32)
     }
 
-    /// Over the last axis; `gamma` and `beta` are constants of its length.
+    /// Adds a layer norm over the last axis; `gamma` and `beta` are constants of its length.
     pub fn layer_norm(&mut self, x: Id, gamma: Id, beta: Id, eps: f32) -> Built {
         self.floats(&[x, gamma, beta])?;
         let shape = self.shape(x).to_vec();
@@ -231,7 +233,7 @@ impl Graph {
         Ok(self.add(op, vec![x, gamma, beta], shape, Type::F32))
     }
 
-    /// The same elements in another shape.
+    /// Adds a reshape: the same elements in another shape.
     pub fn reshape(&mut self, x: Id, shape: &[Dim]) -> Built {
         let x = match self.op(x) {
             Op::Reshape => self.node(x).inputs[0],
@@ -252,7 +254,7 @@ impl Graph {
         self.fold(Op::Reshape, vec![x], shape.to_vec(), ty)
     }
 
-    /// Axis `i` of the result is axis `perm[i]` of `x`.
+    /// Adds a transpose: axis `i` of the result is axis `perm[i]` of `x`.
     pub fn transpose(&mut self, x: Id, perm: &[usize]) -> Built {
         let rank = self.shape(x).len();
         let mut sorted = perm.to_vec();
@@ -283,7 +285,7 @@ impl Graph {
         self.fold(Op::Transpose(perm), vec![x], shape, ty)
     }
 
-    /// `start..start + len` of an axis.
+    /// Adds a slice `start..start + len` of an axis.
     pub fn slice(&mut self, x: Id, axis: usize, start: usize, len: usize) -> Built {
         let whole = self.axis_len(x, axis)?;
         if len == 0 {
@@ -322,7 +324,8 @@ impl Graph {
         self.fold(Op::Slice { axis, start }, vec![x], shape, ty)
     }
 
-    /// The operand of a concatenation that holds a slice as a whole, and where.
+    /// Returns the operand of a concatenation that holds a slice as a whole, and the slice's start
+    /// in it.
     fn part_of(&self, concat: Id, axis: usize, start: usize, len: usize) -> Option<(Id, usize)> {
         let mut at = 0;
         for &part in &self.node(concat).inputs {
@@ -335,7 +338,7 @@ impl Graph {
         None
     }
 
-    /// One operand after the other.
+    /// Adds a concatenation of the parts along an axis.
     pub fn concat(&mut self, parts: &[Id], axis: usize) -> Built {
         let &[first, ref rest @ ..] = parts else {
             return Err("nothing to concatenate".into());
@@ -364,7 +367,7 @@ impl Graph {
         self.fold(Op::Concat { axis }, parts.to_vec(), shape, ty)
     }
 
-    /// Broadcast to a larger shape.
+    /// Adds a broadcast to a larger shape.
     pub fn expand(&mut self, x: Id, shape: &[Dim]) -> Built {
         let shape = broadcast(self.shape(x), shape)?;
         if self.shape(x) == shape {
@@ -374,7 +377,7 @@ impl Graph {
         self.fold(Op::Expand, vec![x], shape, ty)
     }
 
-    /// Rows of `table` along its first axis, by an integer of one element.
+    /// Adds a lookup of rows of `table` along its first axis, by an integer of one element.
     pub fn gather_row(&mut self, table: Id, index: Id) -> Built {
         let shape = self.shape(table).to_vec();
         if shape.is_empty() || self.known_shape(table).is_none() {
@@ -390,7 +393,7 @@ impl Graph {
         self.fold(Op::GatherRow, vec![table, index], shape[1..].to_vec(), ty)
     }
 
-    /// One number as an integer, without its fraction.
+    /// Adds a conversion of one number to an integer, truncated.
     pub fn index_of(&mut self, x: Id) -> Built {
         self.floats(&[x])?;
         let shape = self.shape(x).to_vec();
@@ -403,7 +406,7 @@ impl Graph {
         self.fold(Op::ToIndex, vec![x], shape, Type::I64)
     }
 
-    /// One integer as a number.
+    /// Adds a conversion of one integer to a number.
     pub fn number_of(&mut self, x: Id) -> Built {
         let shape = self.shape(x).to_vec();
         if self.ty(x) != Type::I64 || shape.iter().any(|dim| !dim.is_one()) {
@@ -412,13 +415,13 @@ impl Graph {
         self.fold(Op::FromIndex, vec![x], shape, Type::F32)
     }
 
-    /// Index of the first smallest or largest element of all.
+    /// Adds the index of the first smallest or largest of all elements.
     pub fn arg(&mut self, op: Op, x: Id) -> Built {
         self.floats(&[x])?;
         self.fold(op, vec![x], vec![], Type::I64)
     }
 
-    /// A fused linear layer; see [`Op::Linear`].
+    /// Adds a fused linear layer; see [`Op::Linear`].
     pub fn linear(&mut self, op: Op, inputs: Vec<Id>) -> Built {
         let mut shape = self.shape(inputs[0]).to_vec();
         let n = self.axis_len(inputs[1], 1)?;
@@ -426,7 +429,7 @@ impl Graph {
         Ok(self.add(op, inputs, shape, Type::F32))
     }
 
-    /// [`Op::Attention`] or [`Op::Record`]; the result has the shape of the first operand.
+    /// Adds [`Op::Attention`] or [`Op::Record`]; the result has the shape of the first operand.
     pub fn cached(&mut self, op: Op, inputs: Vec<Id>) -> Id {
         let shape = self.shape(inputs[0]).to_vec();
         self.add(op, inputs, shape, Type::F32)

@@ -1,4 +1,5 @@
-//! What a node computes, in the plainest way, on `ndarray`: with numbers of 32 bits to fold constants, with 64 to check what was compiled.
+//! Evaluates nodes in the plainest way, on `ndarray`: with numbers of 32 bits to fold constants,
+//! with 64 to check compiled programs.
 //!
 //! `None` means that a node is not evaluated, never that it is wrong. Every sum goes from the first element to the last, so that a folded
 //! constant has the same bits wherever it is folded.
@@ -14,22 +15,22 @@ use ndarray::{ArrayD, ArrayViewD, Axis, IxDyn, NdFloat, Slice, Zip, concatenate}
 use super::{Op, Unary};
 use crate::tensor::{Data, Tensor};
 
-/// The most operations that folding the constants of one entry may take. A policy's take some hundred thousands; a small model could
-/// ask for hours and for all memory.
+/// Largest number of operations that folding the constants of one entry may take. The constants of
+/// a policy take some hundred thousands; a small model could ask for hours and for all memory.
 pub(crate) const MAX_FOLDING: usize = 1 << 26;
 
-/// Numbers that nodes are evaluated with.
+/// Number type that nodes are evaluated with.
 pub(crate) trait Real: NdFloat + Sum + Product {
-    /// A number of 32 bits.
+    /// Converts a number of 32 bits.
     fn exact(x: f32) -> Self;
 
     /// Error function.
     fn erf(self) -> Self;
 
-    /// A count, or an index.
+    /// Converts a count or an index.
     fn of(whole: i64) -> Self;
 
-    /// Without its fraction.
+    /// Truncates to an integer.
     fn whole(self) -> i64;
 }
 
@@ -69,14 +70,14 @@ impl Real for f64 {
     }
 }
 
-/// The value of a node.
+/// Value of a node.
 #[derive(Debug, Clone)]
 pub(crate) enum Value<T> {
     Float(ArrayD<T>),
     Int(ArrayD<i64>),
 }
 
-/// An operand of a node.
+/// Operand of a node.
 #[derive(Debug, Clone)]
 pub(crate) enum View<'v, T> {
     Float(ArrayViewD<'v, T>),
@@ -84,7 +85,7 @@ pub(crate) enum View<'v, T> {
 }
 
 impl<T: Real> Value<T> {
-    /// A constant, in these numbers.
+    /// Converts a constant to these numbers.
     pub fn of(tensor: &Tensor) -> Option<Self> {
         Some(match View::of(tensor)? {
             View::Float(array) => Value::Float(array.mapv(T::exact)),
@@ -138,12 +139,12 @@ impl<'v, T> View<'v, T> {
     }
 }
 
-/// All operands, if they are numbers.
+/// Returns all operands, if they are floats.
 fn floats<'v, T: Clone>(x: &[View<'v, T>]) -> Option<Vec<ArrayViewD<'v, T>>> {
     x.iter().map(|x| x.float().cloned()).collect()
 }
 
-/// How many elements are read or made to evaluate a node.
+/// Returns the number of elements that are read or made to evaluate a node.
 pub(crate) fn cost(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> usize {
     let made: usize = shape.iter().product();
     let each = match op {
@@ -156,7 +157,8 @@ pub(crate) fn cost(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> usize {
     made.saturating_mul(each)
 }
 
-/// The value of a node whose operands are constants. What has bits of its own at run time, and indices, are left to it.
+/// Evaluates a node whose operands are constants. Nodes whose result has other bits at run time,
+/// and indices, are not folded.
 pub(crate) fn fold(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> Option<Tensor> {
     let left = matches!(
         op,
@@ -169,7 +171,7 @@ pub(crate) fn fold(op: &Op, x: &[Arc<Tensor>], shape: &[usize]) -> Option<Tensor
     evaluate(op, &x?, shape).map(Value::into_tensor)
 }
 
-/// The value of a node; `shape` is its shape.
+/// Evaluates a node; `shape` is its shape.
 pub(crate) fn evaluate<T: Real>(op: &Op, x: &[View<T>], shape: &[usize]) -> Option<Value<T>> {
     let float = |i: usize| x.get(i)?.float();
     let value = match op {
@@ -245,7 +247,7 @@ pub(crate) fn evaluate<T: Real>(op: &Op, x: &[View<T>], shape: &[usize]) -> Opti
     Some(Value::Float(value))
 }
 
-/// The same elements, or some of them, in another place.
+/// Moves elements, all or some of them, to other places.
 fn moved<E: Clone>(
     op: &Op,
     mut x: Vec<ArrayViewD<E>>,
@@ -313,7 +315,7 @@ fn binary<T: Real>(kind: BinaryKind, x: &[View<T>], shape: &[usize]) -> Option<V
     }
 }
 
-/// One element of a [`Unary`].
+/// Applies a [`Unary`] to one element.
 pub(crate) fn apply<T: Real>(unary: Unary, x: T) -> T {
     let (zero, one) = (T::zero(), T::one());
     let alpha = T::exact(f32::from_bits(unary.alpha));
@@ -340,7 +342,7 @@ pub(crate) fn apply<T: Real>(unary: Unary, x: T) -> T {
     }
 }
 
-/// A copy whose rows over the last axis were changed.
+/// Copies a value and changes its rows over the last axis.
 fn by_rows<T: Real>(x: &ArrayViewD<T>, change: impl Fn(&mut [T])) -> ArrayD<T> {
     let mut y = x.as_standard_layout().into_owned();
     let len = y.shape().last().copied().unwrap_or(1).max(1);
@@ -350,7 +352,7 @@ fn by_rows<T: Real>(x: &ArrayViewD<T>, change: impl Fn(&mut [T])) -> ArrayD<T> {
     y
 }
 
-/// Index of the first smallest or largest element.
+/// Returns the index of the first smallest or largest element.
 fn best<T: Real>(x: &ArrayViewD<T>, largest: bool) -> i64 {
     let mut found = (0, T::nan());
     for (i, &value) in x.iter().enumerate() {
@@ -366,7 +368,7 @@ fn best<T: Real>(x: &ArrayViewD<T>, largest: bool) -> i64 {
     found.0
 }
 
-/// Products over the last two axes, the others broadcast.
+/// Computes products over the last two axes, the others broadcast.
 fn matmul<T: Real>(a: &ArrayViewD<T>, b: &ArrayViewD<T>, shape: &[usize]) -> Option<ArrayD<T>> {
     let (batch, &[m, n]) = shape.split_last_chunk::<2>()?;
     let k = *a.shape().last()?;

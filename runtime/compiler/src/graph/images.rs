@@ -1,33 +1,34 @@
 //! Images in the graph, `[N, rows, columns, C]`, and sequences, `[N, columns, C]`: windows that move over them.
 //!
-//! Channels come last, as the kernels want them. ONNX has them second: [`channels_last`] and [`channels_first`] turn.
+//! Channels come last, as the kernels want them. ONNX has them second: [`channels_last`] and
+//! [`channels_first`] transpose.
 
 use lads_image::op::PoolKind;
 
 use super::{Dim, Graph, Id, Kind, Op, Type, Unary, show};
 use crate::tensor::{MAX_ELEMENTS, elements};
 
-/// How a window moves over an image: rows, then columns; a sequence has one row.
+/// Geometry of a window that moves over an image: rows, then columns; a sequence has one row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) struct Windows {
     pub out: [usize; 2],
     pub kernel: [usize; 2],
     pub stride: [usize; 2],
     pub dilation: [usize; 2],
-    /// Rows above, columns to the left.
+    /// Padding: rows above, columns to the left.
     pub before: [usize; 2],
-    /// Rows below, columns to the right.
+    /// Padding: rows below, columns to the right.
     pub after: [usize; 2],
 }
 
 impl Windows {
-    /// The rows and columns that come before and after the image.
+    /// Returns the padding in ONNX order: the rows and columns before, then those after the image.
     pub fn pads(&self) -> [usize; 4] {
         let ([top, left], [bottom, right]) = (self.before, self.after);
         [top, left, bottom, right]
     }
 
-    /// Padding that some window reaches.
+    /// Limits the padding to the part that some window reaches.
     pub fn reached(&self, size: [usize; 2]) -> Self {
         let axis = |i: usize| {
             let covered =
@@ -40,7 +41,8 @@ impl Windows {
         }
     }
 
-    /// The pixel of an image of this size that element `at` of the window at `out` looks at; `None` in the padding.
+    /// Returns the pixel of an image of this size that element `at` of the window at `out` reads;
+    /// `None` in the padding.
     pub fn pixel(&self, size: [usize; 2], out: [usize; 2], at: [usize; 2]) -> Option<[usize; 2]> {
         let axis = |i: usize| {
             let from_padding = out[i] * self.stride[i] + at[i] * self.dilation[i];
@@ -51,27 +53,27 @@ impl Windows {
     }
 }
 
-/// A convolution and what it took in.
+/// A convolution with the nodes fused into it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) struct ConvOp {
     pub windows: Windows,
     pub groups: usize,
-    /// Whether the padding has a pixel of its own; zeros otherwise.
+    /// True if the padding has a pixel of its own; else it is zeros.
     pub fill: bool,
     pub residual: bool,
     pub activation: Option<Unary>,
-    /// With `Relu`: nothing is larger than this, as bits.
+    /// Upper bound of the result after `Relu`, as bits.
     pub bound: Option<u32>,
 }
 
-/// ONNX' order of axes, `[N, C, ..]`, of a value with its channels last.
+/// Transposes a value with its channels last to ONNX' order of axes, `[N, C, ..]`.
 pub(crate) fn channels_first(g: &mut Graph, x: Id) -> Result<Id, String> {
     let rank = g.shape(x).len();
     let perm: Vec<usize> = [0, rank - 1].into_iter().chain(1..rank - 1).collect();
     g.transpose(x, &perm)
 }
 
-/// The channels of `[N, C, ..]` moved to the end.
+/// Transposes `[N, C, ..]` so that the channels come last.
 pub(crate) fn channels_last(g: &mut Graph, x: Id) -> Result<Id, String> {
     let rank = g.shape(x).len();
     let perm: Vec<usize> = [0].into_iter().chain(2..rank).chain([1]).collect();
@@ -79,7 +81,7 @@ pub(crate) fn channels_last(g: &mut Graph, x: Id) -> Result<Id, String> {
 }
 
 impl Graph {
-    /// The shape of windows' results: that of `x` with other rows, columns and channels.
+    /// Returns the shape of windows' results: that of `x` with other rows, columns and channels.
     fn windowed(&self, x: Id, out: [usize; 2], channels: Dim) -> Result<Vec<Dim>, String> {
         let mut shape = self.shape(x).to_vec();
         if !(3..=4).contains(&shape.len()) || self.known_shape(x).is_none() {
@@ -104,7 +106,7 @@ impl Graph {
         Ok(shape)
     }
 
-    /// See [`Op::Conv`].
+    /// Adds a convolution, [`Op::Conv`].
     pub fn conv(&mut self, conv: ConvOp, inputs: Vec<Id>) -> Result<Id, String> {
         self.floats(&inputs)?;
         let n = *self
@@ -115,7 +117,7 @@ impl Graph {
         self.fold(Op::Conv(conv), inputs, shape, Type::F32)
     }
 
-    /// See [`Op::Pool`].
+    /// Adds a pooling, [`Op::Pool`].
     pub fn pool(&mut self, kind: PoolKind, windows: Windows, x: Id) -> Result<Id, String> {
         self.floats(&[x])?;
         let channels = *self.shape(x).last().ok_or("a scalar is no image")?;
@@ -123,7 +125,7 @@ impl Graph {
         self.fold(Op::Pool(Kind(kind), windows), vec![x], shape, Type::F32)
     }
 
-    /// See [`Op::Resize`].
+    /// Adds a resize, [`Op::Resize`].
     pub fn resize(&mut self, x: Id, rows: Id, cols: Id) -> Result<Id, String> {
         self.floats(&[x, rows, cols])?;
         let len = |id: Id| {

@@ -1,10 +1,11 @@
-//! Rebuilding a graph: each pass copies the nodes that are still needed into a new graph, changing some on the way.
+//! Rebuilds a graph: each pass copies the needed nodes into a new graph, changing some on the way.
 
 use std::collections::HashMap;
 
 use super::{Graph, Id, Op};
 
-/// The nodes that the roots need, operands before users, in depth-first order. `replace` names nodes to be read instead of others.
+/// Returns the nodes that the roots need, operands before users, in depth-first order. `replace`
+/// maps nodes to others that are read instead.
 pub(crate) fn topological(graph: &Graph, roots: &[Id], replace: &HashMap<Id, Id>) -> Vec<Id> {
     enum Visit {
         Enter(Id),
@@ -61,12 +62,12 @@ impl<'g> Rewriter<'g> {
         }
     }
 
-    /// The copy of an old node.
+    /// Returns the copy of an old node.
     pub fn copy_of(&self, old: Id) -> Id {
         self.copies[&self.replace.get(&old).copied().unwrap_or(old)]
     }
 
-    /// The copies of an old node's operands.
+    /// Returns the copies of an old node's operands.
     pub fn operands(&self, old: Id) -> Vec<Id> {
         self.old
             .node(old)
@@ -76,17 +77,17 @@ impl<'g> Rewriter<'g> {
             .collect()
     }
 
-    /// Says what an old node became.
+    /// Sets the new node that replaces an old node.
     pub fn set(&mut self, old: Id, new: Id) {
         self.copies.insert(old, new);
     }
 
-    /// Says that the nodes built from now on come from where an old node came from.
+    /// Sets the origin of the nodes built from now on to that of an old node.
     pub fn at(&mut self, old: Id) {
         self.new.current = self.old.node(old).origin;
     }
 
-    /// Builds an old node again from other operands.
+    /// Rebuilds an old node with other operands.
     pub fn rebuild(&mut self, old: Id, x: &[Id]) -> Result<Id, String> {
         self.at(old);
         let node = self.old.node(old);

@@ -1,4 +1,4 @@
-//! The entries of an image with their ports and ops, and the schedule.
+//! Entries of an image with their ports and ops, and the schedule.
 
 use lads_image::op::{Op, Place};
 use lads_image::records::{CallRecord, EntryRecord, NONE, PortRecord, Repeat, Source, SourceKind};
@@ -8,7 +8,7 @@ use super::{Parts, Strings, put};
 use crate::contract::Contract;
 use crate::family::{Bound, Call, Times};
 
-/// The entries, their ports and their ops.
+/// Encoded entries, their ports and their ops.
 #[derive(Default)]
 pub(super) struct Entries {
     pub records: Vec<u32>,
@@ -95,7 +95,7 @@ fn source(
     })
 }
 
-/// The schedule, by event, and what its calls clear.
+/// Encodes the schedule, by event, and the states that its calls clear.
 pub(super) fn call_words(parts: &Parts, states: &[Used]) -> (Vec<u32>, Vec<u32>) {
     let (mut calls, mut clears) = (vec![], vec![]);
     let state = |name: &String| {

@@ -1,4 +1,4 @@
-//! The states of an image: which are used, how wide they are and where they lie.
+//! States of an image: the used ones, their widths and their places.
 
 use lads_image::op::Place;
 use lads_image::records::{Fill, Scope, StateKind, StateRecord};
@@ -15,7 +15,7 @@ pub(super) struct Used {
     pub record: StateRecord,
 }
 
-/// The states in the image's order, rings and KV caches first; those that nothing uses are left out.
+/// Returns the states in the image's order, rings and KV caches first; unused states are left out.
 pub(super) fn states(parts: &Parts, contract: &Contract, strings: &mut Strings) -> Vec<Used> {
     let (mut rows, mut plain) = (vec![], vec![]);
     let (mut row_end, mut bank_end, mut scratch_end) = (0, 0, 0);
@@ -66,13 +66,14 @@ pub(super) fn states(parts: &Parts, contract: &Contract, strings: &mut Strings) 
     rows.into_iter().chain(plain).collect()
 }
 
-/// Whether a call clears a state; its cache then has two halves.
+/// Returns whether a call clears a state; its cache then has two halves.
 fn is_cleared(parts: &Parts, name: &str) -> bool {
     let mut calls = parts.blueprint.calls.iter();
     calls.any(|call| call.clears.iter().any(|cleared| cleared == name))
 }
 
-/// Elements of a state, or words of a KV cache; `None` when no program uses it.
+/// Returns the number of elements of a state, or of words of a KV cache; `None` when no program
+/// uses it.
 fn width(parts: &Parts, contract: &Contract, of: usize) -> Option<u32> {
     let state = &parts.blueprint.states[of];
     if let Keep::Kv(_) = state.keep {
@@ -103,7 +104,7 @@ fn width(parts: &Parts, contract: &Contract, of: usize) -> Option<u32> {
     })
 }
 
-/// 4-byte words of all KV caches.
+/// Returns the number of 4-byte words of all KV caches.
 pub(crate) fn rows_len(parts: &Parts) -> usize {
     let words = |(name, cache): (&String, &Cache)| {
         let halves = if is_cleared(parts, name) { 2 } else { 1 };

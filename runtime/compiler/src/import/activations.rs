@@ -1,4 +1,4 @@
-//! Non-linearities that are more than one operation.
+//! Non-linearities that are composed of several operations.
 
 use std::f32::consts::{FRAC_1_SQRT_2, SQRT_2};
 
@@ -10,7 +10,8 @@ use super::attributes::Attributes;
 use super::operators::Outputs;
 use crate::graph::{Graph, Id, Unary};
 
-/// `x * 0.5 * (1 + erf(x / sqrt 2))`, or with the tanh approximation `0.5 x (1 + tanh(sqrt(2 / pi) (x + 0.044715 x^3)))`.
+/// Adds a GELU, `x * 0.5 * (1 + erf(x / sqrt 2))`, or with the tanh approximation
+/// `0.5 x (1 + tanh(sqrt(2 / pi) (x + 0.044715 x^3)))`.
 pub(super) fn gelu(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let x = x.get(0)?;
     let bent = match a.text("approximate")?.as_deref() {
@@ -39,20 +40,20 @@ pub(super) fn gelu(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     g.binary(BinaryKind::Mul, x, gate).map(|y| vec![y])
 }
 
-/// `x` where `x >= 0`, else `alpha * (exp(x) - 1)`.
+/// Adds an ELU: `x` where `x >= 0`, else `alpha * (exp(x) - 1)`.
 pub(super) fn elu(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let elu = Unary::with(UnaryKind::Elu, a.float("alpha", 1.0)?);
     g.unary(elu, x.get(0)?).map(|y| vec![y])
 }
 
-/// `gamma * elu(x)`
+/// Adds a SELU, `gamma * elu(x)`.
 pub(super) fn selu(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let (alpha, gamma) = (a.float("alpha", 1.673_263_2)?, a.float("gamma", 1.050_701)?);
     let bent = g.unary(Unary::with(UnaryKind::Elu, alpha), x.get(0)?)?;
     scaled(g, bent, gamma).map(|y| vec![y])
 }
 
-/// `x` where `x >= 0`, else `alpha * (exp(x / alpha) - 1)`.
+/// Adds a CELU: `x` where `x >= 0`, else `alpha * (exp(x / alpha) - 1)`.
 pub(super) fn celu(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let alpha = a.float("alpha", 1.0)?;
     let by = constant(g, alpha);
@@ -61,7 +62,7 @@ pub(super) fn celu(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     scaled(g, bent, alpha).map(|y| vec![y])
 }
 
-/// `x` where `x > alpha`, else 0.
+/// Adds a thresholded rectifier: `x` where `x > alpha`, else 0.
 pub(super) fn thresholded_relu(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let x = x.get(0)?;
     let alpha = constant(g, a.float("alpha", 1.0)?);
@@ -69,7 +70,7 @@ pub(super) fn thresholded_relu(g: &mut Graph, x: &Operands, a: &Attributes) -> O
     g.binary(BinaryKind::Keep, x, above).map(|y| vec![y])
 }
 
-/// `x` where `x >= 0`, else `slope * x`.
+/// Adds a leaky rectifier with learned slopes: `x` where `x >= 0`, else `slope * x`.
 pub(super) fn prelu(g: &mut Graph, x: &Operands) -> Outputs {
     let (x, slope) = (x.get(0)?, x.get(1)?);
     if let Some(slope) = g.constant(slope).and_then(|slope| slope.uniform()) {
@@ -84,20 +85,20 @@ pub(super) fn prelu(g: &mut Graph, x: &Operands) -> Outputs {
     g.binary(BinaryKind::Add, above, below).map(|y| vec![y])
 }
 
-/// `alpha * x + beta` between 0 and 1.
+/// Adds a hard sigmoid, `alpha * x + beta` between 0 and 1.
 pub(super) fn hard_sigmoid(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let (alpha, beta) = (a.float("alpha", 0.2)?, a.float("beta", 0.5)?);
     ramp(g, x.get(0)?, alpha, beta).map(|y| vec![y])
 }
 
-/// `x` times `x / 6 + 0.5` between 0 and 1.
+/// Adds a hard swish: `x` times `x / 6 + 0.5` between 0 and 1.
 pub(super) fn hard_swish(g: &mut Graph, x: &Operands) -> Outputs {
     let x = x.get(0)?;
     let gate = ramp(g, x, 1.0 / 6.0, 0.5)?;
     g.binary(BinaryKind::Mul, x, gate).map(|y| vec![y])
 }
 
-/// `x / (1 + |x|)`
+/// Adds a softsign, `x / (1 + |x|)`.
 pub(super) fn softsign(g: &mut Graph, x: &Operands) -> Outputs {
     let x = x.get(0)?;
     let one = constant(g, 1.0);
@@ -106,7 +107,7 @@ pub(super) fn softsign(g: &mut Graph, x: &Operands) -> Outputs {
     g.binary(BinaryKind::Div, x, below).map(|y| vec![y])
 }
 
-/// `x * sigmoid(alpha * x)`
+/// Adds a swish, `x * sigmoid(alpha * x)`.
 pub(super) fn swish(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let x = x.get(0)?;
     let inner = scaled(g, x, a.float("alpha", 1.0)?)?;

@@ -1,7 +1,7 @@
 //! Arithmetic element by element.
 //!
-//! Integers that are constants, and an index plus or minus a constant, stay integers. All others are numbers when a program runs:
-//! whole ones, exact up to 2^24.
+//! Integers that are constants, and an index plus or minus a constant, stay integers. All other
+//! integers are floats when a program runs, exact up to 2^24.
 
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ use super::operators::Outputs;
 use crate::graph::{Graph, Id, Op, Type, Unary};
 use crate::tensor::{Data, Tensor};
 
-/// A binary operator over all inputs, from the left.
+/// Adds a binary operator over all inputs, from the left.
 pub(super) fn fold(g: &mut Graph, x: &Operands, kind: BinaryKind, most: usize) -> Outputs {
     x.at_most(most)?;
     let inputs = x.all()?;
@@ -24,7 +24,7 @@ pub(super) fn fold(g: &mut Graph, x: &Operands, kind: BinaryKind, most: usize) -
     Ok(vec![y])
 }
 
-/// Two operands of either type.
+/// Adds a binary operation on two operands of either type.
 pub(super) fn binary(g: &mut Graph, kind: BinaryKind, a: Id, b: Id) -> Result<Id, String> {
     let (constant_a, constant_b) = (g.constant(a).is_some(), g.constant(b).is_some());
     let sums = matches!(kind, BinaryKind::Add | BinaryKind::Sub);
@@ -46,7 +46,7 @@ pub(super) fn binary(g: &mut Graph, kind: BinaryKind, a: Id, b: Id) -> Result<Id
     Ok(y)
 }
 
-/// A unary operator; of integers only of constants.
+/// Adds a unary operator; on integers, constants only.
 pub(super) fn unary(g: &mut Graph, kind: UnaryKind, x: Id) -> Result<Id, String> {
     let by: fn(i64) -> Option<i64> = match kind {
         UnaryKind::Neg => i64::checked_neg,
@@ -62,7 +62,7 @@ pub(super) fn unary(g: &mut Graph, kind: UnaryKind, x: Id) -> Result<Id, String>
     Ok(g.add_const(Arc::new(Tensor::i64(&shape, integers))))
 }
 
-/// Whether a number that is computed stands for an integer of the file.
+/// Returns whether a computed number stands for an integer of the file.
 fn is_whole(g: &Graph, id: Id) -> bool {
     let inputs = &g.node(id).inputs;
     match g.op(id) {
@@ -73,7 +73,7 @@ fn is_whole(g: &Graph, id: Id) -> bool {
     }
 }
 
-/// A value as a number.
+/// Converts a value to a number.
 pub(super) fn number(g: &mut Graph, id: Id) -> Result<Id, String> {
     let Some(tensor) = g.constant(id) else {
         return match g.ty(id) {
@@ -93,7 +93,7 @@ pub(super) fn constant(g: &mut Graph, value: f32) -> Id {
     g.add_const(Arc::new(Tensor::scalar(value)))
 }
 
-/// A value by itself is a square.
+/// Multiplies two values; a value times itself becomes a square.
 pub(super) fn multiply(g: &mut Graph, a: Id, b: Id) -> Result<Id, String> {
     if a == b && g.ty(a) == Type::F32 {
         g.unary(Unary::of(UnaryKind::Square), a)
@@ -123,7 +123,7 @@ pub(super) fn power(g: &mut Graph, x: &Operands) -> Outputs {
     Ok(vec![y])
 }
 
-/// Limits are attributes in operator sets before 11.
+/// Adds a clip to limits, which are attributes in operator sets before 11, inputs since.
 pub(super) fn clip(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     x.at_most(3)?;
     let (mut low, mut high) = (x.optional(1), x.optional(2));

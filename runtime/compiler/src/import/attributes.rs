@@ -1,4 +1,5 @@
-//! The attributes of a node. Each must be read: [`Attributes::all_read`] refuses the node otherwise.
+//! Attributes of a node. Each attribute must be read: [`Attributes::all_read`] refuses the node
+//! otherwise.
 
 use std::cell::RefCell;
 use std::collections::HashMap;
@@ -16,7 +17,7 @@ const FLOATS: i32 = 6;
 const INTS: i32 = 7;
 const STRINGS: i32 = 8;
 
-/// The attributes that have not been read yet.
+/// Attributes of a node that have not been read yet.
 pub(super) struct Attributes<'n>(RefCell<HashMap<&'n str, &'n AttributeProto>>);
 
 impl<'n> Attributes<'n> {

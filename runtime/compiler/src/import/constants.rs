@@ -1,4 +1,4 @@
-//! Constants, and numbers of one type as another.
+//! Constants, and conversions between number types.
 
 use std::sync::Arc;
 
@@ -15,8 +15,8 @@ use crate::graph::{Dim, Graph, Id, Type, Unary};
 use crate::onnx::data_type;
 use crate::tensor::{Data, MAX_ELEMENTS, Tensor};
 
-/// Numbers of fewer bits are rounded where they are constants; what is computed keeps 32 bits. Of two types of integers none is
-/// narrower than what a policy counts.
+/// Converts to another type: constants are rounded to fewer bits; computed values keep 32 bits. All
+/// integer types are wide enough for what a policy counts.
 pub(super) fn cast(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     use data_type::{
         BFLOAT16, BOOL, DOUBLE, FLOAT, FLOAT16, INT8, INT16, INT32, INT64, UINT8, UINT16, UINT32,
@@ -77,7 +77,7 @@ fn rounded(g: &mut Graph, x: Id, round: impl Fn(f32) -> f32) -> Outputs {
     Ok(vec![g.add_const(Arc::new(tensor))])
 }
 
-/// `start, start + delta, ..` below `limit`.
+/// Makes the constant `start, start + delta, ..` below `limit`.
 pub(super) fn range(g: &mut Graph, x: &Operands) -> Outputs {
     let mut ends = vec![];
     for i in 0..3 {
@@ -116,7 +116,7 @@ pub(super) fn range(g: &mut Graph, x: &Operands) -> Outputs {
     Ok(vec![g.add_const(Arc::new(tensor))])
 }
 
-/// Ones on a diagonal of a matrix of the input's shape.
+/// Makes a matrix of the input's shape with ones on a diagonal.
 pub(super) fn eye_like(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let shape = g.known_shape(x.get(0)?).unwrap_or_default();
     let &[rows, cols] = &shape[..] else {

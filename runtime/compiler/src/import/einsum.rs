@@ -76,7 +76,7 @@ pub(super) fn einsum(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     turned(g, &sum, &output).map(|y| vec![y])
 }
 
-/// The term without the axes that nobody needs.
+/// Sums a term over the axes that are no longer needed.
 fn summed(g: &mut Graph, term: Term, needed: impl Fn(&char) -> bool) -> Result<Term, String> {
     let Term { mut id, mut axes } = term;
     for i in (0..axes.len()).rev() {
@@ -88,7 +88,7 @@ fn summed(g: &mut Graph, term: Term, needed: impl Fn(&char) -> bool) -> Result<T
     Ok(Term { id, axes })
 }
 
-/// The term with its axes in another order.
+/// Transposes a term to another order of axes.
 fn turned(g: &mut Graph, term: &Term, axes: &[char]) -> Result<Id, String> {
     let perm = axes
         .iter()
@@ -97,7 +97,7 @@ fn turned(g: &mut Graph, term: &Term, axes: &[char]) -> Result<Id, String> {
     g.transpose(term.id, &perm.ok_or("loses an axis")?)
 }
 
-/// Two terms as one product of matrices: `[both, left, inner]` by `[both, inner, right]`.
+/// Multiplies two terms as matrices: `[both, left, inner]` by `[both, inner, right]`.
 fn product(
     g: &mut Graph,
     a: Term,

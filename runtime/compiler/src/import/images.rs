@@ -1,5 +1,6 @@
-//! Operators on images `[N, C, rows, columns]` and sequences `[N, C, columns]`. In the graph channels come last, so each turns its
-//! input and its result; turns that meet cancel out, and [`fuse`](crate::fuse) moves the others out of the way.
+//! Imports operators on images `[N, C, rows, columns]` and sequences `[N, C, columns]`. In the
+//! graph channels come last, so each operator transposes its input and its result; adjacent
+//! transposes cancel out, and [`fuse`](crate::fuse) moves the others out of the way.
 
 use std::sync::Arc;
 
@@ -12,10 +13,10 @@ use super::{resize, shapes};
 use crate::graph::{ConvOp, Dim, Graph, Id, Windows, channels_first, channels_last, show};
 use crate::tensor::Tensor;
 
-/// The longest side of an image, and the largest number that says how a window moves.
+/// Longest side of an image, and largest number in the geometry of a window.
 pub(super) const MAX_SIDE: usize = u16::MAX as usize;
 
-/// The most images of a node, times its groups: each is an operation of its own.
+/// Largest number of images of a node, times its groups: each is an operation of its own.
 const MAX_PARTS: usize = 1 << 12;
 
 /// Adds a node's operations to the graph.
@@ -42,7 +43,7 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
     }
 }
 
-/// Number of images, channels, and the one or two sides.
+/// Returns the number of images, the channels, and the one or two sides.
 pub(super) fn sides(g: &Graph, x: Id) -> Result<Vec<usize>, String> {
     let shape = g.known_shape(x).filter(|shape| {
         (3..=4).contains(&shape.len())
@@ -57,7 +58,7 @@ pub(super) fn sides(g: &Graph, x: Id) -> Result<Vec<usize>, String> {
     })
 }
 
-/// One number for each side, of an attribute.
+/// Reads an attribute with one number for each side.
 fn numbers(
     a: &Attributes,
     name: &str,
@@ -81,7 +82,8 @@ fn numbers(
     })
 }
 
-/// The windows of a convolution or a pool, by the attributes that they share. `round_up` lets the last window reach beyond the padding.
+/// Reads the windows of a convolution or a pool from the attributes that they share. `round_up`
+/// lets the last window reach beyond the padding.
 fn windows(
     a: &Attributes,
     sides: &[usize],
@@ -150,7 +152,7 @@ fn windows(
     })
 }
 
-/// `X, W [M, C / group, ..], B [M]`
+/// Adds a convolution of `X, W [M, C / group, ..], B [M]`.
 fn conv(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let (image, weights) = (x.get(0)?, x.get(1)?);
     let sides = sides(g, image)?;
@@ -235,7 +237,7 @@ fn pool(g: &mut Graph, x: &Operands, a: &Attributes, kind: PoolKind) -> Outputs 
     channels_first(g, y).map(|y| vec![y])
 }
 
-/// One window over the whole image.
+/// Adds a pool with one window over the whole image.
 fn whole(g: &mut Graph, x: &Operands, kind: PoolKind) -> Outputs {
     let image = x.get(0)?;
     let kernel = match *sides(g, image)? {

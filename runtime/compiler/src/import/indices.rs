@@ -1,4 +1,4 @@
-//! Parts of values: slices, splits, and what is picked by an index.
+//! Imports operators that take parts of values: slices, splits, and gathers by an index.
 
 use super::Operands;
 use super::attributes::Attributes;
@@ -39,7 +39,7 @@ pub(super) fn split(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     Ok(parts)
 }
 
-/// Attributes in operator sets before 10, inputs since.
+/// Adds a slice, whose parameters are attributes in operator sets before 10, inputs since.
 pub(super) fn slice(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> {
     let mut value = x.get(0)?;
     let (starts, ends, axes, steps);
@@ -81,7 +81,7 @@ pub(super) fn slice(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, S
     Ok(value)
 }
 
-/// Every `step`th element of an axis, backwards if it is negative.
+/// Takes every `step`th element of an axis, backwards if `step` is negative.
 fn stepped(
     g: &mut Graph,
     value: Id,
@@ -102,10 +102,10 @@ fn stepped(
     rows(g, value, along, &picked)
 }
 
-/// The most rows that are picked one by one.
+/// Largest number of rows that are picked one by one.
 pub(super) const MAX_PICKED: usize = 1024;
 
-/// Rows of an axis, in any order.
+/// Takes rows of an axis, in any order.
 fn rows(g: &mut Graph, value: Id, along: usize, rows: &[usize]) -> Result<Id, String> {
     if rows.is_empty() || rows.len() > MAX_PICKED {
         return Err(format!(
@@ -156,7 +156,8 @@ pub(super) fn gather(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, 
     g.reshape(picked, &shape)
 }
 
-/// Rows by all indices of a row of `indices` at once: constants, or one that is computed of the first axis.
+/// Adds a gather of rows by all indices of a row of `indices` at once: constants, or one computed
+/// index of the first axis.
 pub(super) fn gather_nd(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> {
     a.only("batch_dims", 0)?;
     let (value, index) = (x.get(0)?, x.get(1)?);

@@ -1,4 +1,4 @@
-//! Products, and what makes scores a distribution.
+//! Imports matrix products and softmax.
 
 use lads_image::op::{BinaryKind, ReduceKind, UnaryKind};
 
@@ -8,7 +8,7 @@ use super::operators::Outputs;
 use super::{Operands, shapes};
 use crate::graph::{Dim, Graph, Id, Unary};
 
-/// `alpha * A·B + beta * C`
+/// Adds a general matrix product, `alpha * A·B + beta * C`.
 pub(super) fn gemm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let turn = |g: &mut Graph, id: Id, flag: bool| {
         if flag {
@@ -43,7 +43,7 @@ pub(super) fn gemm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     Ok(vec![y])
 }
 
-/// A vector is a row on the left, a column on the right.
+/// Adds a matrix product; a vector is a row on the left, a column on the right.
 pub(super) fn matmul(g: &mut Graph, x: &Operands) -> Outputs {
     let (a, b) = (x.get(0)?, x.get(1)?);
     let (from_a, from_b) = (g.shape(a).to_vec(), g.shape(b).to_vec());
@@ -67,7 +67,7 @@ pub(super) fn matmul(g: &mut Graph, x: &Operands) -> Outputs {
     g.reshape(y, &shape).map(|y| vec![y])
 }
 
-/// Along an axis; in operator sets before 13 over all axes from one on, as one.
+/// Normalises along an axis; in operator sets before 13 over all axes from one on, flattened.
 fn distribution(
     g: &mut Graph,
     x: &Operands,
@@ -91,7 +91,7 @@ pub(super) fn softmax(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     distribution(g, x, a, Graph::softmax)
 }
 
-/// `x - max - log(sum(exp(x - max)))`
+/// Adds a log-softmax, `x - max - log(sum(exp(x - max)))`.
 pub(super) fn log_softmax(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     distribution(g, x, a, |g, x, axis| {
         let mut kept = g.shape(x).to_vec();

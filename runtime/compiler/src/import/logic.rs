@@ -1,4 +1,4 @@
-//! Conditions: numbers that are 1 where they hold, else 0, and what they select.
+//! Imports conditions, which are numbers that are 1 if true, else 0, and selections by them.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use super::operators::Outputs;
 use crate::graph::{Dim, Graph, Id, Unary};
 use crate::tensor::{Data, Tensor};
 
-/// How two values are compared.
+/// Comparison of two values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Comparison {
     Equal,
@@ -20,7 +20,7 @@ pub(super) enum Comparison {
     LessOrEqual,
 }
 
-/// A comparison. Of what is not a number, all but `Greater` and `Less` hold.
+/// Adds a comparison. For NaN, all but `Greater` and `Less` are true.
 pub(super) fn compare(g: &mut Graph, x: &Operands, how: Comparison) -> Outputs {
     let (a, b) = (x.get(0)?, x.get(1)?);
     let mut greater = |a: Id, b: Id| -> Result<Id, String> {
@@ -47,7 +47,7 @@ pub(super) fn compare(g: &mut Graph, x: &Operands, how: Comparison) -> Outputs {
     Ok(vec![y])
 }
 
-/// `1 - x`
+/// Negates a condition, `1 - x`.
 fn negated(g: &mut Graph, x: Id) -> Result<Id, String> {
     let one = constant(g, 1.0);
     g.binary(BinaryKind::Sub, one, x)
@@ -57,7 +57,7 @@ pub(super) fn not(g: &mut Graph, x: &Operands) -> Outputs {
     negated(g, x.get(0)?).map(|y| vec![y])
 }
 
-/// Of two conditions.
+/// Combines two conditions by a binary operation.
 pub(super) fn both(g: &mut Graph, x: &Operands, kind: BinaryKind) -> Outputs {
     g.binary(kind, x.get(0)?, x.get(1)?).map(|y| vec![y])
 }
@@ -68,7 +68,7 @@ pub(super) fn either(g: &mut Graph, x: &Operands) -> Outputs {
         .map(|y| vec![y])
 }
 
-/// Whether a number is not zero.
+/// Tests whether a number is not zero.
 pub(super) fn is_set(g: &mut Graph, x: Id) -> Result<Id, String> {
     let zero = constant(g, 0.0);
     let more = g.binary(BinaryKind::Greater, x, zero)?;
@@ -76,7 +76,7 @@ pub(super) fn is_set(g: &mut Graph, x: Id) -> Result<Id, String> {
     g.binary(BinaryKind::Add, more, less)
 }
 
-/// The second input where the first holds, else the third.
+/// Selects the second input where the first is true, else the third.
 pub(super) fn select(g: &mut Graph, x: &Operands) -> Outputs {
     let (condition, a, b) = (x.get(0)?, x.get(1)?, x.get(2)?);
     let mut shape = g.shape(condition).to_vec();
@@ -105,7 +105,7 @@ pub(super) fn select(g: &mut Graph, x: &Operands) -> Outputs {
     g.expand(y, &shape).map(|y| vec![y])
 }
 
-/// Of constants a constant, integers too.
+/// Selects among constants, integers too, which gives a constant.
 fn selected(
     g: &mut Graph,
     condition: Id,

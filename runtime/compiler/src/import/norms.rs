@@ -1,4 +1,4 @@
-//! Normalisations.
+//! Imports normalisations.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use super::{Operands, shapes};
 use crate::graph::{Dim, Graph, Id, Unary, show};
 use crate::tensor::Tensor;
 
-/// Over all axes from one on.
+/// Adds a layer norm over all axes from one on.
 pub(super) fn layer_norm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let value = x.get(0)?;
     let eps = a.float("epsilon", 1e-5)?;
@@ -36,7 +36,7 @@ pub(super) fn layer_norm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs
     g.reshape(y, &shape).map(|y| vec![y])
 }
 
-/// `x / sqrt(mean(x^2) + eps) * scale` over all axes from one on.
+/// Adds an RMS norm, `x / sqrt(mean(x^2) + eps) * scale`, over all axes from one on.
 pub(super) fn rms_norm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let value = x.get(0)?;
     let eps = constant(g, a.float("epsilon", 1e-5)?);
@@ -55,7 +55,8 @@ pub(super) fn rms_norm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     g.binary(BinaryKind::Mul, y, x.get(1)?).map(|y| vec![y])
 }
 
-/// Each group of channels of each sample by itself; a scale for each channel, or for each group in operator sets before 21.
+/// Adds a group norm, each group of channels of each sample by itself; with a scale for each
+/// channel, or for each group in operator sets before 21.
 pub(super) fn group_norm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     a.only("stash_type", 1)?;
     let groups = a.int("num_groups", 0)?;
@@ -69,7 +70,7 @@ pub(super) fn group_norm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs
     by_groups(g, x, groups, each, eps)
 }
 
-/// Each channel of each sample by itself.
+/// Adds an instance norm, each channel of each sample by itself.
 pub(super) fn instance_norm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let channels = channels(g, x.get(0)?)?;
     by_groups(g, x, channels, 1, a.float("epsilon", 1e-5)?)
@@ -109,7 +110,8 @@ fn by_groups(g: &mut Graph, x: &Operands, groups: usize, each: usize, eps: f32) 
     g.binary(BinaryKind::Add, y, bias).map(|y| vec![y])
 }
 
-/// `(x - mean) / sqrt(var + eps) * scale + bias` over axis 1, with constants: a scale and a shift.
+/// Adds a batch norm, `(x - mean) / sqrt(var + eps) * scale + bias` over axis 1, with constants: a
+/// scale and a shift.
 pub(super) fn batch_norm(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     a.only("training_mode", 0)?;
     a.float("momentum", 0.9)?;

@@ -1,5 +1,5 @@
-//! What each ONNX operator becomes: the table of those that compute. Those on images are in [`images`](super::images), those that move
-//! elements in [`shapes`](super::shapes).
+//! Translates ONNX operators that compute: the table of operators. Operators on images are in
+//! [`images`](super::images), operators that move elements in [`shapes`](super::shapes).
 
 use lads_image::op::{BinaryKind, ReduceKind, UnaryKind};
 
@@ -16,7 +16,7 @@ use super::reductions::{arg, reduce};
 use super::{Operands, arithmetic, images, recurrent};
 use crate::graph::{Graph, Id, Op, Unary};
 
-/// Values that a node gives.
+/// Values that a node outputs.
 pub(super) type Outputs = Result<Vec<Id>, String>;
 
 /// Adds a node's operations to the graph.

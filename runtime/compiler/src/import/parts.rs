@@ -1,4 +1,4 @@
-//! Values put together from parts: padded, repeated, overwritten in places.
+//! Imports operators that assemble values from parts: padding, tiling, scattering.
 
 use super::Operands;
 use super::arithmetic::{constant, number};
@@ -7,7 +7,7 @@ use super::indices::MAX_PICKED;
 use super::shapes::{axis, integers, wanted, within};
 use crate::graph::{Dim, Graph, Id, Type};
 
-/// Attributes in operator sets before 11, inputs since.
+/// Adds padding, whose parameters are attributes in operator sets before 11, inputs since.
 pub(super) fn pad(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> {
     let mode = a.text("mode")?;
     if mode.as_deref().is_some_and(|mode| mode != "constant") {
@@ -57,7 +57,7 @@ pub(super) fn pad(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, Str
     Ok(value)
 }
 
-/// The value so many times along each axis.
+/// Repeats the value along each axis.
 pub(super) fn tile(g: &mut Graph, x: &Operands) -> Result<Id, String> {
     let mut value = x.get(0)?;
     let repeats = wanted(g, x.get(1)?)?;
@@ -76,7 +76,7 @@ pub(super) fn tile(g: &mut Graph, x: &Operands) -> Result<Id, String> {
     Ok(value)
 }
 
-/// Data with the updates in the place of what constant indices name.
+/// Replaces elements of the data at constant indices by the updates.
 pub(super) fn scatter(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> {
     if a.text("reduction")?.is_some_and(|how| how != "none") {
         return Err("supports no reduction".into());

@@ -1,4 +1,5 @@
-//! LSTM and GRU, unrolled: the number of steps is static, so every step becomes operations of its own.
+//! Imports LSTM and GRU, unrolled: the number of steps is static, so every step becomes operations
+//! of its own.
 //!
 //! LSTM, with the gates in ONNX' order i, o, f, c (Hochreiter & Schmidhuber 1997, with forget gates):
 //! `g = x_t·W^T + h·R^T + Wb + Rb`, `c = sigmoid(g_f) * c + sigmoid(g_i) * tanh(g_c)`, `h = sigmoid(g_o) * tanh(c)`.
@@ -16,15 +17,15 @@ use super::attributes::Attributes;
 use super::operators::Outputs;
 use crate::graph::{Dim, Graph, Id, Unary};
 
-/// The most steps that are unrolled.
+/// Largest number of steps that are unrolled.
 const MAX_STEPS: usize = 512;
 
-/// Which network.
+/// Kind of recurrent network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Lstm,
     Gru {
-        /// Whether the hidden state is multiplied by its weights before the reset gate is applied.
+        /// True if the hidden state is multiplied by its weights before the reset gate is applied.
         linear_before_reset: bool,
     },
 }
@@ -37,7 +38,7 @@ impl Kind {
         }
     }
 
-    /// The standard non-linearities, in ONNX' order.
+    /// Returns the standard non-linearities, in ONNX' order.
     fn activations(self) -> &'static [&'static str] {
         match self {
             Self::Lstm => &["sigmoid", "tanh", "tanh"],
@@ -50,16 +51,17 @@ impl Kind {
 struct Cell {
     kind: Kind,
     input: Id,
-    /// All gates of an LSTM; of a GRU z and r, then h.
+    /// Recurrent weights: all gates of an LSTM; z and r, then h, of a GRU.
     recurrent: Vec<Id>,
-    /// Added to the input's share.
+    /// Bias that is added to the input's share.
     bias: Option<Id>,
-    /// Added to the hidden state's shares, where it is not part of `bias`; empty for none.
+    /// Biases that are added to the hidden state's shares, if not part of `bias`; else empty.
     recurrent_bias: Vec<Id>,
     hidden: usize,
 }
 
-/// What one direction gives: `h` of every step in time order, and the last `h` and `c`. All `[batch, hidden]`.
+/// Results of one direction: `h` of every step in time order, and the last `h` and `c`. All have
+/// the shape `[batch, hidden]`.
 struct Run {
     all: Vec<Id>,
     h: Id,
@@ -139,7 +141,7 @@ fn unrolled(g: &mut Graph, x: &Operands, a: &Attributes, kind: Kind) -> Outputs 
     outputs(g, &runs, steps, batch_first)
 }
 
-/// Refuses what the unrolled form does not compute.
+/// Refuses variants that the unrolled form does not compute.
 fn check(x: &Operands, a: &Attributes, kind: Kind) -> Result<(), String> {
     if x.optional(4).is_some() {
         return Err("does not support sequence_lens".into());
@@ -260,7 +262,7 @@ fn run(
     Ok(Run { all, h, c })
 }
 
-/// One step of an LSTM from the input's share of the gates: the new `h` and `c`.
+/// Computes one step of an LSTM from the input's share of the gates: the new `h` and `c`.
 fn lstm_step(
     g: &mut Graph,
     cell: &Cell,
@@ -292,7 +294,7 @@ fn lstm_step(
     Ok((g.binary(BinaryKind::Mul, o, bent)?, next))
 }
 
-/// One step of a GRU from the input's share of the gates: the new `h`.
+/// Computes one step of a GRU from the input's share of the gates: the new `h`.
 fn gru_step(
     g: &mut Graph,
     cell: &Cell,
@@ -349,7 +351,8 @@ fn gru_step(
     g.binary(BinaryKind::Sub, candidate, lost)
 }
 
-/// `Y [steps, directions, batch, hidden]`, `Y_h` and `Y_c [directions, batch, hidden]`; with `layout` 1 the batch comes first.
+/// Assembles `Y [steps, directions, batch, hidden]`, `Y_h` and `Y_c [directions, batch, hidden]`;
+/// with `layout` 1 the batch comes first.
 fn outputs(g: &mut Graph, runs: &[Run], steps: usize, batch_first: bool) -> Outputs {
     let last = |g: &mut Graph, pick: fn(&Run) -> Id| -> Result<Id, String> {
         let parts = runs
@@ -382,7 +385,7 @@ fn outputs(g: &mut Graph, runs: &[Run], steps: usize, batch_first: bool) -> Outp
     Ok(vec![y, h, c])
 }
 
-/// An axis of length one in front.
+/// Adds an axis of length one in front.
 fn lead(g: &mut Graph, x: Id) -> Result<Id, String> {
     let shape = [&[Dim::of(1)], g.shape(x)].concat();
     g.reshape(x, &shape)

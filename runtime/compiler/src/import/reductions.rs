@@ -1,4 +1,4 @@
-//! Reductions over axes.
+//! Imports reductions over axes.
 
 use lads_image::op::{ReduceKind, UnaryKind};
 
@@ -7,7 +7,7 @@ use super::operators::Outputs;
 use super::{Operands, shapes};
 use crate::graph::{Dim, Graph, Op, Unary};
 
-/// Over the axes of an attribute or an input, or all of them.
+/// Adds a reduction over the axes of an attribute or an input, or over all of them.
 pub(super) fn reduce(
     g: &mut Graph,
     x: &Operands,
@@ -46,7 +46,7 @@ pub(super) fn reduce(
     Ok(vec![y])
 }
 
-/// Index along an axis, of one row.
+/// Adds the index of the smallest or largest element along an axis, of one row.
 pub(super) fn arg(g: &mut Graph, x: &Operands, a: &Attributes, op: Op) -> Outputs {
     let value = x.get(0)?;
     a.only("select_last_index", 0)?;

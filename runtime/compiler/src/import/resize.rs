@@ -1,4 +1,5 @@
-//! ONNX' `Resize`, nearest and linear, of images and sequences of known size: tables of which pixels are mixed.
+//! Imports ONNX' `Resize`, nearest and linear, of images and sequences of known size, as tables of
+//! the pixels to mix.
 
 use std::sync::Arc;
 
@@ -9,15 +10,15 @@ use super::{Operands, shapes};
 use crate::graph::{Graph, Id, channels_first, channels_last};
 use crate::tensor::Tensor;
 
-/// How an output's place becomes one of the input, by ONNX' names.
+/// Mapping from an output coordinate to an input coordinate, by ONNX' names.
 struct Places {
     mode: String,
     nearest: Option<String>,
 }
 
 impl Places {
-    /// The place of output `i` in an input of `from` elements, of which `to` are made; `scale` is a quotient, so that a place that is a
-    /// whole number is one.
+    /// Returns the coordinate of output `i` in an input of `from` elements, of which `to` are made;
+    /// `scale` is a quotient, so that whole coordinates are exact.
     fn of(&self, i: usize, from: usize, to: usize, scale: [f64; 2]) -> Result<f64, String> {
         let (at, from, to) = (i as f64, from as f64, to as f64);
         let [over, under] = scale;
@@ -46,7 +47,8 @@ impl Places {
         })
     }
 
-    /// First input, second input and weight of the second, for each of `to` outputs.
+    /// Makes the table of first input, second input and weight of the second, for each of `to`
+    /// outputs.
     fn table(&self, from: usize, to: usize, scale: [f64; 2]) -> Result<Tensor, String> {
         let last = (from - 1) as f64;
         let mut table = vec![];
@@ -79,7 +81,8 @@ impl Places {
     }
 }
 
-/// `X, roi, scales, sizes`, of images; batch and channels keep their length.
+/// Adds a resize of images, with inputs `X, roi, scales, sizes`; batch and channels keep their
+/// length.
 pub(super) fn resize(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let image = x.get(0)?;
     sides(g, image)?;

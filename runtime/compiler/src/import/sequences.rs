@@ -1,4 +1,5 @@
-//! Sequences of values: lists that are known when a policy is compiled, so that nothing of them is left in a program.
+//! Imports sequences of values: lists that are known at compile time, so that a program contains
+//! none.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -9,16 +10,16 @@ use crate::graph::{Dim, Graph, Id};
 use crate::onnx::NodeProto;
 use crate::tensor::Tensor;
 
-/// The most values of a sequence.
+/// Largest number of values of a sequence.
 const MAX_LEN: usize = 1024;
 
-/// What a node of a sequence gives.
+/// Result of a node that reads or writes a sequence.
 pub(super) enum Given {
     Value(Id),
     Sequence(Vec<Id>),
 }
 
-/// Whether an operator reads or gives a sequence.
+/// Returns whether an operator reads or writes a sequence.
 pub(super) fn is_known(operator: &str) -> bool {
     matches!(
         operator,
@@ -32,7 +33,8 @@ pub(super) fn is_known(operator: &str) -> bool {
     )
 }
 
-/// Adds a node of a sequence. `inputs` are the values that it reads, sequences left out.
+/// Adds a node that reads or writes a sequence. `inputs` are the values that it reads, sequences
+/// left out.
 pub(super) fn translate(
     g: &mut Graph,
     node: &NodeProto,

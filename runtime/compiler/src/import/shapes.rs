@@ -1,4 +1,5 @@
-//! Operators that move elements or name shapes and indices: what they become is a view wherever that is possible.
+//! Imports operators that move elements or name shapes and indices, as views wherever that is
+//! possible.
 
 use std::sync::Arc;
 
@@ -11,7 +12,7 @@ use super::parts::{pad, scatter, tile};
 use crate::graph::{Dim, Graph, Id, show};
 use crate::tensor::Tensor;
 
-/// What is said of an operator that is not known.
+/// Message for an unknown operator.
 pub(super) const UNKNOWN: &str =
     "is not supported; export the graph with operators that the compiler's documentation lists";
 
@@ -98,7 +99,7 @@ pub(super) fn translate(g: &mut Graph, operator: &str, x: &Operands, a: &Attribu
     }
 }
 
-/// An axis that may count from the end.
+/// Resolves an axis that may count from the end.
 pub(super) fn axis(g: &Graph, x: Id, axis: i64) -> Result<usize, String> {
     within(axis, g.shape(x).len())
         .ok_or_else(|| format!("names axis {axis} of {}", show(g.shape(x))))
@@ -113,7 +114,7 @@ pub(super) fn within(axis: i64, rank: usize) -> Option<usize> {
     usize::try_from(axis).ok().filter(|&axis| axis < rank)
 }
 
-/// The number of elements.
+/// Returns the number of elements.
 pub(super) fn volume(dims: &[Dim]) -> Result<Dim, String> {
     let mut lens = dims.iter().map(|dim| dim.known());
     lens.try_fold(1_usize, |all, len| all.checked_mul(len?))
@@ -121,7 +122,7 @@ pub(super) fn volume(dims: &[Dim]) -> Result<Dim, String> {
         .ok_or_else(|| "supports static shapes only".into())
 }
 
-/// Constant integers, if the input is there.
+/// Returns constant integers, if the input is given.
 pub(super) fn integers(g: &Graph, id: Option<Id>) -> Result<Option<Vec<i64>>, String> {
     id.map(|id| wanted(g, id)).transpose()
 }
@@ -188,7 +189,7 @@ fn flatten(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id, String> {
     g.reshape(value, &shape)
 }
 
-/// Axes from an attribute (operator sets before 13) or from input 1.
+/// Reads axes from an attribute (operator sets before 13) or from input 1.
 fn axes(g: &Graph, x: &Operands, a: &Attributes) -> Result<Option<Vec<i64>>, String> {
     match a.ints("axes")? {
         Some(axes) => Ok(Some(axes.to_vec())),

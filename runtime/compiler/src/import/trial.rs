@@ -1,7 +1,9 @@
-//! Tries every node of a graph, also those behind one that was refused: what the compiler does not take of it, all at once.
+//! Tries every node of a graph, also those after a refused one, to list everything that the
+//! compiler does not support at once.
 //!
-//! Behind a refused node, a value has the type and shape that the file declares for it; where it declares none, the nodes that read it
-//! are only asked for operators that are not known. Nothing is compiled.
+//! After a refused node, a value has the type and shape that the file declares for it; if it
+//! declares none, the nodes that read it are only checked for unknown operators. Nothing is
+//! compiled.
 
 use std::collections::{BTreeSet, HashMap, HashSet};
 
@@ -11,12 +13,12 @@ use crate::entries;
 use crate::graph::{Dim, Graph, Type, show};
 use crate::onnx::{GraphProto, NodeProto};
 
-/// A node that the compiler does not take.
+/// A node that the compiler does not support.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Refused {
     pub operator: String,
     pub node: String,
-    /// Name and shape of what it reads; `?` for a shape that is not known.
+    /// Name and shape of each operand; `?` for a shape that is not known.
     pub inputs: Vec<(String, String)>,
     pub problem: String,
 }
@@ -24,7 +26,8 @@ pub(crate) struct Refused {
 /// Types and shapes that a file declares.
 pub(crate) type Declared<'d> = HashMap<&'d str, (Type, Vec<Dim>)>;
 
-/// Tries all nodes that the graph's outputs need. Values of entries are tried entry by entry, as they are compiled.
+/// Tries all nodes that the graph's outputs need, and returns those that are refused. Values of
+/// entries are tried entry by entry, as they are compiled.
 pub(crate) fn trial(graph: &GraphProto, opset: i64, declared: &Declared) -> Vec<Refused> {
     let model = Model::of(graph, opset);
     let order: HashMap<*const NodeProto, usize> = (graph.node.iter().enumerate())
@@ -61,7 +64,7 @@ pub(crate) fn trial(graph: &GraphProto, opset: i64, declared: &Declared) -> Vec<
 struct Attempt<'b, 'm> {
     builder: Builder<'b, 'm>,
     declared: &'b Declared<'b>,
-    /// Values of which nothing is known.
+    /// Values of unknown type and shape.
     unknown: HashSet<String>,
 }
 
@@ -85,7 +88,7 @@ impl<'b, 'm> Attempt<'b, 'm> {
         attempt
     }
 
-    /// Takes a value as it is declared.
+    /// Assumes that a value has its declared type and shape.
     fn assume(&mut self, name: &str) {
         match self.declared.get(name) {
             Some((ty, shape)) => {
@@ -98,7 +101,7 @@ impl<'b, 'm> Attempt<'b, 'm> {
         }
     }
 
-    /// Builds a node, or says what is wrong with it.
+    /// Builds a node, or returns its fault.
     fn node(&mut self, node: &NodeProto) -> Option<String> {
         let problem = if node.input.iter().any(|name| self.unknown.contains(name)) {
             unknown(node)
@@ -135,7 +138,7 @@ impl<'b, 'm> Attempt<'b, 'm> {
     }
 }
 
-/// What is wrong with a node whatever it reads: an operator that is not known.
+/// Returns the fault of a node whatever its operands: an unknown operator.
 fn unknown(node: &NodeProto) -> Option<String> {
     if let Some(problem) = super::foreign(node) {
         return Some(problem);

@@ -1,4 +1,4 @@
-//! Attention over the cache, and appending to it.
+//! Lowers attention over the cache, and appending to it.
 
 use lads_image::op::{Attention, Span};
 use lads_kernels::attention_scratch_len;
@@ -7,14 +7,14 @@ use super::Lowering;
 use super::compute::{Done, product};
 use crate::graph::Id;
 
-/// A row-wise view: first element, elements from one row to the next, and all it spans.
+/// A row-wise view: first element, elements from one row to the next, and the whole span.
 struct Rows {
     span: Span,
     stride: u32,
 }
 
 impl Lowering<'_, '_> {
-    /// Rows of a matrix, each contiguous.
+    /// Returns the rows of a matrix, each contiguous.
     fn rows(&mut self, id: Id) -> Result<Rows, String> {
         let shape = self.shape(id)?;
         let view = self.view(id)?;
@@ -62,7 +62,7 @@ impl Lowering<'_, '_> {
         Ok(())
     }
 
-    /// Only appends to the cache.
+    /// Appends to the cache without attending.
     pub(super) fn record(&mut self, k: Id, v: Id, layer: usize) -> Done {
         let tokens = self.shape(k)?[0];
         let (k, v) = (self.rows(k)?, self.rows(v)?);

@@ -1,4 +1,4 @@
-//! The op or view of each kind of node.
+//! Lowers each kind of node to an op or a view.
 
 use lads_image::op::{
     self, Activation, ArgMax, ArgMin, Binary, BinaryKind, Copy, FromIndex, GatherRow, LayerNorm,
@@ -17,7 +17,7 @@ pub(super) fn product(shape: &[usize]) -> usize {
 }
 
 impl Lowering<'_, '_> {
-    /// Lowers one node; its operands are lowered.
+    /// Lowers one node, whose operands are already lowered.
     pub(super) fn node(&mut self, id: Id) -> Done {
         let computed = matches!(self.g.op(id), Op::ArgMin | Op::ArgMax | Op::ToIndex);
         if self.g.ty(id) == Type::I64 && !computed {
@@ -78,7 +78,7 @@ impl Lowering<'_, '_> {
         }
     }
 
-    /// Integers are slots and what is added to them.
+    /// Lowers an integer, which is a slot and a number that is added to it.
     fn integer(&mut self, id: Id) -> Done {
         let node = self.g.node(id);
         let known = |input: Id| self.ints.get(&input).copied();
@@ -154,7 +154,8 @@ impl Lowering<'_, '_> {
         Ok(())
     }
 
-    /// The place of an elementwise result: the operand's own if nobody else reads it, else a new one.
+    /// Returns the place of an elementwise result: the operand's own if it has no other reader,
+    /// else a new one.
     fn in_place(&mut self, id: Id, operands: &[Id]) -> Result<View, String> {
         let shape = self.shape(id)?;
         if !self.placed.contains_key(&id) {
@@ -286,7 +287,7 @@ impl Lowering<'_, '_> {
         Ok(())
     }
 
-    /// A constant in the weights.
+    /// Stores a constant in the weights.
     pub(super) fn plain(&mut self, id: Id) -> Result<WeightSpan, String> {
         let tensor = self
             .g
@@ -433,7 +434,8 @@ impl Lowering<'_, '_> {
         Ok(())
     }
 
-    /// Where a layer is added to: the residual itself if nobody else reads it, else a copy.
+    /// Returns the place that a layer is added to: the residual itself if it has no other reader,
+    /// else a copy.
     fn accumulator(&mut self, id: Id, x: Id, residual: Id) -> Result<View, String> {
         let shape = self.shape(id)?;
         let view = self.view(residual)?;

@@ -1,7 +1,8 @@
-//! Convolutions, pools and changes of size: where an image lies, and the border around it.
+//! Lowers convolutions, pools and resizes, and places images with their borders.
 //!
-//! A convolution reads an image that has its border. Whoever computes an image leaves room for what its readers want around it and fills
-//! that first, so that the image is written once, inside its border; an image that something else wrote is copied into one.
+//! A convolution reads an image whose border is stored. The op that computes an image leaves room
+//! for the border that its readers need and fills that first, so that the image is written once,
+//! inside its border; any other image is copied into one with a border.
 
 use lads_image::op::{
     Activation, Border, Conv, Depthwise, Pair, Picture, Pool, PoolKind, Resize, WeightSpan, Window,
@@ -13,7 +14,7 @@ use super::view::View;
 use crate::graph::{ConvOp, Id, Op, Windows};
 use crate::tensor::{MAX_ELEMENTS, elements};
 
-/// The batch, rows, columns and channels of images or sequences.
+/// Returns the batch, rows, columns and channels of images or sequences.
 fn four(shape: &[usize]) -> Result<[usize; 4], String> {
     match *shape {
         [n, rows, cols, c] => Ok([n, rows, cols, c]),
@@ -31,12 +32,12 @@ fn pair([rows, cols]: [usize; 2]) -> Result<Pair, String> {
     })
 }
 
-/// What covers both.
+/// Returns the smallest border that covers both.
 fn larger(a: [usize; 4], b: [usize; 4]) -> [usize; 4] {
     std::array::from_fn(|i| a[i].max(b[i]))
 }
 
-/// Images in memory: the view of each, of so many rows, columns and channels.
+/// Images in memory: their view, and the distances between images, rows and pixels.
 struct Images {
     view: View,
     each: usize,
@@ -45,7 +46,8 @@ struct Images {
 }
 
 impl Lowering<'_, '_> {
-    /// Decides which borders images get: the largest that a convolution wants, a residual that of its sum.
+    /// Chooses the borders of images: the largest that a convolution needs; a residual has the
+    /// border of its sum.
     pub(super) fn plan_borders(&mut self, order: &[Id]) {
         for &id in order.iter().rev() {
             let Op::Conv(conv) = *self.g.op(id) else {
@@ -71,7 +73,7 @@ impl Lowering<'_, '_> {
         }
     }
 
-    /// The padding that a convolution really reads.
+    /// Returns the padding that a convolution actually reads.
     fn reached(&self, windows: &Windows, x: Id) -> [usize; 4] {
         let shape = self
             .shape(x)
@@ -80,7 +82,7 @@ impl Lowering<'_, '_> {
         windows.reached([shape[1], shape[2]]).pads()
     }
 
-    /// A new image with the border that its readers want.
+    /// Allocates a new image with the border that its readers need.
     fn image(&mut self, id: Id, shape: &[usize]) -> Result<View, String> {
         let border = self.wanted.get(&id).copied().unwrap_or_default();
         if border == [0; 4] || self.placed.contains_key(&id) {
@@ -90,7 +92,7 @@ impl Lowering<'_, '_> {
         self.bordered(shape, border, None)
     }
 
-    /// The inside of new images with a border around each.
+    /// Allocates new images with a border around each, and returns their inside.
     fn bordered(
         &mut self,
         shape: &[usize],
@@ -129,7 +131,8 @@ impl Lowering<'_, '_> {
         Ok(all.with(offset, strides))
     }
 
-    /// Where images lie whose channels are side by side in the arena; a copy if they are not.
+    /// Returns the places of images whose channels are side by side in the arena, copied if
+    /// necessary.
     fn images(&mut self, id: Id) -> Result<Images, String> {
         let shape = self.shape(id)?;
         let view = self.view(id)?;
@@ -146,7 +149,7 @@ impl Lowering<'_, '_> {
         Ok(Images::of(view))
     }
 
-    /// The images that a convolution reads, from the first pixel of their border on.
+    /// Returns the images that a convolution reads, starting at the first pixel of their border.
     fn with_border(
         &mut self,
         id: Id,
@@ -181,7 +184,7 @@ impl Lowering<'_, '_> {
         })
     }
 
-    /// One of the images, `[rows, columns]` of it, some of its channels.
+    /// Returns one of the images, `[rows, columns]` of it, some of its channels.
     fn picture(
         &self,
         images: &Images,
@@ -276,7 +279,8 @@ impl Lowering<'_, '_> {
         Ok(())
     }
 
-    /// Where a convolution is added to: the residual itself if nobody else reads it, else a copy.
+    /// Returns the place that a convolution is added to: the residual itself if it has no other
+    /// reader, else a copy.
     fn sum(&mut self, id: Id, x: Id, residual: Id) -> Result<View, String> {
         let shape = self.shape(id)?;
         let there = self.borders.get(&residual).copied().unwrap_or_default();
@@ -346,7 +350,7 @@ impl Lowering<'_, '_> {
 }
 
 impl Images {
-    /// The images of a view `[N, rows, columns, C]` or `[N, columns, C]`.
+    /// Reads the images of a view `[N, rows, columns, C]` or `[N, columns, C]`.
     fn of(view: View) -> Self {
         let (each, row, pixel) = match view.strides[..] {
             [each, row, pixel, _] => (each, row, pixel),

@@ -1,6 +1,6 @@
 //! Strided views on buffers and weights.
 
-/// Which memory a view looks at.
+/// Memory that a view points into.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Base {
     /// A buffer of the arena.
@@ -9,11 +9,12 @@ enum Base {
     Weights,
 }
 
-/// Where the elements of a value lie: element `[i, j, ..]` at `offset + i * strides[0] + j * strides[1] + ..`.
+/// Strided view of a value: element `[i, j, ..]` at
+/// `offset + i * strides[0] + j * strides[1] + ..`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct View {
     base: Base,
-    /// From the buffer's first element, or the weights'.
+    /// Offset from the first element of the buffer or of the weights.
     pub offset: usize,
     pub strides: Vec<usize>,
 }
@@ -35,7 +36,7 @@ impl View {
         }
     }
 
-    /// The buffer, if it is not in the weights.
+    /// Returns the buffer, unless the view is in the weights.
     pub fn buffer(&self) -> Option<usize> {
         match self.base {
             Base::Buffer(buffer) => Some(buffer),
@@ -43,7 +44,7 @@ impl View {
         }
     }
 
-    /// The same memory, read otherwise.
+    /// Returns a view on the same memory with other offset and strides.
     pub fn with(&self, offset: usize, strides: Vec<usize>) -> Self {
         Self {
             base: self.base,
@@ -57,7 +58,7 @@ impl View {
         (0..shape.len()).all(|i| shape[i] == 1 || self.strides[i] == own[i])
     }
 
-    /// Whether no two elements share a place, as those of a broadcast do.
+    /// Returns whether no two elements share a place, as those of a broadcast do.
     pub fn is_injective(&self, shape: &[usize]) -> bool {
         let mut axes: Vec<_> = self
             .strides
@@ -74,7 +75,7 @@ impl View {
         })
     }
 
-    /// How many elements the view spans, gaps included.
+    /// Returns the number of elements that the view spans, gaps included.
     pub fn reach(&self, shape: &[usize]) -> usize {
         1 + shape
             .iter()
@@ -83,7 +84,8 @@ impl View {
             .sum::<usize>()
     }
 
-    /// The strides with which a value of another shape reads this one: 0 where it broadcasts.
+    /// Returns the strides with which a value of another shape reads this one: 0 where it
+    /// broadcasts.
     pub fn broadcast(&self, from: &[usize], to: &[usize]) -> Vec<usize> {
         let missing = to.len() - from.len();
         (0..to.len())
@@ -94,7 +96,8 @@ impl View {
             .collect()
     }
 
-    /// The strides after a reshape, if it needs no copy: each group of axes with equal volume must lie at one stride.
+    /// Returns the strides after a reshape, if it needs no copy: each group of axes with equal
+    /// volume must have one stride.
     pub fn reshaped(&self, from: &[usize], to: &[usize]) -> Option<Vec<usize>> {
         let kept: Vec<(usize, usize)> = from
             .iter()
@@ -134,8 +137,9 @@ impl View {
     }
 }
 
-/// Several strided operands over one shape, brought to four dimensions: axes of length one go, neighbours that lie at one stride
-/// in every operand become one. `None` when more than four are left.
+/// Brings several strided operands over one shape to four dimensions: axes of length one are
+/// removed, neighbours with one stride in every operand are merged. Returns `None` if more than
+/// four remain.
 pub(super) fn four<const N: usize>(
     shape: &[usize],
     strides: [&[usize]; N],

@@ -1,7 +1,7 @@
-//! Everything constant, in the order of first use, each content once.
+//! Stores all constants, in the order of first use, each content once.
 //!
-//! Packed matrices are compared panel by panel, so that a matrix of which another program needs some columns only is stored once
-//! too: the columns' panels lie one after the other inside it.
+//! Packed matrices are compared panel by panel, so that a matrix is stored once even if another
+//! program needs only some of its columns: the columns' panels are consecutive inside it.
 
 use std::collections::HashMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -17,18 +17,18 @@ use lads_kernels::{
 use crate::storage::Storage;
 use crate::tensor::Tensor;
 
-/// Elements of a cache line: what each tensor starts at a multiple of.
+/// Alignment of each tensor in elements: a cache line.
 const ALIGN: usize = 16;
 
-/// How a tensor is stored.
+/// Layout in which a tensor is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 enum Form {
     Plain,
     Packed(WeightFormat),
     Scales(WeightFormat),
-    /// Of a convolution, in so many groups of outputs.
+    /// Weights of a convolution, with this number of groups of outputs.
     Windows(usize),
-    /// Of a convolution of each channel by itself.
+    /// Weights of a depthwise convolution.
     Channels,
 }
 
@@ -37,27 +37,27 @@ enum Form {
 pub(crate) struct Packed {
     pub format: WeightFormat,
     pub w: WeightSpan,
-    /// Of integers only.
+    /// Scales of the columns, for integer formats only.
     pub scales: Option<WeightSpan>,
 }
 
 /// The weights of an image.
 #[derive(Debug)]
 pub(crate) struct Weights<'s> {
-    /// How matrices are stored; everything else is `f32`.
+    /// Storage format of matrices; all other constants are `f32`.
     storage: &'s Storage,
-    /// The entry graph whose layers are being stored.
+    /// Name of the entry graph whose layers are being stored.
     pub entry: &'s str,
-    /// In words: of what is stored with fewer bits, several to an element here.
+    /// Stored words; formats with fewer bits have several elements in each.
     pub data: Vec<f32>,
-    /// By content, as a hash: where blocks with that hash start.
+    /// Starts of the stored blocks, by the hash of their content.
     places: HashMap<u64, Vec<usize>>,
     /// Tensors that were stored before. The tensor is kept, so that its address stays its own.
     stored: HashMap<(usize, Form), (Arc<Tensor>, WeightSpan)>,
 }
 
 impl<'s> Weights<'s> {
-    /// None yet.
+    /// Makes an empty store.
     pub fn new(storage: &'s Storage) -> Self {
         Self {
             storage,
@@ -68,7 +68,7 @@ impl<'s> Weights<'s> {
         }
     }
 
-    /// Stores a tensor as it is.
+    /// Stores a tensor as it is given.
     pub fn plain(&mut self, tensor: &Arc<Tensor>) -> Result<WeightSpan, String> {
         let data = tensor.as_f32().ok_or("reads integers as numbers")?;
         self.once(tensor, Form::Plain, |this| this.store(data))
@@ -109,7 +109,8 @@ impl<'s> Weights<'s> {
         Ok(Packed { format, w, scales })
     }
 
-    /// Panels as words; of a matrix of which another program needs some columns only, the columns' panels are found again.
+    /// Stores panels as words; if another program needs only some columns of the matrix, the
+    /// columns' panels are found again.
     fn panels<T: NoUninit + Default>(
         &mut self,
         tensor: &Arc<Tensor>,
@@ -130,7 +131,7 @@ impl<'s> Weights<'s> {
         })
     }
 
-    /// Integers, by the scales of the columns.
+    /// Quantises to integers, by the scales of the columns.
     fn scaled<T: NoUninit + Default>(
         &mut self,
         tensor: &Arc<Tensor>,
@@ -151,8 +152,8 @@ impl<'s> Weights<'s> {
         Ok((w, Some(scales)))
     }
 
-    /// Stores the `[k, n]` matrix of a convolution for the kernel `Conv`: the panels of one group of outputs after those of another,
-    /// each as long.
+    /// Stores the `[k, n]` matrix of a convolution for the kernel `Conv`: the panels of each group
+    /// of outputs in turn, all of the same length.
     pub fn windows(&mut self, tensor: &Arc<Tensor>, groups: usize) -> Result<WeightSpan, String> {
         let data = tensor.as_f32().ok_or("reads integers as numbers")?;
         let &[k, all] = &tensor.shape[..] else {
@@ -202,12 +203,13 @@ impl<'s> Weights<'s> {
         Ok(span)
     }
 
-    /// Stores elements unless the same are there already.
+    /// Stores elements unless the same elements are stored already.
     pub fn store(&mut self, data: &[f32]) -> Result<WeightSpan, String> {
         self.store_blocks(data, data.len())
     }
 
-    /// The same, for data of which the tail from any multiple of `block` may be asked for later.
+    /// Stores data whose tail from any multiple of `block` may be asked for later, unless it is
+    /// stored already.
     fn store_blocks(&mut self, data: &[f32], block: usize) -> Result<WeightSpan, String> {
         let hash = |block: &[f32]| {
             let mut hasher = DefaultHasher::new();
@@ -250,8 +252,9 @@ impl<'s> Weights<'s> {
     }
 }
 
-/// Whether a `[k, n]` matrix weighs its inputs very differently, as the first layer does whose inputs are sensors, each in its
-/// own unit: some input has four times the root mean square of the median one.
+/// Returns whether a `[k, n]` matrix weights its inputs very differently, like a first layer whose
+/// inputs are sensors, each in its own unit: some input has four times the root mean square of the
+/// median one.
 fn is_uneven(data: &[f32], n: usize) -> bool {
     let squares = |row: &[f32]| row.iter().map(|w| w * w).sum::<f32>();
     let mut inputs: Vec<f32> = data.chunks(n.max(1)).map(squares).collect();
@@ -262,12 +265,12 @@ fn is_uneven(data: &[f32], n: usize) -> bool {
         .is_some_and(|&largest| largest > 16.0 * median)
 }
 
-/// The columns of a matrix of `n` of them.
+/// Returns the columns of a matrix with `n` columns.
 fn columns(data: &[f32], n: usize) -> impl Iterator<Item = impl Iterator<Item = f32>> {
     (0..n).map(move |j| data.iter().skip(j).step_by(n).copied())
 }
 
-/// Every weight in another format.
+/// Converts every weight to another format.
 fn converted<T>(
     data: &[f32],
     format: WeightFormat,
@@ -283,7 +286,7 @@ fn converted<T>(
     })
 }
 
-/// The bits of elements, so that zeros of different sign differ.
+/// Returns the bits of elements, so that zeros of different sign differ.
 fn bytes(data: &[f32]) -> &[u8] {
     bytemuck::cast_slice(data)
 }
@@ -296,7 +299,7 @@ mod tests {
     use crate::storage::Storage;
     use crate::tensor::Tensor;
 
-    /// The format that a `[k, 20]` matrix gets, whose inputs have these weights.
+    /// Returns the format that is chosen for a `[k, 20]` matrix whose inputs have these weights.
     fn format(wanted: WeightFormat, inputs: &[f32]) -> WeightFormat {
         let data = inputs.iter().flat_map(|&w| [w; 20]).collect();
         let storage = Storage {

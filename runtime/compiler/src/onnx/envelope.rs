@@ -1,23 +1,25 @@
-//! The top-level fields of a protocol buffer: tells a model that was cut off from a file that never was one.
+//! Reads the top-level fields of a protocol buffer, to distinguish a truncated model from a file
+//! that never was one.
 //!
-//! A field is a varint key (`number << 3 | wire type`) and its value; see the protocol buffer encoding specification. The
-//! walk looks at keys and lengths only, so it is exact about where the file ends.
+//! A field is a varint key (`number << 3 | wire type`) and its value; see the protocol buffer
+//! encoding specification. The walk reads keys and lengths only, so it is exact about where the
+//! file ends.
 
 use crate::error::BundleError;
 
-/// The highest field number of a `ModelProto`.
+/// Highest field number of a `ModelProto`.
 const LAST_MODEL_FIELD: u64 = 26;
 
-/// One field as it lies in the file.
+/// One encoded field of the file.
 pub(crate) struct Field<'b> {
     pub number: u64,
-    /// Key and value.
+    /// Bytes of key and value.
     pub whole: &'b [u8],
-    /// What a field of varying length holds; empty for the other wire types.
+    /// Content of a field of varying length; empty for the other wire types.
     pub value: &'b [u8],
 }
 
-/// The fields of what looks like a complete `ModelProto`.
+/// Returns the fields of a `ModelProto` if the bytes look like a complete one.
 pub(crate) fn fields(bytes: &[u8]) -> Result<Vec<Field<'_>>, BundleError> {
     let not_onnx = |problem: &str| BundleError::NotOnnx {
         problem: problem.into(),
@@ -76,7 +78,7 @@ pub(crate) fn fields(bytes: &[u8]) -> Result<Vec<Field<'_>>, BundleError> {
     Ok(fields)
 }
 
-/// Reads a varint of at most ten bytes and moves `at` behind it.
+/// Reads a varint of at most ten bytes and advances `at` past it.
 fn varint(bytes: &[u8], at: &mut usize) -> Option<u64> {
     let mut value = 0u64;
     for shift in (0..70).step_by(7) {

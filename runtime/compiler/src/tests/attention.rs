@@ -1,4 +1,4 @@
-//! Attention over the cache: spellings that are understood, and those that must not be.
+//! Tests of attention over the cache: spellings that are understood, and those that must not be.
 
 use std::collections::HashMap;
 
@@ -17,10 +17,10 @@ use crate::lower::Cache;
 const HEADS: usize = 2;
 const DIM: usize = 3;
 const WIDTH: usize = HEADS * DIM;
-/// Rows of the cache.
+/// Number of rows of the cache.
 const ROWS: usize = 12;
 
-/// Where a spelling differs from the exporter's.
+/// Differences of a spelling of attention from the exporter's.
 #[derive(Clone)]
 #[expect(
     clippy::struct_excessive_bools,
@@ -31,13 +31,13 @@ struct Spelling {
     mask: Vec<f32>,
     /// Scale of the scores of the past, and of the new tokens.
     scales: [f32; 2],
-    /// Multiplies the queries instead of the scores.
+    /// True if the scale multiplies the queries instead of the scores.
     scale_queries: bool,
-    /// The scores of the new tokens come first.
+    /// True if the scores of the new tokens come first.
     swapped: bool,
-    /// Another mask, over the past.
+    /// True if there is another mask, over the past.
     past_mask: bool,
-    /// The output is read through its last token only.
+    /// True if the output is read through its last token only.
     last_only: bool,
 }
 
@@ -57,7 +57,7 @@ impl Spelling {
         }
     }
 
-    /// `y = attention(x·Wq, x·Wk, x·Wv)·Wo` over a cache of one layer.
+    /// Makes the model `y = attention(x·Wq, x·Wk, x·Wv)·Wo` over a cache of one layer.
     #[expect(clippy::too_many_lines, reason = "one graph, node by node")]
     fn model(&self) -> Small {
         let n = self.tokens;

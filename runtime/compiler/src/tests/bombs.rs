@@ -1,4 +1,5 @@
-//! Small models that ask for more than any policy needs: they are refused by name before their constants are made, or they compile.
+//! Tests of small models that ask for more than any policy needs: they are refused by name before
+//! their constants are made, or they compile.
 
 use super::models::{Small, int};
 use super::operators::compile;
@@ -6,7 +7,7 @@ use crate::error::CompileError;
 use crate::graph::MAX_FOLDING;
 use crate::tensor::MAX_ELEMENTS;
 
-/// What is refused, and at which node.
+/// Returns the refusal of a model, and its node.
 #[track_caller]
 fn refused(small: &Small) -> (String, String) {
     match compile(small) {
@@ -18,7 +19,7 @@ fn refused(small: &Small) -> (String, String) {
     }
 }
 
-/// A model that adds the sum of constants to its input.
+/// Makes a model that adds the sum of constants to its input.
 fn constants(shape: &[i64], most: usize) -> Small {
     let mut small = Small::new()
         .input("a", &[1])

@@ -1,5 +1,5 @@
-//! A graph in double precision, node by node as it was imported: the numbers that golden steps are written by, against the same oracles as
-//! what is compiled.
+//! Evaluates a graph in double precision, node by node as it was imported, against the same oracles
+//! as compiled programs: golden steps are written from these numbers.
 
 use std::collections::HashMap;
 
@@ -10,7 +10,7 @@ use crate::graph::{Type, Value, evaluate, topological};
 use crate::import::Model;
 use crate::onnx::ModelProto;
 
-/// The outputs of an entry for the inputs that are named.
+/// Returns the outputs of an entry for the named inputs.
 pub fn outputs(
     model: &ModelProto,
     signature: &Signature,

@@ -1,5 +1,6 @@
-//! What policy files of the field are made of beside plain layers: old operator sets, vectors without a batch axis, conditions, sums
-//! of Einstein's, sequences, numbers that are indices. Beside tract, or where it has no such operator, beside what the definition says.
+//! Tests of features that policy files of the field use besides plain layers: old operator sets,
+//! vectors without a batch axis, conditions, Einstein sums, sequences, numbers that are indices.
+//! They are compared with tract, or where it has no such operator, with the definition.
 
 use proptest::prelude::*;
 
@@ -8,7 +9,7 @@ use super::models::{Small, float, int, ints, text};
 use super::operators::{agrees, agrees_at, compile, names, refused};
 use crate::graph::{Dim, Type};
 
-/// What a program gives for one input `a`.
+/// Runs a program on one input `a`.
 fn run(small: &Small, a: &[f32]) -> Vec<f32> {
     let program = compile(small).unwrap_or_else(|error| panic!("{error}"));
     let mut machine = Machine::new(&program.placed, &program.weights, vec![]);
@@ -186,7 +187,8 @@ fn sequences_leave_nothing_behind() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(40))]
 
-    /// Two operands over random lengths of named axes, against the sum by its definition.
+    /// Compares Einstein sums of two operands over random lengths of named axes with the sum by its
+    /// definition.
     #[test]
     fn einstein_sums_are_what_they_say(
         lens in prop::collection::vec(1_usize..4, 4),

@@ -1,9 +1,10 @@
-//! Operators on images and sequences against tract, what they become together, and what is refused.
+//! Tests of operators on images and sequences against tract, of their fusion, and of refusals.
 
 use super::models::{Small, float, int, ints, text};
 use super::operators::{agrees, names, refused};
 
-/// An image `[1, c, side, side + 1]` through a convolution with a kernel `[n, c / groups, rows, cols]`.
+/// Makes a convolution of an image `[1, c, side, side + 1]` with a kernel
+/// `[n, c / groups, rows, cols]`.
 fn conv(
     c: usize,
     side: usize,
@@ -72,7 +73,7 @@ fn convolutions() {
     agrees(sequence.output("y", &[1, 5, 5]));
 }
 
-/// What is added to a convolution is not written over where its elements share their place.
+/// A residual whose elements share their place is added by copy, not overwritten.
 #[test]
 fn broadcasts_are_added_by_copy() {
     for (images, from) in [(2, [1, 4, 4]), (1, [1, 1, 4]), (2, [1, 1, 4])] {
@@ -126,7 +127,7 @@ fn pools() {
     }
 }
 
-/// Two convolutions with what networks of images put between and behind them.
+/// Two convolutions absorb the nodes that image networks put between and after them.
 #[test]
 fn encoders_become_convolutions_alone() {
     let small = Small::new()
@@ -216,7 +217,8 @@ fn encoders_become_convolutions_alone() {
     assert_eq!(names, others);
 }
 
-/// Convolutions over the steps of a history, as policies of legged robots have them: time is the columns, and nothing has to be moved.
+/// Convolutions over the steps of a history, as policies of legged robots have them, are images of
+/// one row: time is the columns, and nothing has to be moved.
 #[test]
 fn histories_are_images_of_one_row() {
     let small = Small::new()

@@ -1,4 +1,4 @@
-//! What several operators become together: layers, concatenations, tables, the LSTM; and what is refused.
+//! Tests of fusing several operators: layers, concatenations, tables, the LSTM; and of refusals.
 
 use super::compiled;
 use super::machine::Machine;

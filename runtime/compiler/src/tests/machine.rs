@@ -16,7 +16,7 @@ pub struct Machine<'w> {
     ints: [i64; INT_SLOTS],
 }
 
-/// Offsets of all elements of a strided layout, in order.
+/// Returns the offsets of all elements of a strided layout, in order.
 fn offsets(dims: [u32; 4], strides: [u32; 4]) -> Vec<usize> {
     let (dims, strides) = (dims.map(|x| x as usize), strides.map(|x| x as usize));
     (0..dims.iter().product())
@@ -52,7 +52,7 @@ fn element(activation: UnaryKind, alpha: f32, x: f32) -> f32 {
 }
 
 impl<'w> Machine<'w> {
-    /// An arena full of NaN, so that nothing passes that was not written.
+    /// Makes an arena full of NaN, so that an unwritten element is noticed.
     pub fn new(program: &Placed, weights: &'w [f32], cache: Vec<f32>) -> Self {
         Self {
             weights,

@@ -10,7 +10,7 @@ use crate::onnx::{
     TensorProto, TensorShapeProto, TensorTypeProto, TypeProto, ValueInfoProto, data_type,
 };
 
-/// The entry that small models are.
+/// Name of the entry of small models.
 pub const ENTRY: &str = "test/graph";
 
 /// A model of one entry under construction.
@@ -73,7 +73,7 @@ impl Small {
         }
     }
 
-    /// Numbers between -1 and 1, always the same ones (xorshift, Marsaglia 2003).
+    /// Returns numbers between -1 and 1, always the same ones (xorshift, Marsaglia 2003).
     pub fn numbers(&mut self, len: usize) -> Vec<f32> {
         let mut next = || {
             self.random ^= self.random << 13;
@@ -152,7 +152,7 @@ impl Small {
         self.output_dims(name, Type::F32, &dims)
     }
 
-    /// A constant of numbers.
+    /// Adds a constant with these values.
     pub fn weights(mut self, name: &str, shape: &[usize], values: &[f32]) -> Self {
         let tensor = TensorProto {
             name: full(name),
@@ -169,13 +169,13 @@ impl Small {
         self
     }
 
-    /// A constant of random numbers.
+    /// Adds a constant of random numbers.
     pub fn random(mut self, name: &str, shape: &[usize]) -> Self {
         let values = self.numbers(shape.iter().product());
         self.weights(name, shape, &values)
     }
 
-    /// A constant of integers along one axis.
+    /// Adds a constant of integers along one axis.
     pub fn integers(mut self, name: &str, values: &[i64]) -> Self {
         let tensor = TensorProto {
             name: full(name),
@@ -188,7 +188,7 @@ impl Small {
         self
     }
 
-    /// A node; an empty name leaves an input or output out.
+    /// Adds a node; an empty name leaves an input or output out.
     pub fn node(
         mut self,
         op_type: &str,

@@ -1,8 +1,10 @@
-//! ONNX's own node conformance tests, through compilation and the core's executor, on every instruction set.
+//! Runs ONNX's own node conformance tests, through compilation and the core's executor, on every
+//! instruction set.
 //!
-//! The cases are made by `tests/parity/test_onnx_nodes.py` from the `onnx` package, one model per file in the folder that
-//! [`FOLDER`] names: its inputs are called `a` to `e`, its outputs `y`, `z` or `j`, and what goes in and has to come out is among
-//! the initializers, as `given/a` and `expected/y`. Without the variable the test has nothing to do.
+//! The cases are made by `tests/parity/test_onnx_nodes.py` from the `onnx` package, one model per
+//! file in the folder that [`FOLDER`] names: its inputs are called `a` to `e`, its outputs `y`, `z`
+//! or `j`, and the given inputs and expected outputs are among the initializers, as `given/a` and
+//! `expected/y`. Without the variable the test has nothing to do.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -54,7 +56,8 @@ impl Case {
         }
     }
 
-    /// The inputs from the `runtime`-th on become constants: what an exporter would have made of a scale or of axes.
+    /// Turns the inputs from the `runtime`-th on into constants, as an exporter would for a scale
+    /// or for axes.
     fn exported(&self, runtime: usize) -> (ModelProto, Signature) {
         let mut model = self.model.clone();
         let graph = model.graph.as_mut().expect("a graph");
@@ -166,7 +169,7 @@ fn compile((model, signature): &(ModelProto, Signature)) -> Result<Compiled, Com
     compiled(model, signature, &names, Cache::NONE)
 }
 
-/// Compares; the tolerance is that of ONNX's own runner.
+/// Asserts equality within the tolerance of ONNX's own runner.
 fn same(what: &str, got: &[f32], expected: &Tensor) {
     let expected: Vec<f32> = match &expected.data {
         Data::F32(data) => data.clone(),

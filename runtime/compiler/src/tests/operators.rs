@@ -1,4 +1,4 @@
-//! Each ONNX operator on its own against tract, and what is refused.
+//! Tests of each ONNX operator on its own against tract, and of refusals.
 
 use std::collections::HashMap;
 
@@ -26,7 +26,8 @@ pub(super) fn agrees(small: Small) -> Compiled {
     agrees_at(18, small)
 }
 
-/// The same by another operator set.
+/// Compiles with another operator set, runs and compares, and evaluates the graph in double
+/// precision.
 #[track_caller]
 pub(super) fn agrees_at(opset: i64, mut small: Small) -> Compiled {
     let outputs: Vec<String> = (small.signature.outputs.iter())

@@ -1,4 +1,4 @@
-//! tract as the oracle: what an ONNX model means.
+//! Oracle for the meaning of an ONNX model: tract.
 
 use std::collections::HashMap;
 
@@ -7,7 +7,7 @@ use tract_onnx::prelude::*;
 
 use crate::onnx::{ModelProto, ValueInfoProto};
 
-/// One entry, ready to run. Values have their short names.
+/// One entry, ready to run. Values go by their short names.
 pub struct Oracle {
     plan: Arc<TypedRunnableModel>,
     inputs: Vec<String>,
@@ -43,7 +43,7 @@ impl Oracle {
         }
     }
 
-    /// The outputs as numbers, integers too.
+    /// Runs the entry and returns the outputs as numbers, integers too.
     pub fn run(&self, inputs: &HashMap<String, Tensor>) -> HashMap<String, Vec<f32>> {
         let inputs = self
             .inputs

@@ -1,4 +1,4 @@
-//! The memory plan and the verifier that does not trust it.
+//! Tests of the memory plan and of the verifier that does not trust it.
 
 use lads_image::op::{Copy, Op, Operand, Place, Space, Span, Unary, UnaryKind};
 use proptest::prelude::*;
@@ -8,12 +8,12 @@ use crate::lower::Lowered;
 use crate::plan::{Placed, plan};
 use crate::verify::{PlanFault, verify};
 
-/// All programs of the tiny bundle.
+/// Returns all programs of the tiny bundle.
 fn programs() -> Vec<(Lowered, Placed)> {
     named().into_iter().map(|(_, planned)| planned).collect()
 }
 
-/// All programs of the tiny bundle with their names.
+/// Returns all programs of the tiny bundle with their names.
 fn named() -> Vec<(String, (Lowered, Placed))> {
     let bundle =
         Bundle::from_bytes(include_bytes!("../../tests/data/tiny.onnx")).expect("a bundle");
@@ -34,7 +34,7 @@ fn offsets(op: &Op) -> Vec<u32> {
     offsets
 }
 
-/// Moving any one span of any op somewhere else is found, unless nothing was moved.
+/// The verifier notices if any one span of any op is moved, unless nothing changes by it.
 #[test]
 fn every_moved_span_is_found() {
     for (lowered, placed) in programs() {
@@ -172,7 +172,8 @@ fn reads_of_nothing_are_found() {
 }
 
 proptest! {
-    /// Any chain of ops over any buffers: the plan is proven, and no smaller than its lower bound.
+    /// Plans random chains of ops over random buffers: the plan is proven, and no smaller than its
+    /// lower bound.
     #[test]
     fn random_programs_are_planned(steps in prop::collection::vec((0usize..6, 1u32..40), 1..40)) {
         let mut buffers = vec![Span { offset: 0, len: 8 }];

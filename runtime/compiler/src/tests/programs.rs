@@ -1,5 +1,5 @@
-//! Every program of the tiny bundle, and of the shipped one where it is there, against tract running the entry that it was
-//! compiled from, with nothing, a little and a lot in the cache.
+//! Compares every program of the tiny bundle, and of the shipped one if present, with tract running
+//! the entry that it was compiled from, for several lengths of the cache.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -13,7 +13,7 @@ use super::{Program, models::Small, programs};
 use crate::bundle::Bundle;
 use crate::graph::Type;
 
-/// Past lengths that are tried.
+/// Lengths of the past that are tried.
 const PASTS: [usize; 3] = [0, 5, 300];
 
 fn check(path: &Path) {
@@ -101,7 +101,8 @@ impl Case<'_> {
         }
     }
 
-    /// Where the cache holds the elements of `[1, heads, len, head_dim]`, in that order.
+    /// Returns the places in the cache of the elements of `[1, heads, len, head_dim]`, in that
+    /// order.
     fn rows(&self, name: &str, shape: &[usize]) -> impl Iterator<Item = usize> {
         let parts: Vec<&str> = name.split('.').collect();
         let layer: usize = parts[1].parse().expect("a layer");

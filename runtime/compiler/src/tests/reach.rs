@@ -1,4 +1,5 @@
-//! Tables and what chooses their rows: an integer that can lie beyond the last row is refused when the policy is compiled.
+//! Tests that an integer that can lie beyond the last row of a table is refused when the policy is
+//! compiled.
 
 use base64::Engine as _;
 use prost::Message;
@@ -10,7 +11,7 @@ use crate::compile::compile;
 use crate::graph::{Dim, Type};
 use crate::onnx::{ModelProto, StringStringEntryProto};
 
-/// A plain policy that adds row `gait` of a table of three rows to what it observes.
+/// Makes a plain policy that adds row `gait` of a table of three rows to its observation.
 fn by_gait(limits: &str) -> Vec<u8> {
     let small = Small::new()
         .input("observation", &[1, 2])

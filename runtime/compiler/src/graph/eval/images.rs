@@ -1,4 +1,5 @@
-//! Windows over images and sequences, and their other sizes: every result by itself, channel by channel of every pixel.
+//! Evaluates windows over images and sequences, and resizing: every result by itself, channel by
+//! channel of every pixel.
 
 use lads_image::op::PoolKind;
 use ndarray::{Array4, ArrayD, ArrayView4, ArrayViewD, Axis, Ix1, Ix2, IxDyn};
@@ -6,7 +7,7 @@ use ndarray::{Array4, ArrayD, ArrayView4, ArrayViewD, Axis, Ix1, Ix2, IxDyn};
 use super::super::{ConvOp, Windows};
 use super::{Real, apply};
 
-/// Images as `[N, rows, columns, C]`: a sequence `[N, columns, C]` has one row.
+/// Views images as `[N, rows, columns, C]`: a sequence `[N, columns, C]` has one row.
 fn four<'v, T: Clone>(x: &ArrayViewD<'v, T>) -> Option<ArrayView4<'v, T>> {
     let x = x.clone();
     let x = if x.ndim() == 3 {
@@ -21,12 +22,12 @@ fn size<T>(x: &ArrayView4<T>) -> [usize; 2] {
     [x.shape()[1], x.shape()[2]]
 }
 
-/// Rows, and columns within each, of a kernel.
+/// Returns the rows, and the columns within each, of a kernel.
 fn places([rows, cols]: [usize; 2]) -> impl Iterator<Item = [usize; 2]> {
     (0..rows).flat_map(move |row| (0..cols).map(move |col| [row, col]))
 }
 
-/// A result: what `f` says of an image, a pixel and a channel.
+/// Makes a result from `f` of an image, a pixel and a channel.
 fn each<T>(shape: &[usize], f: impl Fn(usize, [usize; 2], usize) -> T) -> Option<ArrayD<T>> {
     let whole = match *shape {
         [n, rows, cols, c] => (n, rows, cols, c),
@@ -37,7 +38,7 @@ fn each<T>(shape: &[usize], f: impl Fn(usize, [usize; 2], usize) -> T) -> Option
     all.into_shape_with_order(IxDyn(shape)).ok()
 }
 
-/// See [`Op::Conv`](super::Op::Conv).
+/// Evaluates [`Op::Conv`](super::Op::Conv).
 pub(super) fn conv<T: Real>(
     conv: &ConvOp,
     x: &[ArrayViewD<T>],
@@ -79,7 +80,7 @@ pub(super) fn conv<T: Real>(
     })
 }
 
-/// See [`Op::Pool`](super::Op::Pool).
+/// Evaluates [`Op::Pool`](super::Op::Pool).
 pub(super) fn pool<T: Real>(
     kind: PoolKind,
     windows: &Windows,
@@ -114,7 +115,7 @@ pub(super) fn pool<T: Real>(
     })
 }
 
-/// See [`Op::Resize`](super::Op::Resize).
+/// Evaluates [`Op::Resize`](super::Op::Resize).
 pub(super) fn resize<T: Real>(x: &[ArrayViewD<T>], shape: &[usize]) -> Option<ArrayD<T>> {
     let image = four(x.first()?)?;
     let table = |i: usize| x.get(i)?.clone().into_dimensionality::<Ix2>().ok();
