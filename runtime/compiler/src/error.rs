@@ -123,7 +123,7 @@ pub enum CompileError {
         operator: Line,
         /// Name of the node, or of its first output.
         node: Line,
-        /// What is not supported, and what is supported instead.
+        /// Unsupported use, and the supported alternative.
         problem: Line,
     },
     /// A value is missing or has another shape than the contract states.

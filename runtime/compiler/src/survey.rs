@@ -85,7 +85,7 @@ pub struct Operator {
     pub node: String,
     /// Operands of the node.
     pub inputs: Vec<Operand>,
-    /// What the compiler does not support.
+    /// Unsupported use, and the supported alternative.
     pub problem: String,
 }
 

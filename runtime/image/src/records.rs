@@ -274,15 +274,15 @@ word_enum! {
         Channel = 0,
         /// A state, by its index: a plain state, or a ring: all its rows as an input, its newest row as an output.
         State = 1,
-        /// As an input: row `pass` of a ring, the oldest first.
+        /// Row `pass` of a ring, the oldest first; an input.
         Row = 2,
-        /// As an integer: control steps since the context began.
+        /// Number of control steps since the context began; an integer.
         Timestep = 3,
-        /// As an integer: the timestep modulo the parameter.
+        /// Phase, the timestep modulo the parameter; an integer.
         Phase = 4,
-        /// As an integer: the number of earlier runs of the same call.
+        /// Number of earlier runs of the same call; an integer.
         Pass = 5,
-        /// As an integer: the selected index in force.
+        /// Selected index in force; an integer.
         Selected = 6,
     }
 }
