@@ -1,8 +1,9 @@
 //! `lads act`: the controller on a pipe. One observation per line of input, one action per line of output, flushed, in the same form.
 //!
-//! A line holds the elements of all observation channels, one channel behind the other in the policy's order. It is read up to the length
-//! that an observation can have, whatever comes. An empty line starts a new episode of the same instruction and is not answered. An
-//! observation that is refused ends the command with the number of its line; the lines before it have been answered.
+//! A line holds the elements of all observation channels, one channel after the other in the
+//! policy's order. No more of it is read than an observation can need. An empty line starts a new
+//! episode of the same instruction and is not answered. An observation that is refused ends the
+//! command with the number of its line; the lines before it have been answered.
 
 use std::fmt::Display;
 use std::io::{BufRead, ErrorKind, Read as _, Write};
@@ -16,11 +17,12 @@ use crate::refusal::Refusal;
 use crate::seen::Seen;
 use crate::self_test;
 
-/// Bytes of a line that are read at most: for every element, and for the rest of it. A number of f32 in any usual form takes fewer.
+/// Number of bytes of a line that are read at most for every element, and for the rest of the line.
+/// An f32 in any usual form takes fewer.
 const BYTES_PER_ELEMENT: usize = 64;
 const BYTES_BESIDE: usize = 1024;
 
-/// What to act on.
+/// Options of `lads act`.
 pub struct Request<'r> {
     /// Text or id of an instruction that the policy knows.
     pub instruction: Option<&'r str>,
@@ -30,7 +32,7 @@ pub struct Request<'r> {
     pub sample: Option<u64>,
 }
 
-/// Answers `input` on `output` until it ends or nobody reads any more.
+/// Answers `input` on `output` until the input ends or the output's reader closes it.
 pub fn act(
     model: &Model,
     request: &Request<'_>,
@@ -76,7 +78,8 @@ pub fn act(
     pipe.answer_all(input, output)
 }
 
-/// The rule of `--sample`: at the contract's temperature, or at 1 where the contract's rule is argmax.
+/// Returns the rule of `--sample`: at the contract's temperature, or at 1 where the contract's rule
+/// is argmax.
 pub fn sampling(policy: &Policy<'_>, seed: u64) -> Decision {
     let temperature = match policy.contract().decision() {
         Decision::Sample { temperature, .. } => temperature,
@@ -85,7 +88,7 @@ pub fn sampling(policy: &Policy<'_>, seed: u64) -> Decision {
     Decision::Sample { temperature, seed }
 }
 
-/// A controller between a reader and a writer.
+/// Connects a controller with a reader and a writer.
 struct Pipe<'p, 'm> {
     policy: Policy<'p>,
     controller: Controller<'p, 'm>,
@@ -145,7 +148,8 @@ impl Pipe<'_, '_> {
         Ok(())
     }
 
-    /// One control step; on success the form of the line, and the index in force where it was asked for.
+    /// Runs one control step; on success returns the form of the line, and the index in force if
+    /// requested.
     fn answer(
         &mut self,
         asked: &str,

@@ -1,6 +1,7 @@
-//! `lads bench`: how long the control steps of a policy take at its real rate.
+//! `lads bench`: measures the time of a policy's control steps at its real rate.
 //!
-//! What can fail: an argument that makes no sense, a policy without a golden episode, a contender that computes something else.
+//! What can fail: an invalid argument, a policy without a golden episode, a contender whose results
+//! differ.
 
 use std::io::IsTerminal;
 use std::path::PathBuf;
@@ -13,7 +14,7 @@ use lads_pace::suite::{Candidate, Nobody, options};
 use crate::model::Model;
 use crate::refusal::Refusal;
 
-/// What to measure and how.
+/// Options of `lads bench`.
 #[derive(Debug, Args)]
 pub struct Request {
     /// Bundle (.onnx) or compiled image (.lads)
@@ -25,11 +26,11 @@ pub struct Request {
     /// Seconds for each contender
     #[arg(long, default_value_t = 20.0)]
     seconds: f64,
-    /// Threads that thrash the caches and compute beside it
+    /// Threads that thrash the caches and compute during the measurement
     #[arg(long, default_value_t = 0)]
     load: usize,
-    /// Formats of the weights to measure, side by side, those of 16 bits or fewer with a cache of 16; an image has those that it was
-    /// compiled with
+    /// Weight formats to measure, side by side; formats of 16 bits or fewer get a cache of 16 bits;
+    /// an image keeps the formats that it was compiled with
     #[arg(
         long,
         value_name = "FORMAT",
@@ -38,12 +39,12 @@ pub struct Request {
         value_parser = crate::compile::weight_format
     )]
     weights: Vec<WeightFormat>,
-    /// As one JSON object
+    /// Print one JSON object
     #[arg(long)]
     pub json: bool,
 }
 
-/// Measures as requested.
+/// Runs the measurement.
 pub fn bench(request: &Request) -> Result<Report, Refusal> {
     let protocol = Protocol {
         rate: request.rate,

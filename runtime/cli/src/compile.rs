@@ -1,6 +1,6 @@
-//! `lads compile`: a bundle into a program image, as a file, as source, or both.
+//! `lads compile`: turns a bundle into a program image, as a file, as source, or both.
 //!
-//! Everything that can be refused is, before the first file is written.
+//! All refusals happen before the first file is written.
 
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
@@ -13,43 +13,47 @@ use crate::model::Model;
 use crate::refusal::Refusal;
 use crate::{emit, print, self_test};
 
-/// What to compile, how, and what to write.
+/// Options of `lads compile`.
 #[derive(Debug, Args)]
 pub struct Request {
     /// Bundle (.onnx); with --emit-c or --emit-rust also a compiled image (.lads)
     model: PathBuf,
-    /// The image to write
+    /// Path of the image to write
     #[arg(short, long, required_unless_present_any = ["emit_c", "emit_rust"])]
     output: Option<PathBuf>,
-    /// A C source to write: the image as a constant, aligned byte array
+    /// Path of a C source to write: the image as a constant, aligned byte array
     #[arg(long, value_name = "FILE")]
     emit_c: Option<PathBuf>,
-    /// A Rust source to write: the image as a constant, aligned byte array
+    /// Path of a Rust source to write: the image as a constant, aligned byte array
     #[arg(long, value_name = "FILE")]
     emit_rust: Option<PathBuf>,
-    /// How the weights are stored: auto, as the bundle was tuned (`lads-run tune`), and f32 where it was not; f32; int16 or
-    /// int8, with which the inputs of a layer are rounded too, and which are faster than f32 on x86-64 and aarch64; f16 or bf16, which are
-    /// decoded. Fewer bits than 32 have to pass a gate: the golden episode replays with the same plans, and with actions inside
-    /// the tolerance
+    /// Storage format of the weights: auto, as the bundle was tuned (`lads-run tune`), and f32 if
+    /// it was not; f32; int16 or int8, with which the inputs of a layer are rounded too, and which
+    /// are faster than f32 on x86-64 and aarch64; f16 or bf16, which are decoded. Fewer bits than
+    /// 32 have to pass a gate: the golden episode replays with the same plans, and with actions
+    /// inside the tolerance
     #[arg(long, value_name = "FORMAT", default_value = "auto", value_parser = auto_or(weight_format))]
     weights: Choice<WeightFormat>,
-    /// How the weights are stored of what is in the action and does not only choose a plan, if otherwise: with f32 the actions
-    /// of a plan keep their bits, and all that fewer bits elsewhere can do is to choose another plan
+    /// Storage format of the weights that the action depends on, not only the choice of a plan, if
+    /// it differs: with f32 the actions of a plan keep their bits, so fewer bits elsewhere can only
+    /// change which plan is chosen
     #[arg(long, value_name = "FORMAT", value_parser = weight_format)]
     low_level: Option<WeightFormat>,
-    /// How the KV cache is stored: auto, as the bundle was tuned where nothing is said of the weights, else f32; f32; or f16 in half the memory. It has to pass the same gate
+    /// Storage format of the KV cache: auto, as the bundle was tuned if no format of the weights is
+    /// given, else f32; f32; or f16 in half the memory. Fewer bits have to pass the same gate as
+    /// weights
     #[arg(long, value_name = "FORMAT", default_value = "auto", value_parser = auto_or(cache_format))]
     cache: Choice<CacheFormat>,
-    /// Largest difference of an action that the gate, and later the image's self-test, accept, in the action's units; the
-    /// bundle's own is meant for 32-bit weights
+    /// Largest difference of an action that the gate, and later the image's self-test, accept, in
+    /// the action's units; the bundle's own tolerance is meant for 32-bit weights
     #[arg(long, value_name = "DIFFERENCE", value_parser = tolerance)]
     tolerance: Option<f32>,
-    /// Writes an image that the gate refuses, for experiments; its self-test fails
+    /// Write an image that the gate refuses, for experiments; its self-test fails
     #[arg(long)]
     force: bool,
 }
 
-/// Compiles as requested.
+/// Compiles a bundle and writes the requested files.
 pub fn compile(request: Request) -> Result<(), Refusal> {
     // What is no bundle is refused below, with what it is instead.
     let bundle = Bundle::open(&request.model).ok();
@@ -140,11 +144,11 @@ fn cache_format(name: &str) -> Result<CacheFormat, String> {
     named(name, CacheFormat::ALL, CacheFormat::name)
 }
 
-/// A format; `None` is `auto`.
+/// A format, or `auto` as `None`.
 #[derive(Debug, Clone, Copy)]
 struct Choice<T>(Option<T>);
 
-/// A parser that also knows `auto`.
+/// Makes a parser that also accepts `auto`.
 fn auto_or<T>(
     format: fn(&str) -> Result<T, String>,
 ) -> impl Fn(&str) -> Result<Choice<T>, String> + Clone {

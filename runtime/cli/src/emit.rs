@@ -1,4 +1,5 @@
-//! Program images as source: a constant, aligned byte array that a compiler puts into flash, so that opening copies nothing.
+//! Writes program images as source: a constant, aligned byte array that a compiler puts into flash,
+//! so that opening copies nothing.
 //!
 //! The name in the source is made from the name of the file.
 
@@ -7,13 +8,13 @@ use std::path::Path;
 
 use crate::refusal::Refusal;
 
-/// Alignment of the array, in bytes: that of the weights in the image.
+/// Alignment of the array in bytes: that of the weights in the image.
 const ALIGN: usize = lads_image::format::WEIGHTS_ALIGN;
 
-/// Bytes of the image in a line of source.
+/// Number of bytes of the image in a line of source.
 const BYTES_PER_LINE: usize = 32;
 
-/// The image as a C file, for C99 with GNU attributes, C11, and C++.
+/// Formats the image as a C file, for C99 with GNU attributes, C11, and C++.
 pub fn c(image: &[u8], path: &Path) -> Result<String, Refusal> {
     let name = identifier(path)?;
     let len = image.len();
@@ -43,7 +44,7 @@ pub fn c(image: &[u8], path: &Path) -> Result<String, Refusal> {
     Ok(source)
 }
 
-/// The image as a Rust file, to be included as a module.
+/// Formats the image as a Rust file, to be included as a module.
 pub fn rust(image: &[u8], path: &Path) -> Result<String, Refusal> {
     let name = identifier(path)?.to_uppercase();
     let len = image.len();
@@ -65,7 +66,7 @@ pub fn rust(image: &[u8], path: &Path) -> Result<String, Refusal> {
     Ok(source)
 }
 
-/// A name that C and Rust accept, from the stem of the file.
+/// Makes a name that C and Rust accept from the stem of the file.
 fn identifier(path: &Path) -> Result<String, Refusal> {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
     let plain = |c: char| {

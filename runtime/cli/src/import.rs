@@ -1,6 +1,6 @@
-//! `lads import`: any ONNX policy and a description of the robot into a bundle.
+//! `lads import`: turns any ONNX policy and a description of the robot into a bundle.
 //!
-//! All that is missing and all that contradicts is told at once, and no file is written then.
+//! All missing and contradictory fields are reported at once, and then no file is written.
 
 use std::path::{Path, PathBuf};
 
@@ -11,35 +11,38 @@ use lads_import::{ImportError, Imported};
 use crate::print;
 use crate::refusal::{Refusal, chain};
 
-/// What to import, and what to write.
+/// Options of `lads import`.
 #[derive(Debug, Args)]
 pub struct Request {
-    /// The policy (.onnx); of several files, one's output is the input of another
+    /// Policy to import (.onnx); of several files, one's output is the input of another
     #[arg(required = true)]
     models: Vec<PathBuf>,
-    /// What is to be said about the robot (.toml): --template prints the form
+    /// Description of the robot (.toml): --template prints the form
     #[arg(long, value_name = "FILE")]
     contract: Option<PathBuf>,
-    /// A file that says something about the policy (deploy.yaml, JSON), besides those that lie where exporters put them
+    /// Another file that describes the policy (deploy.yaml, JSON), besides those in the places
+    /// where exporters put them
     #[arg(long, value_name = "FILE")]
     beside: Vec<PathBuf>,
-    /// The bundle to write; otherwise the policy's name with .lads.onnx
+    /// Path of the bundle to write; by default the policy's name with .lads.onnx
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// The graph's output that is the action, where there are several
+    /// Output of the graph that is the action, if there are several
     #[arg(long, value_name = "NAME")]
     action: Option<String>,
-    /// An input and the output that is its value in the next control step; zeros when an episode begins
+    /// Input of the graph, and the output that is its value in the next control step; zeros when an
+    /// episode begins
     #[arg(long, value_name = "INPUT=OUTPUT", value_parser = pair)]
     state: Vec<(String, String)>,
-    /// An output of one file and the input of another that reads it; with its file and a colon in front where a name alone is not enough
+    /// Output of one file, and the input of another that reads it; prefixed with the file and a
+    /// colon if the name alone is ambiguous
     #[arg(long, value_name = "OUTPUT=INPUT", value_parser = pair)]
     wire: Vec<(String, String)>,
-    /// A recorded run (.csv) to be the golden steps, with a column CHANNEL.ELEMENT for all that was observed and action.ELEMENT for all
-    /// that was done
+    /// Recorded run (.csv) that gives the golden steps, with a column CHANNEL.ELEMENT for every
+    /// observed element and action.ELEMENT for every element of the executed action
     #[arg(long, value_name = "FILE")]
     golden: Option<PathBuf>,
-    /// Writes nothing and prints the form to fill in, with all that the files say
+    /// Print the form to fill in, with everything that the files state, and write nothing
     #[arg(long, conflicts_with_all = ["output", "golden"])]
     template: bool,
 }
@@ -51,7 +54,7 @@ fn pair(text: &str) -> Result<(String, String), String> {
     }
 }
 
-/// Imports as requested.
+/// Imports a policy and writes its bundle.
 pub fn import(request: &Request) -> Result<(), Refusal> {
     let asked = lads_import::Request {
         models: request.models.iter().map(PathBuf::as_path).collect(),

@@ -1,7 +1,8 @@
-//! `lads inspect`: what a policy expects and promises, what runs at which step, and how much memory it takes.
+//! `lads inspect`: prints a policy's channels, its schedule, and its memory.
 //!
-//! Everything is read from the compiled image, so a bundle and the image made from it give the same report, but for the file's name.
-//! Of an ONNX file that is no policy, what is missing is listed instead, all of it ([`foreign`]).
+//! Everything is read from the compiled image, so a bundle and the image made from it give the same
+//! report, except for the file's name. For an ONNX file that is not a policy, everything that it
+//! lacks is listed instead ([`foreign`]).
 
 pub mod foreign;
 mod json;
@@ -21,7 +22,8 @@ use crate::line::{self, Form};
 use crate::model::Model;
 use crate::refusal::Refusal;
 
-/// The observations of the golden episode as lines of CSV, the shortest decimal form of each element; all channels, one behind the other.
+/// Formats the observations of the golden episode as lines of CSV, with the shortest decimal form
+/// of each element; all channels, one after the other.
 pub fn observations(model: &Model) -> Result<String, Refusal> {
     let golden = model.policy().golden().ok_or_else(|| {
         Refusal::new(
@@ -46,7 +48,7 @@ pub fn observations(model: &Model) -> Result<String, Refusal> {
     Ok(text)
 }
 
-/// A policy that can describe itself, for people or as JSON.
+/// Report on a policy, for people or as JSON.
 pub struct Report<'m> {
     path: &'m Path,
     opened: &'m Opened,
@@ -56,7 +58,7 @@ pub struct Report<'m> {
 }
 
 impl<'m> Report<'m> {
-    /// The report on a policy that was read from `path`.
+    /// Makes the report on a policy that was read from `path`.
     pub fn of(path: &'m Path, opened: &'m Opened) -> Self {
         let policy = opened.policy();
         let tables = match Tables::new(policy.image()) {
@@ -101,7 +103,7 @@ impl<'m> Report<'m> {
         })
     }
 
-    /// What a port is bound to.
+    /// Describes the binding of a port.
     fn source(&self, port: &PortRecord) -> String {
         let of = port.source.of;
         let state = || {
@@ -123,7 +125,7 @@ impl<'m> Report<'m> {
         }
     }
 
-    /// Name of the KV cache of an entry.
+    /// Returns the name of the KV cache of an entry.
     fn cache(&self, entry: &EntryRecord) -> Option<&'m str> {
         let state = self.tables.state(entry.cache as usize);
         state
@@ -144,7 +146,7 @@ impl<'m> Report<'m> {
 struct State<'m> {
     name: &'m str,
     record: StateRecord,
-    /// Whether calls clear it.
+    /// True if calls clear the state.
     cleared: bool,
 }
 
@@ -157,7 +159,7 @@ impl State<'_> {
         }
     }
 
-    /// How long it lasts.
+    /// Returns the lifetime of the state.
     fn scope(&self) -> &'static str {
         match self.record.scope {
             Scope::Instruction => "instruction",
@@ -166,8 +168,9 @@ impl State<'_> {
         }
     }
 
-    /// What it takes of a controller's state: a ring has one row to spare, a cache that calls clear two halves, and what lasts longer
-    /// than a step a second bank.
+    /// Returns the size of the state in a controller's memory, in bytes: a ring has one row to
+    /// spare, a cache that calls clear two halves, and a state that lasts longer than a step a
+    /// second bank.
     fn bytes(&self) -> u64 {
         let (width, rows) = (u64::from(self.record.width), u64::from(self.record.rows));
         let words = match (self.record.kind, self.record.scope) {

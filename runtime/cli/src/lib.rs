@@ -1,10 +1,13 @@
-//! The `lads` command: looks into a policy, compiles it, tests it on this machine, and drives it from a pipe. No simulator, no Python.
+//! The `lads` command: inspects a policy, compiles it, tests it on this machine, and drives it from
+//! a pipe. No simulator, no Python.
 //!
-//! It is a library for those who offer the same command or the same report elsewhere, such as the Python package: [`command`] is the
-//! command, [`inspect_json`] its report as data, [`chain`] the one line in which it says an error.
+//! It is a library for programs that offer the same command or the same report elsewhere, such as
+//! the Python package: [`command`] is the command, [`inspect_json`] its report as data, [`chain`]
+//! its one-line form of an error.
 //!
-//! Whatever is refused ends with one line on stderr that names the thing and the remedy, and with exit code 2. Files are written as
-//! [`lads_host::output`] has it: whole or not at all, and never over what is read.
+//! Every refusal ends with one line on stderr that names the thing and the remedy, and with exit
+//! code 2. Files are written by [`lads_host::output`]: completely or not at all, and never over an
+//! input.
 #![forbid(unsafe_code)]
 
 mod act;
@@ -33,10 +36,10 @@ use crate::model::Model;
 use crate::refusal::Refusal;
 pub use crate::refusal::chain;
 
-/// Exit code of everything that was refused.
+/// Exit code of every refusal.
 const REFUSED: u8 = 2;
 
-/// Looks into, compiles, tests and drives LADS policies.
+/// Inspects, compiles, tests and drives LADS policies.
 #[derive(Debug, Parser)]
 #[command(name = "lads", version, arg_required_else_help = false)]
 struct Arguments {
@@ -46,18 +49,21 @@ struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Prints channels, schedule, programs, states and memory of a policy; of another ONNX file, all that it misses to be one
+    /// Prints channels, schedule, programs, states and memory of a policy; of another ONNX file,
+    /// everything that it lacks to be a policy
     Inspect {
         /// Bundle (.onnx), compiled image (.lads), or any ONNX file
         model: PathBuf,
-        /// As one JSON object
+        /// Print one JSON object
         #[arg(long)]
         json: bool,
-        /// Instead, the observations of the golden episode as CSV, one per line: input for `lads act`
+        /// Print the observations of the golden episode as CSV instead, one per line: input for
+        /// `lads act`
         #[arg(long, conflicts_with = "json")]
         observations: bool,
     },
-    /// Makes a bundle of any policy.onnx and a description of the robot: raw sensor values in, what the motors get out
+    /// Makes a bundle of any policy.onnx and a description of the robot: raw sensor values in,
+    /// motor commands out
     Import(import::Request),
     /// Compiles a bundle to a program image, and writes it as a file, as source, or both
     Compile(compile::Request),
@@ -74,7 +80,8 @@ enum Command {
         /// Bundle (.onnx) or compiled image (.lads)
         #[arg(long)]
         model: PathBuf,
-        /// What to do: the text or the id of an instruction that the policy knows; none for a policy that takes none
+        /// Instruction to follow: the text or the id of an instruction that the policy knows; none
+        /// for a policy that takes none
         #[arg(long)]
         instruction: Option<String>,
         /// Append the index in force, such as that of a latent plan, to every action
@@ -91,7 +98,8 @@ enum Command {
     Bench(bench::Request),
 }
 
-/// Does what the arguments ask for, the program's name first, and gives the exit code: 0, or 2 where something was refused.
+/// Runs the command with these arguments, the program's name first, and returns the exit code: 0,
+/// or 2 if something was refused.
 pub fn command(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     let arguments = match Arguments::try_parse_from(arguments) {
         Ok(arguments) => arguments,
@@ -117,7 +125,7 @@ pub fn command(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     }
 }
 
-/// What `lads inspect --json` prints of a policy that was read from `path`.
+/// Returns the report that `lads inspect --json` prints on a policy that was read from `path`.
 pub fn inspect_json(path: &Path, opened: &Opened) -> Value {
     inspect::Report::of(path, opened).json()
 }
@@ -188,7 +196,7 @@ fn inspect(path: &Path, json: bool, observations: bool) -> Result<(), Refusal> {
     }
 }
 
-/// Prints to stdout; a reader that has left is no failure.
+/// Prints to stdout; a closed reader is not an error.
 fn print(text: &str) -> Result<(), Refusal> {
     let mut stdout = io::stdout().lock();
     match stdout

@@ -1,44 +1,46 @@
-//! One observation or action per line of text: comma-separated values, or a JSON array of numbers.
+//! Reads and writes one observation or action per line of text: comma-separated values, or a JSON
+//! array of numbers.
 //!
-//! Reading and writing use the shortest decimal form that gives the same f32 back, so a pipe loses nothing. What can fail: a value
-//! that is no number, not finite, or too many or too few of them; the error names the element, counted from 1.
+//! Numbers have the shortest decimal form that gives the same f32 back, so a pipe loses nothing.
+//! What can fail: a value is not a number or not finite, or there are too many or too few; the
+//! error names the element, counted from 1.
 
 use std::fmt::Write as _;
 
-/// How a line is written; an action is answered in the form in which its observation came.
+/// Format of a line; an action is answered in the format of its observation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Form {
-    /// `0.1,0.2,0.3`
+    /// Comma-separated values, `0.1,0.2,0.3`.
     Csv,
-    /// `[0.1,0.2,0.3]`
+    /// JSON array, `[0.1,0.2,0.3]`.
     Json,
 }
 
-/// Why a line holds no observation.
+/// Reason why a line is not an observation.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum LineError {
-    /// Another number of values.
+    /// The number of values is wrong.
     #[error("{got} values, the contract has {expected}")]
     Count {
-        /// Values on the line.
+        /// Number of values on the line.
         got: usize,
-        /// Values in an observation.
+        /// Number of values in an observation.
         expected: usize,
     },
     /// A value that is not a number.
     #[error("value {position} is '{text}', not a number")]
     NotANumber {
-        /// Its place on the line, from 1.
+        /// Position of the value on the line, from 1.
         position: usize,
-        /// What stands there, shortened.
+        /// Text at that position, shortened.
         text: String,
     },
-    /// NaN or an infinity, also by overflow of f32.
+    /// A value is NaN or infinite, also by overflow of f32.
     #[error("value {position} is '{text}', not finite")]
     NotFinite {
-        /// Its place on the line, from 1.
+        /// Position of the value on the line, from 1.
         position: usize,
-        /// What stands there, shortened.
+        /// Text at that position, shortened.
         text: String,
     },
     /// A JSON array without its closing bracket, or something after it.

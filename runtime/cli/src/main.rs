@@ -1,4 +1,4 @@
-//! The `lads` command; [`lads_cli`] has what it does.
+//! The `lads` command, implemented by [`lads_cli`].
 #![forbid(unsafe_code)]
 
 use std::process::ExitCode;

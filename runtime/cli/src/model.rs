@@ -1,4 +1,4 @@
-//! A policy that the command was given: as lads-host opens it, and refusals that name its file.
+//! Opens the policy that is given to a command, with refusals that name its file.
 
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -11,18 +11,20 @@ use crate::refusal::{Refusal, chain};
 
 /// A policy that was read, with its compiled image.
 pub struct Model {
-    /// Where it was read from.
+    /// Path that the policy was read from.
     pub path: PathBuf,
     opened: Opened,
 }
 
 impl Model {
-    /// Reads and, where it is a bundle, compiles the policy at `path`, its numbers stored as it was tuned.
+    /// Reads the policy at `path` and compiles it if it is a bundle, with the formats that it was
+    /// tuned for.
     pub fn open(path: &Path) -> Result<Self, Refusal> {
         Self::compile(path, &Options::default())
     }
 
-    /// The same, stored otherwise; an image has those that it was compiled with.
+    /// Reads the policy at `path` and compiles it if it is a bundle, with these options; an image
+    /// keeps the formats that it was compiled with.
     pub fn compile(path: &Path, options: &Options) -> Result<Self, Refusal> {
         let opened = lads_host::open_with(path, options);
         Ok(Self {
@@ -31,32 +33,33 @@ impl Model {
         })
     }
 
-    /// The policy.
+    /// Returns the policy.
     pub fn opened(&self) -> &Opened {
         &self.opened
     }
 
-    /// Whether it was read from a bundle and compiled, not read as an image.
+    /// Returns whether the policy was read from a bundle and compiled, not read as an image.
     pub fn is_bundle(&self) -> bool {
         self.opened.is_bundle()
     }
 
-    /// The compiled image.
+    /// Returns the compiled image.
     pub fn image(&self) -> &[u8] {
         self.opened.image()
     }
 
-    /// The checked view on the image.
+    /// Returns the checked view on the image.
     pub fn policy(&self) -> Policy<'_> {
         self.opened.policy()
     }
 
-    /// What is wrong with the policy, by an error that says itself what to do.
+    /// Makes a refusal of the policy from an error that names the remedy itself.
     pub fn refused(&self, error: impl Display) -> Refusal {
         Refusal::with_remedy_inside(self.path.display(), error)
     }
 
-    /// The number of the instruction with this id, or with this text up to case and white space.
+    /// Returns the number of the instruction with this id, or with this text up to case and white
+    /// space.
     pub fn instruction(&self, wanted: &str) -> Result<u32, Refusal> {
         self.opened.instruction(wanted).map_err(Refusal::of)
     }

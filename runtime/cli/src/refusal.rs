@@ -1,27 +1,28 @@
-//! The one line with which the command refuses: what it is about, what is wrong with it, what to do. Where a person has to settle many
-//! things at once, there is a line for each of them below.
+//! The one line with which the command refuses: the thing, the fault, the remedy. If a person has
+//! to settle many things at once, a line for each follows.
 //!
 //! Invariant: every line of a printed refusal was made here, whatever the errors underneath contain.
 
 use std::error::Error;
 use std::fmt::{self, Display};
 
-/// Why the command ended without doing what it was asked; exit code 2.
+/// Reason why the command ended without doing its work; exit code 2.
 #[derive(Debug)]
 pub struct Refusal(String);
 
 impl Refusal {
-    /// `thing` (a path, an argument, a line of input), what is wrong with it, and the remedy.
+    /// Makes a refusal from the `thing` (a path, an argument, a line of input), its fault, and the
+    /// remedy.
     pub fn new(thing: impl Display, wrong: impl Display, remedy: impl Display) -> Self {
         Self(one_line(&format!("{thing}: {wrong}; {remedy}")))
     }
 
-    /// An error that names the thing and the remedy itself.
+    /// Makes a refusal from an error that names the thing and the remedy itself.
     pub fn of(error: impl Display) -> Self {
         Self(one_line(&error.to_string()))
     }
 
-    /// All that is wrong with `thing`, a line for each, and the remedy.
+    /// Makes a refusal that lists all faults of `thing`, a line for each, and the remedy.
     pub fn list(
         thing: impl Display,
         wrong: impl Iterator<Item = String>,
@@ -36,7 +37,7 @@ impl Refusal {
         Self(format!("{head}\n{}", wrong.join("\n")))
     }
 
-    /// The same with an error that says itself what to do.
+    /// Makes a refusal from the `thing` and an error that names the remedy itself.
     pub fn with_remedy_inside(thing: impl Display, error: impl Display) -> Self {
         Self(one_line(&format!("{thing}: {error}")))
     }
@@ -48,7 +49,7 @@ impl Display for Refusal {
     }
 }
 
-/// An error and what caused it, as one line.
+/// Formats an error and its causes as one line.
 pub fn chain(error: &dyn Error) -> String {
     let mut text = error.to_string();
     let mut source = error.source();
@@ -63,7 +64,7 @@ pub fn chain(error: &dyn Error) -> String {
     one_line(&text)
 }
 
-/// Joins lines and drops what does not print.
+/// Joins lines and drops unprintable characters.
 pub fn one_line(text: &str) -> String {
     let words = text.split(|c: char| c.is_whitespace() || c.is_control());
     words

@@ -1,7 +1,8 @@
-//! What is observed in one control step, as a line of numbers and as values of channels.
+//! Observation of one control step, as a line of numbers and as values of channels.
 //!
-//! Invariant: there are as many values as the observation channels have elements, one channel behind the other. What can fail: a line
-//! that is none, or a number that is no value of its channel's type; the message names channel and element.
+//! Invariant: there are as many values as the observation channels have elements, one channel after
+//! the other. What can fail: an invalid line, or a number that is not a value of its channel's
+//! type; the message names channel and element.
 
 use lads_core::{Channel, ChannelId, Contract, DType, Data};
 
@@ -10,7 +11,7 @@ use crate::line::{self, Form, LineError};
 /// The observation channels of a policy and their values.
 pub struct Seen {
     channels: Vec<Values>,
-    /// All values as they were read.
+    /// All values in the order in which they were read.
     numbers: Vec<f32>,
 }
 
@@ -18,7 +19,7 @@ pub struct Seen {
 struct Values {
     id: ChannelId,
     name: String,
-    /// Names of the elements; none for images and the like.
+    /// Names of the elements; empty for images and the like.
     elements: Vec<String>,
     held: Held,
 }
@@ -30,7 +31,7 @@ enum Held {
 }
 
 impl Seen {
-    /// Zeros for the observation channels of a policy.
+    /// Makes zeros for the observation channels of a policy.
     pub fn of(contract: &Contract) -> Self {
         let channels: Vec<Values> = contract
             .observations()
@@ -40,12 +41,12 @@ impl Seen {
         Self { channels, numbers }
     }
 
-    /// Elements of all channels.
+    /// Returns the number of elements of all channels.
     pub fn len(&self) -> usize {
         self.numbers.len()
     }
 
-    /// Takes the values of a line.
+    /// Reads the values of a line.
     pub fn read(&mut self, text: &str) -> Result<Form, String> {
         let form = line::parse(text, &mut self.numbers).map_err(|error| match error {
             LineError::NotANumber { position, .. } | LineError::NotFinite { position, .. } => {
@@ -69,7 +70,7 @@ impl Seen {
         Ok(form)
     }
 
-    /// The values, channel by channel.
+    /// Returns the values, channel by channel.
     pub fn given(&self) -> Vec<(ChannelId, Data<'_>)> {
         fn data(held: &Held) -> Data<'_> {
             match held {
@@ -82,7 +83,7 @@ impl Seen {
         all.map(|values| (values.id, data(&values.held))).collect()
     }
 
-    /// Channel and element of the value at a place.
+    /// Names channel and element of the value at a position.
     fn at(&self, mut place: usize) -> String {
         for values in &self.channels {
             if place < values.held.len() {
@@ -111,7 +112,7 @@ impl Values {
         }
     }
 
-    /// Element `i` by its names.
+    /// Names element `i`.
     fn element(&self, i: usize) -> String {
         let name = self.elements.get(i).map(|name| format!(" `{name}`"));
         let name = name.unwrap_or_default();
@@ -136,7 +137,7 @@ impl Held {
         }
     }
 
-    /// Takes values over; the first that is none of the type is an error.
+    /// Copies values; an error is the index of the first that is not of the channel's type.
     fn take(&mut self, from: &[f32]) -> Result<(), usize> {
         let whole = |value: f32, min: f64, max: f64| {
             value.fract() == 0.0 && (min..=max).contains(&f64::from(value))

@@ -6,7 +6,8 @@ use lads_host::Memory;
 use crate::model::Model;
 use crate::refusal::Refusal;
 
-/// Replays the golden episode and says in one line how it went; a policy without one is refused.
+/// Replays the golden episode and describes the result in one line; a policy without one is
+/// refused.
 pub fn self_test(model: &Model) -> Result<String, Refusal> {
     let policy = model.policy();
     let mut memory = Memory::of(&policy).map_err(|error| model.refused(error))?;
@@ -23,7 +24,7 @@ pub fn self_test(model: &Model) -> Result<String, Refusal> {
     }
 }
 
-/// Replays the golden episode, if there is one, and leaves the controller fresh.
+/// Replays the golden episode, if there is one, and leaves the controller reset.
 pub fn replay(
     model: &Model,
     policy: &Policy<'_>,

@@ -1,4 +1,4 @@
-//! `lads act`: observations in, actions out, through a pipe.
+//! Tests of `lads act`: observations in, actions out, through a pipe.
 
 mod common;
 

@@ -1,4 +1,4 @@
-//! `lads bench`.
+//! Tests of `lads bench`.
 
 mod common;
 

@@ -1,4 +1,4 @@
-//! `lads compile`: the gate of fewer bits, and the files that it writes.
+//! Tests of `lads compile`: the gate of fewer bits, and the files that it writes.
 
 mod common;
 

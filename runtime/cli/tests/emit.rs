@@ -1,4 +1,5 @@
-//! Images as source: what a compiler makes of them is the image, byte for byte, where an image may start.
+//! Tests that images as source compile to the image, byte for byte, at an address where an image
+//! may start.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -25,7 +26,7 @@ fn emit(arguments: &[&str]) -> Output {
         .expect("it runs")
 }
 
-/// The bytes that a compiler's program prints.
+/// Returns the bytes that a compiler's program prints.
 fn printed(compiler: &mut Command, program: &Path) -> Vec<u8> {
     let output = compiler.output().expect("the compiler runs");
     let errors = String::from_utf8_lossy(&output.stderr);

@@ -1,4 +1,4 @@
-//! Files and arguments that no command takes, and the self-test.
+//! Tests of files and arguments that no command accepts, and of the self-test.
 
 mod common;
 
@@ -112,14 +112,15 @@ fn bad_files_are_refused_by_every_command() {
     refused(&["inspect", &older], "", &parts);
 }
 
-/// First word of a section.
+/// Returns the first word of a section.
 fn section(words: &[u32], tag: Tag) -> usize {
     let (rows, _) = words[TABLE_WORD..].as_chunks::<3>();
     let mut rows = rows.iter().take(words[COUNT_WORD] as usize);
     rows.find(|row| row[0] == tag as u32).unwrap()[1] as usize / 4
 }
 
-/// An image with an entry whose arena has `elements`, and, where it is to be used, an op over all of it.
+/// Makes an image with an entry whose arena has `elements`, and, if it is to be used, an op over
+/// all of it.
 fn greedy(image: &[u8], elements: u32, used: bool) -> Vec<u8> {
     let tables = Tables::new(image).unwrap();
     let mut entries = (0..tables.entries_len()).map(|i| tables.entry(i).unwrap());

@@ -1,4 +1,4 @@
-//! `lads import`: what it writes, what it refuses, and that a refusal leaves nothing behind.
+//! Tests of `lads import`: its output, its refusals, and that a refusal leaves nothing behind.
 
 mod common;
 

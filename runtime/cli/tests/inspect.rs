@@ -1,4 +1,5 @@
-//! `lads inspect`: what a policy expects, runs and needs; what a foreign file misses.
+//! Tests of `lads inspect`: a policy's channels, schedule and memory, and the gaps of a foreign
+//! file.
 
 mod common;
 
@@ -100,7 +101,7 @@ fn inspect_shows_what_runs_at_which_step() {
     }
 }
 
-/// A field of a protocol buffer: its number, and text or a message.
+/// Encodes a field of a protocol buffer: its number, and text or a message.
 fn field(number: u8, content: &[u8]) -> Vec<u8> {
     let mut len = content.len();
     let mut bytes = vec![number << 3 | 2];
@@ -112,7 +113,7 @@ fn field(number: u8, content: &[u8]) -> Vec<u8> {
     [bytes, content.to_vec()].concat()
 }
 
-/// A node of an ONNX graph.
+/// Encodes a node of an ONNX graph.
 fn node(operator: &str, name: &str, input: &str, output: &str) -> Vec<u8> {
     let [input, output] =
         [(1, input), (2, output)].map(|(number, text)| field(number, text.as_bytes()));
@@ -120,7 +121,8 @@ fn node(operator: &str, name: &str, input: &str, output: &str) -> Vec<u8> {
     field(1, &[input, output, named].concat())
 }
 
-/// An f32 value `[batch, len]` at the edge of an ONNX graph, by the number of the graph's field.
+/// Encodes an f32 input or output `[batch, len]` of an ONNX graph, by the number of the graph's
+/// field.
 fn edge(number: u8, name: &str, len: u8) -> Vec<u8> {
     let dims = [field(1, &field(2, b"batch")), field(1, &[1 << 3, len])].concat();
     let tensor = [vec![1 << 3, 1], field(2, &dims)].concat();
@@ -130,7 +132,8 @@ fn edge(number: u8, name: &str, len: u8) -> Vec<u8> {
     )
 }
 
-/// A recurrent policy as somebody else exports one: no contract, and operators of which three are not known.
+/// Makes a recurrent policy as a foreign exporter would: no contract, and operators of which three
+/// are not known.
 fn stranger() -> Vec<u8> {
     let nodes = [
         node("Tanh", "squash", "obs", "a"),

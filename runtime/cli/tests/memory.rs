@@ -1,4 +1,5 @@
-//! The memory contract: what the shipped policy takes, as `lads inspect` tells it, stays within its budget file.
+//! Tests that the memory of the shipped policy, as `lads inspect` reports it, stays within its
+//! budget file.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -6,7 +7,7 @@ use std::process::Command;
 
 use serde_json::Value;
 
-/// Tolerated growth, in per cent: more needs a decision, and a new number in the file.
+/// Tolerated growth in per cent: more needs a decision, and a new number in the file.
 const GROWTH: u64 = 3;
 
 #[test]
@@ -51,7 +52,7 @@ fn the_small_kitchen_policy_fits_a_microcontroller() {
     }
 }
 
-/// What `lads inspect` says of a policy's sizes, in bytes.
+/// Returns a policy's sizes in bytes, as `lads inspect` reports them.
 fn sizes(path: &Path) -> Value {
     let output = Command::new(env!("CARGO_BIN_EXE_lads"))
         .arg("inspect")

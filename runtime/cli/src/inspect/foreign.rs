@@ -1,4 +1,4 @@
-//! An ONNX file that is no policy: what it holds, and all that is missing.
+//! Report on an ONNX file that is not a policy: its content, and everything that it lacks.
 
 use std::fmt::{self, Display, Formatter};
 use std::path::Path;
@@ -6,21 +6,21 @@ use std::path::Path;
 use lads_compiler::{Missing, Operand, Operator, Survey, Value as Edge};
 use serde_json::{Value, json};
 
-/// What a file that is no policy holds and misses.
+/// Content and gaps of a file that is not a policy.
 pub struct Foreign<'p> {
     path: &'p Path,
     survey: Survey,
 }
 
 impl<'p> Foreign<'p> {
-    /// Looks into the file, if it is an ONNX model that misses something.
+    /// Surveys the file, if it is an ONNX model that is not a complete policy.
     pub fn look(path: &'p Path) -> Option<Self> {
         let bytes = lads_host::input::read(path).ok()?;
         let survey = lads_compiler::survey(&bytes).ok()?;
         (!survey.missing.is_empty()).then_some(Self { path, survey })
     }
 
-    /// Everything as one JSON object.
+    /// Formats everything as one JSON object.
     pub fn json(&self) -> Value {
         let Survey {
             opset,

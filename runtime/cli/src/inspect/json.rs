@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use super::{Report, State, beyond, bytes, dtype, event, quaternions, role, steps};
 
 impl Report<'_> {
-    /// Everything as one JSON object.
+    /// Formats everything as one JSON object.
     pub fn json(&self) -> Value {
         let contract = self.policy.contract();
         let golden = self.policy.golden();
@@ -184,7 +184,7 @@ fn noise_json(noise: Noise) -> Value {
     }
 }
 
-/// An f32 as the f64 of its shortest decimal form.
+/// Converts an f32 to the f64 of its shortest decimal form.
 fn decimal(value: f32) -> f64 {
     value
         .to_string()

@@ -1,4 +1,4 @@
-//! Runs the command, for all suites of this crate.
+//! Runs the command, for all tests of this crate.
 #![allow(dead_code, reason = "each suite uses its own part")]
 
 use std::fs;
@@ -27,7 +27,7 @@ pub fn lads(arguments: &[&str], input: &str) -> Output {
     child.wait_with_output().unwrap()
 }
 
-/// What `lads` prints when it succeeds.
+/// Returns the output of `lads` when it succeeds.
 pub fn answer(arguments: &[&str], input: &str) -> String {
     let output = lads(arguments, input);
     assert!(
@@ -39,7 +39,7 @@ pub fn answer(arguments: &[&str], input: &str) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// Exit code 2 and one line on stderr with all `parts`; returns what was on stdout.
+/// Asserts exit code 2 and one line on stderr with all `parts`; returns the text on stdout.
 pub fn refused(arguments: &[&str], input: &str, parts: &[&str]) -> String {
     let output = lads(arguments, input);
     let errors = String::from_utf8_lossy(&output.stderr);
@@ -81,7 +81,7 @@ pub fn numbers(line: &str) -> Vec<f32> {
         .collect()
 }
 
-/// A copy of the small bundle in which one text of its metadata is another of the same length.
+/// Copies the small bundle, with one text of its metadata replaced by another of the same length.
 pub fn altered(folder: &Path, from: &str, to: &str) -> String {
     assert_eq!(from.len(), to.len());
     let mut bytes = fs::read(tiny()).unwrap();
