@@ -1,9 +1,11 @@
-//! The bundle's graph: the policy's own nodes, and in front of and behind them what turns raw sensor values into its inputs and its
-//! output into what the robot gets.
+//! Builds the bundle's graph: the policy's own nodes, with nodes before and after them that turn
+//! raw sensor values into its inputs and its output into the robot's commands.
 //!
-//! Everything added is made of `Add Cast Concat Div Gather Identity MatMul Max Min Mul Reshape Sqrt Sub Transpose`, which
-//! mean the same in every operator set. Values of the policy keep their names behind the number of their file; nothing else of the files
-//! is taken over. What can fail: files of different operator sets.
+//! All added nodes are of the operators
+//! `Add Cast Concat Div Gather Identity MatMul Max Min Mul Reshape Sqrt Sub Transpose`, which mean
+//! the same in every operator set. Values of the policy keep their names, prefixed with the number
+//! of their file; nothing else of the files is kept. What can fail: files of different operator
+//! sets.
 
 mod states;
 mod terms;
@@ -20,23 +22,23 @@ use crate::problem::Problems;
 
 pub(crate) use states::Kept;
 
-/// The entry of a plain policy.
+/// Name of the entry of a plain policy.
 const ENTRY: &str = "policy/act";
 
 /// ONNX's numbers for the types of attributes.
 const INT: i32 = 2;
 const INTS: i32 = 7;
 
-/// A graph that grows.
+/// A graph under construction.
 #[derive(Default)]
 struct Net {
     graph: GraphProto,
-    /// States beside those of the policy's own graphs.
+    /// States besides those of the policy's own graphs.
     kept: Vec<Kept>,
     values: usize,
 }
 
-/// The graph, and the states that the contract has to name.
+/// Builds the graph, and the states that the contract has to name.
 pub(crate) fn build(
     models: &[Model],
     plan: &Plan,
@@ -94,17 +96,17 @@ pub(crate) fn build(
     Some((model, net.kept))
 }
 
-/// The name of a value of the entry.
+/// Returns the name of a value of the entry.
 fn entry(name: &str) -> String {
     format!("{ENTRY}/{name}")
 }
 
-/// What a value of a policy's file is called in the bundle.
+/// Returns the name in the bundle of a value of a policy's file.
 fn inside(edge: &Edge) -> String {
     format!("{}/{}", edge.file, edge.name)
 }
 
-/// The operator sets, which all files share.
+/// Returns the operator sets, which all files must share.
 fn opsets(models: &[Model], problems: &mut Problems) -> Option<Vec<OperatorSetIdProto>> {
     let of = |model: &Model| {
         let sets = model.proto.opset_import.iter();
@@ -127,7 +129,7 @@ fn opsets(models: &[Model], problems: &mut Problems) -> Option<Vec<OperatorSetId
     Some(models.first()?.proto.opset_import.clone())
 }
 
-/// The files, each after those whose outputs it reads.
+/// Returns the files in order, each after those whose outputs it reads.
 fn order(files: usize, plan: &Plan, problems: &mut Problems) -> Option<Vec<usize>> {
     let reads = |file: usize| {
         plan.feeds
@@ -150,7 +152,7 @@ fn order(files: usize, plan: &Plan, problems: &mut Problems) -> Option<Vec<usize
 }
 
 impl Net {
-    /// A new node with one output, which is returned.
+    /// Adds a node with one output, and returns the output.
     fn op(&mut self, operator: &str, inputs: &[&str], attributes: Vec<AttributeProto>) -> String {
         let output = format!("edge/{}", self.values);
         self.values += 1;
@@ -220,7 +222,7 @@ impl Net {
         self.op("Reshape", &[value, &wanted], vec![])
     }
 
-    /// A value becomes an input of one of the policy's graphs.
+    /// Makes a value an input of one of the policy's graphs.
     fn arrive(&mut self, edge: &Edge, value: &str) {
         let shaped = self.shaped(value, &edge.dims);
         let full = inside(edge);
@@ -232,7 +234,7 @@ impl Net {
         }
     }
 
-    /// An output of one of the policy's graphs, as floats of a shape.
+    /// Returns an output of one of the policy's graphs, as floats of a shape.
     fn leave(&mut self, edge: &Edge, shape: &[usize]) -> String {
         let mut value = inside(edge);
         if edge.elem_type != data_type::FLOAT {
@@ -246,7 +248,7 @@ impl Net {
         }
     }
 
-    /// The nodes and weights of a file.
+    /// Adds the nodes and weights of a file.
     fn take(&mut self, file: usize, model: &Model) {
         let graph = model.graph();
         let own = |name: &String| {
@@ -272,7 +274,8 @@ impl Net {
         }
     }
 
-    /// Columns of a value `[rows, width]`, or the value itself if they are all of it in order.
+    /// Selects columns of a value `[rows, width]`; returns the value itself if they are all of it
+    /// in order.
     fn columns(&mut self, value: String, columns: &[usize], width: usize) -> String {
         if columns.len() == width && columns.iter().enumerate().all(|(i, &column)| i == column) {
             return value;
@@ -300,7 +303,7 @@ impl Net {
         self.op("Transpose", &[value], vec![perm])
     }
 
-    /// `value * scale`, left out where it changes nothing.
+    /// Multiplies a value by a scale, `value * scale`; adds no node if that changes nothing.
     fn scaled(&mut self, value: String, scale: &[f64]) -> String {
         if scale.iter().all(|&scale| scale == 1.0) {
             return value;
@@ -309,7 +312,7 @@ impl Net {
         self.op("Mul", &[&value, &scale], vec![])
     }
 
-    /// A sum or a difference with an offset, left out where it changes nothing.
+    /// Adds or subtracts an offset; adds no node if that changes nothing.
     fn moved(&mut self, operator: &str, value: String, offset: &[f64]) -> String {
         if offset.iter().all(|&offset| offset == 0.0) {
             return value;

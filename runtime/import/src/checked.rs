@@ -1,6 +1,7 @@
-//! The golden steps, and whether the recording and the compiled policy do what the graph says.
+//! Checks the golden steps: the recording and the compiled policy have to agree with the graph.
 //!
-//! What can fail: an action is no number, or further from the graph's than the tolerance; it is told by its name and its step.
+//! What can fail: an action is not a number, or further from the graph's than the tolerance; the
+//! error names it and its step.
 
 use lads_compiler::{Bundle, CompileError, Reference};
 use lads_core::{ChannelId, Data};
@@ -10,10 +11,10 @@ use crate::golden::{self, Episode};
 use crate::plan::Plan;
 use crate::problem::Problems;
 
-/// What the tolerance is of how far an action moves, where nobody says one.
+/// Default tolerance, as a share of how far an action moves.
 const SHARE: f64 = 1e-3;
 
-/// The smallest tolerance, of an action's size: some roundings to 32 bits.
+/// Smallest tolerance, as a share of an action's size: some roundings to 32 bits.
 const LEAST: f64 = 1e-6;
 
 /// Golden steps, and the largest difference of an action that counts as equal.
@@ -22,7 +23,7 @@ pub(crate) struct Steps {
     pub tolerance: f64,
 }
 
-/// Recorded steps, which have to be what the graph does, or made-up ones.
+/// Returns recorded steps, which have to agree with the graph, or made-up ones.
 pub(crate) fn steps(
     reference: &mut Reference,
     plan: &Plan,
@@ -51,7 +52,7 @@ pub(crate) fn steps(
     Ok(Steps { episode, tolerance })
 }
 
-/// A share of how far the element that moves farthest moves.
+/// Returns the default tolerance: a share of how far the element that moves farthest moves.
 fn tolerance(actions: &[Vec<f64>]) -> f64 {
     let width = actions.first().map_or(0, Vec::len);
     let wanted = (0..width).map(|i| {
@@ -108,7 +109,7 @@ pub(crate) fn compared(
     ))
 }
 
-/// The largest difference; the first one beyond the tolerance is a problem.
+/// Returns the largest difference; the first one beyond the tolerance is added to the problems.
 fn differences(
     graph: &[Vec<f64>],
     other: &[Vec<f64>],

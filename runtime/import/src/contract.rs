@@ -7,7 +7,8 @@ use crate::model::Model;
 use crate::plan::{Channel, Element, Plan};
 use crate::robot::QuaternionOrder;
 
-/// Of the files only their digests are named: what else is in them may be private.
+/// Formats the contract; it names only the digests of the files, because their other content may be
+/// private.
 pub(crate) fn contract(models: &[Model], plan: &Plan, states: &[Kept]) -> String {
     let mut channels: Vec<Value> = plan.channels.iter().map(observation).collect();
     channels.push(json!({

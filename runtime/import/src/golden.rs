@@ -1,6 +1,8 @@
-//! Golden steps: what the policy does on made-up or recorded observations, computed in double precision from the graph.
+//! Golden steps: the policy's actions on made-up or recorded observations, computed in double
+//! precision from the graph.
 //!
-//! What can fail: the graph gives what is no number, a recording misses a column or does something else than the graph says.
+//! What can fail: the graph's output is not a number, a recording misses a column or differs from
+//! the graph.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -15,21 +17,22 @@ use safetensors::tensor::TensorView;
 use crate::plan::{Element, Plan};
 use crate::problem::Problems;
 
-/// Steps of a made-up episode.
+/// Number of steps of a made-up episode.
 pub(crate) const STEPS: usize = 64;
 
-/// The step before which a comparison starts a second episode.
+/// Step before which a comparison starts a second episode.
 pub(crate) const RESET: usize = 40;
 
-/// The most steps of a recording that become golden ones; all of them are compared.
+/// Largest number of steps of a recording that become golden ones; all of them are compared.
 const KEPT: usize = 256;
 
-/// Steps: the values of each channel, the actions, and where episodes begin.
+/// Steps of one or more episodes: the values of each channel, the actions, and where episodes
+/// begin.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Episode {
-    /// `[channel][step][element]`
+    /// Values of the channels, `[channel][step][element]`.
     pub channels: Vec<Vec<Vec<f64>>>,
-    /// `[step][element]`
+    /// Actions, `[step][element]`.
     pub actions: Vec<Vec<f64>>,
     pub begins: Vec<bool>,
 }
@@ -39,13 +42,13 @@ impl Episode {
         self.begins.len()
     }
 
-    /// The values of every channel in a step.
+    /// Returns the values of every channel in a step.
     pub fn observed(&self, step: usize) -> Vec<Vec<f64>> {
         let rows = self.channels.iter();
         rows.map(|rows| rows[step].clone()).collect()
     }
 
-    /// The first episode, with its actions, as the bundle's metadata has it.
+    /// Encodes the first episode, with its actions, for the bundle's metadata.
     pub fn golden(&self, plan: &Plan, tolerance: f64) -> Result<String, String> {
         let second = self.begins.iter().skip(1).position(|&begins| begins);
         let steps = second.map_or(self.len(), |at| at + 1).min(KEPT);
@@ -80,7 +83,7 @@ impl Episode {
     }
 }
 
-/// Smooth made-up observations well inside their limits, with a second episode.
+/// Makes smooth observations well inside their limits, with a second episode.
 pub(crate) fn made_up(plan: &Plan) -> Episode {
     let mut random = Pcg32::new(1, 1);
     let mut uniform = move || f64::from(random.next_u32()) / f64::from(u32::MAX);
@@ -109,7 +112,7 @@ pub(crate) fn made_up(plan: &Plan) -> Episode {
     }
 }
 
-/// What the graph does on the observations of an episode.
+/// Computes the graph's actions on the observations of an episode.
 pub(crate) fn computed(
     reference: &mut Reference,
     episode: &Episode,
@@ -124,8 +127,9 @@ pub(crate) fn computed(
     Ok(actions)
 }
 
-/// A recorded run: a column `CHANNEL.ELEMENT` for everything observed, `action.ELEMENT` for everything done, and if there are several
-/// episodes a column `reset` that is 1 where one begins.
+/// Reads a recorded run: a column `CHANNEL.ELEMENT` for every observed element, `action.ELEMENT`
+/// for every element of the executed action, and if there are several episodes a column `reset`
+/// that is 1 where one begins.
 pub(crate) fn recorded(path: &Path, plan: &Plan, problems: &mut Problems) -> Option<Episode> {
     let about = path.display().to_string();
     let mut reader = match csv::ReaderBuilder::new()

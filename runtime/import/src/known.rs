@@ -1,13 +1,15 @@
-//! Observation terms whose meaning the frameworks define: Isaac Lab, mjlab and unitree's tools name them alike.
+//! Observation terms whose meaning the frameworks define: Isaac Lab, mjlab and unitree's tools use
+//! the same names.
 //!
-//! Only what follows from the definition stands here. Limits of a sensor, and what a command asks for, are said by a person.
+//! Only facts that follow from the definition are listed here. A person states the limits of a
+//! sensor, and the meaning of a command.
 
 use crate::robot::{Each, From, Term};
 
-/// What is known of a term by its name.
+/// Facts about a term that follow from its name.
 pub(crate) struct Known {
     pub term: Term,
-    /// Joint positions relative to the default posture, by definition.
+    /// True if joint positions are relative to the default posture, by definition.
     pub relative: bool,
 }
 

@@ -1,4 +1,5 @@
-//! Makes a policy bundle of any ONNX policy file: graphs, what is said of the robot, golden steps.
+//! Makes a policy bundle of any ONNX policy file: its graphs, a description of the robot, golden
+//! steps.
 //!
 //! ```text
 //! policy.onnx ─► model ─┐
@@ -6,9 +7,11 @@
 //! robot.toml ─► robot ──┘
 //! ```
 //!
-//! The bundle does the hand-written part too: raw sensor values in, what the robot's motors get out. Nothing is guessed: what neither the
-//! files nor the person say, and what contradicts, is told all at once ([`ImportError::Problems`]), and [`template`] prints the form to
-//! fill in. Files may be hostile; nothing private of them (paths, robot descriptions) enters the bundle, and nothing in them is executed.
+//! The bundle includes the processing that is otherwise written by hand: raw sensor values in,
+//! motor commands out. Nothing is guessed: everything that neither the files nor the person state,
+//! and every contradiction, is reported at once ([`ImportError::Problems`]), and [`template`]
+//! prints the form to fill in. Files may be hostile; nothing private of them (paths, robot
+//! descriptions) enters the bundle, and nothing in them is executed.
 #![forbid(unsafe_code)]
 
 mod build;
@@ -38,7 +41,7 @@ use crate::said::{Gain, Said};
 
 pub use problem::{Problem, Problems};
 
-/// Files that are looked for beside a policy.
+/// Names of files that are looked for beside a policy.
 const NEIGHBOURS: [&str; 4] = [
     "deploy.yaml",
     "params/deploy.yaml",
@@ -46,44 +49,44 @@ const NEIGHBOURS: [&str; 4] = [
     "manifest.json",
 ];
 
-/// What to import.
+/// Files and choices of an import.
 #[derive(Debug, Clone, Default)]
 pub struct Request<'r> {
-    /// The policy's files; of several, one's output is the input of another.
+    /// Files of the policy; of several, one's output is the input of another.
     pub models: Vec<&'r Path>,
-    /// What a person says about the robot, as TOML.
+    /// Description of the robot by a person, as TOML.
     pub robot: Option<&'r Path>,
-    /// Files that say something about the policy, beside those that are found by their names.
+    /// Further files that describe the policy, besides those that are found by their names.
     pub beside: Vec<&'r Path>,
-    /// The output that is the action, where there are several.
+    /// Name of the output that is the action, if there are several.
     pub output: Option<&'r str>,
-    /// Inputs and the outputs that are their next values.
+    /// Names of inputs and of the outputs that are their next values.
     pub states: Vec<(String, String)>,
-    /// Outputs and the inputs that read them in the same step.
+    /// Names of outputs and of the inputs that read them in the same step.
     pub wires: Vec<(String, String)>,
-    /// A recorded run, to be the golden steps.
+    /// A recorded run that gives the golden steps.
     pub golden: Option<&'r Path>,
 }
 
-/// A bundle, and what is worth saying about how it came to be.
+/// A bundle, with notes on how it was made.
 #[derive(Debug, Clone)]
 pub struct Imported {
     /// The bundle, a complete ONNX file.
     pub bundle: Vec<u8>,
-    /// One line for each thing that was read or found out.
+    /// Notes, one line for each fact that was read or found.
     pub notes: Vec<String>,
 }
 
-/// Why there is no bundle.
+/// Reason why there is no bundle.
 #[derive(Debug, thiserror::Error)]
 pub enum ImportError {
-    /// A file that is no policy at all.
+    /// A file is not a policy at all.
     #[error(transparent)]
     File(#[from] BundleError),
-    /// All that is missing and all that contradicts.
+    /// The import misses something or contradicts itself.
     #[error("{count} to settle:\n{problems}", count = things(.problems.all().len()))]
     Problems {
-        /// One line for each.
+        /// All problems, one line for each.
         problems: Problems,
     },
     /// The policy cannot be compiled.
@@ -99,7 +102,7 @@ fn things(count: usize) -> String {
     }
 }
 
-/// What is known before anything is decided.
+/// Facts that are known before anything is resolved.
 struct Known {
     models: Vec<Model>,
     robot: Robot,
@@ -107,7 +110,7 @@ struct Known {
     problems: Problems,
 }
 
-/// Makes a bundle.
+/// Imports a policy and makes its bundle.
 pub fn import(request: &Request) -> Result<Imported, ImportError> {
     let Known {
         models,
@@ -165,7 +168,8 @@ pub fn import(request: &Request) -> Result<Imported, ImportError> {
     Ok(Imported { bundle, notes })
 }
 
-/// The form to fill in: all that is known, all that is missing with what it means, and what is wrong with the files.
+/// Makes the form to fill in: everything known, everything missing with its meaning, and the faults
+/// of the files.
 pub fn template(request: &Request) -> Result<String, ImportError> {
     let mut known = known(request)?;
     let edges = Edges::of(&known.models, &known.robot.axes, &mut known.problems);
@@ -258,7 +262,7 @@ fn read_text(path: &Path) -> Result<String, String> {
     lads_host::input::read_to_string(path).map_err(|error| format!("cannot be read: {error}"))
 }
 
-/// Files that were named, and those that lie beside the policy.
+/// Returns the files that were named, and those that lie beside the policy.
 fn neighbours(request: &Request) -> Vec<PathBuf> {
     let mut all: Vec<PathBuf> = request.beside.iter().map(|&path| path.into()).collect();
     for model in &request.models {

@@ -1,7 +1,8 @@
-//! The policy files themselves: read, their external data brought in, their values listed.
+//! Reads the policy files: the model, its external data, its inputs and outputs.
 //!
-//! What can fail: a file is no ONNX model, or one that is cut off; external data is missing, short, larger than it says, or lies outside the
-//! model's folder; names are given twice, nodes form a cycle, a weight is no number. Each is a problem with its name.
+//! What can fail: a file is not an ONNX model, or a truncated one; external data is missing, short,
+//! larger than stated, or outside the model's folder; names are given twice, nodes form a cycle, a
+//! weight is not a number. Each is a problem with its name.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fs::File;
@@ -19,14 +20,14 @@ use crate::problem::Problems;
 
 /// A policy file.
 pub(crate) struct Model {
-    /// The file's name without its ending, which tells values of several files apart.
+    /// File name without its ending, which distinguishes values of several files.
     pub stem: String,
     pub path: PathBuf,
     pub proto: ModelProto,
     pub sha256: String,
 }
 
-/// A value that a graph reads or gives.
+/// An input or output of a graph.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Edge {
     /// Index of the file.
@@ -42,11 +43,12 @@ impl Edge {
     }
 }
 
-/// Largest number of elements of a value at a graph's edge.
+/// Largest number of elements of a graph's input or output.
 const MAX_LEN: usize = 1 << 20;
 
 impl Model {
-    /// Reads a file. What is wrong inside of it is added to the problems; an error is what makes reading on senseless.
+    /// Reads a file. Faults inside the file are added to the problems; an error means that the file
+    /// cannot be read further.
     pub fn read(path: &Path, problems: &mut Problems) -> Result<Self, BundleError> {
         let named = |source: BundleError| BundleError::File {
             path: path.into(),
@@ -72,7 +74,8 @@ impl Model {
         })
     }
 
-    /// Nodes that the compiler does not take, with the lengths of the axes that are known by now.
+    /// Returns the nodes that the compiler does not support, with the lengths of the axes that are
+    /// known so far.
     pub fn operators(
         &self,
         axes: &BTreeMap<String, usize>,
@@ -106,13 +109,13 @@ impl Model {
             .unwrap_or_else(|| NONE.get_or_init(GraphProto::default))
     }
 
-    /// Metadata of the file.
+    /// Returns the metadata of the file.
     pub fn metadata(&self) -> impl Iterator<Item = (&str, &str)> {
         let pairs = self.proto.metadata_props.iter();
         pairs.map(|pair| (pair.key.as_str(), pair.value.as_str()))
     }
 
-    /// The inputs, without those that are weights, and the outputs.
+    /// Returns the inputs, without those that are weights, and the outputs.
     pub fn edges(
         &self,
         file: usize,
@@ -178,7 +181,7 @@ fn edge(
     })
 }
 
-/// The length of an axis; the first one, if it has a name, is a batch of one.
+/// Returns the length of an axis; the first one, if it has a name, is a batch of one.
 fn length(
     axis: usize,
     dim: &DimensionProto,
@@ -283,7 +286,7 @@ fn external(
     Ok(raw)
 }
 
-/// Bytes that a tensor's elements take.
+/// Returns the number of bytes of a tensor's elements.
 fn expected(tensor: &TensorProto) -> Result<u64, String> {
     let size = match tensor.data_type {
         data_type::FLOAT | data_type::INT32 | 12 => 4,
@@ -304,7 +307,7 @@ fn expected(tensor: &TensorProto) -> Result<u64, String> {
         .ok_or_else(|| format!("has shape {:?}, which no policy has", tensor.dims))
 }
 
-/// Names given twice, nodes that wait for each other, weights that are no numbers.
+/// Checks for names given twice, cycles of nodes, and weights that are not numbers.
 fn check(graph: &GraphProto, problems: &mut Problems) {
     let weights = graph.initializer.iter().map(|tensor| tensor.name.as_str());
     let mut known: HashSet<&str> = HashSet::new();

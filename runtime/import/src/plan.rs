@@ -1,11 +1,13 @@
-//! The policy as it will be: channels of the caller, what each input of the graphs is made of, states, the action.
+//! Plan of the imported policy: channels of the caller, the composition of each input of the
+//! graphs, states, the action.
 //!
-//! Made by [`resolve`](crate::resolve) of what the graphs are and what was said, complete and free of contradictions.
+//! [`resolve`](crate::resolve) makes it of the graphs and the description, complete and free of
+//! contradictions.
 
 use crate::model::Edge;
 use crate::robot::{Layout, Order, QuaternionOrder, Start, Wave};
 
-/// An element of a channel, as the contract has it.
+/// An element of a channel, in the contract's form.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Element {
     pub name: String,
@@ -23,12 +25,12 @@ pub(crate) struct Element {
 pub(crate) struct Channel {
     pub name: String,
     pub elements: Vec<Element>,
-    /// Which elements each term brought, in their order.
+    /// Elements that each term contributed, in their order.
     pub parts: Vec<Part>,
     pub quaternion_order: Option<QuaternionOrder>,
 }
 
-/// The elements of a channel that a term brought: `first..first + len`.
+/// Elements of a channel that a term contributed: `first..first + len`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Part {
     pub term: String,
@@ -36,20 +38,21 @@ pub(crate) struct Part {
     pub len: usize,
 }
 
-/// Where the raw values of a term come from.
+/// Source of the raw values of a term.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Source {
     /// Columns of a channel, in the graph's order.
     Columns { channel: usize, columns: Vec<usize> },
-    /// The columns `w, x, y, z` of an orientation.
+    /// Direction of gravity, from the columns `w, x, y, z` of an orientation.
     Gravity { channel: usize, columns: [usize; 4] },
-    /// The last raw action.
+    /// Last raw action.
     Action,
-    /// Sine or cosine, ahead by a part of a turn; the clock turns by so many radians in a control step.
+    /// Sine or cosine of a clock, ahead by a part of a turn; the clock turns by so many radians in
+    /// a control step.
     Phase { turn: f64, hands: Vec<(Wave, f64)> },
-    /// Control steps since the episode began.
+    /// Number of control steps since the episode began.
     Step,
-    /// 1 in the first step.
+    /// Indicator that is 1 in the first step.
     First,
     /// Another output of the graphs.
     Output(Edge),
@@ -58,7 +61,7 @@ pub(crate) enum Source {
 /// Lowest and highest value of each element.
 pub(crate) type Bounds = (Vec<f64>, Vec<f64>);
 
-/// A part of an input: `clip(raw - offset) * scale`, of the last steps.
+/// Part of an input: `clip(raw - offset) * scale`, of the last steps.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Term {
     pub name: String,
@@ -75,7 +78,7 @@ impl Term {
     }
 }
 
-/// How terms of several steps are put together.
+/// Layout of terms of several steps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Stack {
     pub layout: Layout,
@@ -83,7 +86,7 @@ pub(crate) struct Stack {
     pub start: Start,
 }
 
-/// What an input of a graph is made of.
+/// Composition of an input of a graph.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Feed {
     Terms {
@@ -91,35 +94,35 @@ pub(crate) enum Feed {
         stack: Stack,
         clip: Option<Bounds>,
     },
-    /// What the output of that number gave in the last step.
+    /// Value of the output with this number in the last step.
     State(usize),
     Constant(f64),
-    /// Another graph's output.
+    /// Output of another graph.
     Wire(Edge),
 }
 
-/// The action: `clip(raw) * scale + offset`, then in the robot's order.
+/// Action of the policy: `clip(raw) * scale + offset`, then in the robot's order.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Action {
     pub edge: Edge,
     pub clip: Option<Bounds>,
     pub scale: Vec<f64>,
     pub offset: Vec<f64>,
-    /// For each element that the robot gets, its index in the policy's order.
+    /// Index in the policy's order of each element that the robot gets.
     pub order: Vec<usize>,
-    /// In the robot's order.
+    /// Elements of the action, in the robot's order.
     pub elements: Vec<Element>,
     pub reference: String,
 }
 
-/// A state that the graphs themselves have.
+/// A state of the graphs themselves.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct State {
     pub input: Edge,
     pub output: Edge,
 }
 
-/// All of it.
+/// The complete plan of an import.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Plan {
     pub environment: (String, String),
@@ -128,6 +131,6 @@ pub(crate) struct Plan {
     pub feeds: Vec<(Edge, Feed)>,
     pub states: Vec<State>,
     pub action: Action,
-    /// Largest difference of an action that counts as equal, where a person says one.
+    /// Largest difference of an action that counts as equal, if a person states one.
     pub tolerance: Option<f64>,
 }

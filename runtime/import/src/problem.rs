@@ -1,15 +1,16 @@
-//! What stands between a file and a policy, collected so that a person sees all of it at once.
+//! Problems between a file and a policy, collected so that a person sees all of them at once.
 
 use std::fmt::{self, Display, Formatter};
 
 use lads_compiler::Line;
 
-/// One thing that is missing or contradicts another.
+/// One missing or contradictory thing.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Problem {
-    /// What it is about: a field of the robot's description, a value or a node of the graph, a file.
+    /// Subject of the problem: a field of the robot's description, a value or a node of the graph,
+    /// a file.
     pub about: String,
-    /// What is wrong with it, and what to do.
+    /// Fault of the subject, and its remedy.
     pub wrong: String,
 }
 
@@ -18,7 +19,7 @@ pub struct Problem {
 pub struct Problems(Vec<Problem>);
 
 impl Problems {
-    /// Adds one, once.
+    /// Adds a problem unless it is there already.
     pub(crate) fn add(&mut self, about: impl Display, wrong: impl Display) {
         let line = |text: String| Line::from(text).to_string();
         let problem = Problem {
@@ -30,18 +31,18 @@ impl Problems {
         }
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no problems.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// All of them.
+    /// Returns all problems.
     pub fn all(&self) -> &[Problem] {
         &self.0
     }
 }
 
-/// One line for each.
+/// Formats one line for each problem.
 impl Display for Problems {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         for problem in &self.0 {

@@ -1,4 +1,5 @@
-//! Brings together what the graphs are and what was said of them: a complete [`Plan`], or all that is missing and all that contradicts.
+//! Combines the graphs and their description to a complete [`Plan`], or lists everything that is
+//! missing or contradictory.
 
 mod action;
 mod elements;
@@ -38,7 +39,8 @@ impl Edges {
         }
     }
 
-    /// A value by what a person calls it: its name, or `FILE:NAME`, or `FILE:NUMBER`.
+    /// Finds a value by the name that a person gives it: its name, or `FILE:NAME`, or
+    /// `FILE:NUMBER`.
     pub fn find<'e>(&self, among: &'e [Edge], said: &str) -> Result<&'e Edge, String> {
         let known = || {
             let names: Vec<String> = among.iter().map(|edge| self.name(edge)).collect();
@@ -72,7 +74,7 @@ impl Edges {
         }
     }
 
-    /// What a value is called: with its file where there are several.
+    /// Returns the name of a value for messages: with its file if there are several.
     pub fn name(&self, edge: &Edge) -> String {
         match (self.stems.len(), self.stems.get(edge.file)) {
             (0 | 1, _) | (_, None) => edge.name.clone(),
@@ -81,7 +83,7 @@ impl Edges {
     }
 }
 
-/// The plan; `None` if there are problems, which are then told.
+/// Makes the plan; `None` if there are problems, which are then added.
 pub(crate) fn resolve(
     edges: &Edges,
     robot: &Robot,
@@ -129,7 +131,7 @@ pub(crate) fn resolve(
     })
 }
 
-/// The inputs that states, constants and wires feed, and those that are left for terms.
+/// Returns the inputs that states, constants and wires feed, and those that are left for terms.
 fn otherwise_fed<'e>(
     edges: &'e Edges,
     robot: &Robot,
@@ -188,7 +190,7 @@ fn otherwise_fed<'e>(
     (feeds, open)
 }
 
-/// What a policy was made for, and how often it runs.
+/// Checks the control period and the environment of the policy.
 fn check_head(robot: &Robot, problems: &mut Problems) {
     match robot.control_period_s {
         None => problems.add(
@@ -241,7 +243,7 @@ fn states(edges: &Edges, robot: &Robot, problems: &mut Problems) -> Vec<State> {
     states
 }
 
-/// The terms of each input that terms feed.
+/// Returns the terms of each input that terms feed.
 fn assigned<'r>(context: &mut terms::Context<'r, '_>, open: &[&Edge]) -> Vec<Vec<&'r Term>> {
     let robot = context.robot;
     let edges = context.edges;

@@ -1,7 +1,9 @@
-//! What a person says about a robot and its policy: the TOML file, and what the policy's neighbours say in the same form.
+//! Description of a robot and its policy: the TOML file by a person, and the policy's neighbour
+//! files in the same form.
 //!
-//! Every field may be missing here; whether enough is said is decided where all of it comes together. What can fail: the text is no
-//! TOML, or a field has a name or a type that is not known, which is told with its line.
+//! Every field may be missing here; [`resolve`](crate::resolve) decides whether the description is
+//! complete. What can fail: the text is not TOML, or a field has an unknown name or type, which is
+//! reported with its line.
 
 use std::collections::BTreeMap;
 
@@ -46,7 +48,7 @@ pub(crate) enum QuaternionOrder {
     Xyzw,
 }
 
-/// In which order a graph reads the values of several steps.
+/// Order in which a graph reads the values of several steps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Layout {
@@ -65,17 +67,17 @@ pub(crate) enum Order {
     NewestFirst,
 }
 
-/// What stands for steps before the first one.
+/// Values of steps before the first one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Start {
-    /// Zeros, where the graph reads them.
+    /// Zeros, inserted where the graph reads them.
     Zero,
-    /// The first step.
+    /// Copies of the first step.
     First,
 }
 
-/// How many of the last steps the graph reads, and how.
+/// Number of the last steps that the graph reads, and their layout.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(crate) struct History {
@@ -85,7 +87,7 @@ pub(crate) struct History {
     pub start: Option<Start>,
 }
 
-/// What holds for a whole input of the graph.
+/// Options of a whole input of the graph.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(crate) struct Input {
@@ -93,20 +95,20 @@ pub(crate) struct Input {
     pub history: Option<History>,
 }
 
-/// Where the values of a term come from.
+/// Source of the values of a term.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum From {
-    /// The caller, as they are.
+    /// Values that the caller gives, unchanged.
     Sensor,
-    /// The caller's orientation; the term is the direction of gravity in the body's frame.
+    /// Direction of gravity in the body's frame, from the caller's orientation.
     Gravity,
-    /// The last raw action of the policy.
+    /// Last raw action of the policy.
     Action,
-    /// A clock with the period of a gait.
+    /// Clock with the period of a gait.
     Phase,
-    /// Control steps since the episode began.
+    /// Number of control steps since the episode began.
     Step,
-    /// 1 in the first step of an episode, 0 afterwards.
+    /// Indicator that is 1 in the first step of an episode, 0 afterwards.
     First,
     /// Another output of the graphs.
     Output(String),
@@ -164,7 +166,7 @@ pub(crate) struct Phase {
     pub elements: Vec<Hand>,
 }
 
-/// A part of an input of the graph.
+/// Part of an input of the graph.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(crate) struct Term {
@@ -187,7 +189,7 @@ pub(crate) struct Term {
     pub phase: Option<Phase>,
 }
 
-/// What the policy's output means.
+/// Meaning of the policy's output.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(crate) struct Action {
@@ -224,7 +226,7 @@ pub(crate) struct State {
     pub cleared_by: ClearedBy,
 }
 
-/// An input that is always the same.
+/// An input that is always the same, with its value.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Constant {
@@ -232,7 +234,7 @@ pub(crate) struct Constant {
     pub value: f64,
 }
 
-/// Everything that is said.
+/// The whole description.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(crate) struct Robot {
@@ -240,10 +242,10 @@ pub(crate) struct Robot {
     pub control_period_s: Option<f64>,
     pub quaternion_order: Option<QuaternionOrder>,
     pub joints: Option<Vec<String>>,
-    /// `robot_joints` in the file: the robot's joints, in its order.
+    /// Names of the robot's joints in its order; `robot_joints` in the file.
     #[serde(rename = "robot_joints")]
     pub wired_joints: Option<Vec<String>>,
-    /// For each of the policy's joints, its index among the robot's.
+    /// Index among the robot's joints of each of the policy's joints.
     pub joint_ids_map: Option<Vec<usize>>,
     pub default_position: Option<Vec<f64>>,
     pub history: Option<History>,
@@ -258,7 +260,7 @@ pub(crate) struct Robot {
     pub axes: BTreeMap<String, usize>,
 }
 
-/// Takes over what `mine` does not say.
+/// Copies the fields that `mine` lacks.
 macro_rules! fill {
     ($mine:expr, $other:expr, $($field:ident)+) => {
         $(if $mine.$field.is_none() { $mine.$field = $other.$field; })+
@@ -271,8 +273,8 @@ impl Robot {
         toml::from_str(text).map_err(|error| error.to_string().trim_end().replace('\n', " "))
     }
 
-    /// Takes over what another source says where this one says nothing. Terms are the same if they have the same name; other names in
-    /// another number are a contradiction, which is returned.
+    /// Fills the fields that this source lacks from another source. Terms are matched by their
+    /// names; another number of terms under other names is a contradiction, which is returned.
     pub fn fill(&mut self, other: Robot) -> Result<(), String> {
         fill!(self, other, environment control_period_s quaternion_order joints wired_joints joint_ids_map default_position);
         match (&mut self.history, other.history) {
@@ -319,7 +321,7 @@ impl Robot {
 }
 
 impl Term {
-    /// Takes over what another source says of the same term.
+    /// Fills the fields that this term lacks from another source's description of it.
     pub fn fill(&mut self, other: Term) {
         fill!(self, other, input width elements per_joint joints channel from unit interface min max offset clip scale history phase);
     }

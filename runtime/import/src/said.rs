@@ -1,8 +1,11 @@
-//! What a policy file and the files beside it say about the robot, in the form in which a person says it.
+//! Reads descriptions of the robot from a policy file and the files beside it, in the form in which
+//! a person writes them.
 //!
-//! Read are the flat metadata of Isaac Lab and mjlab exports (comma-separated), JSON metadata of the same meaning, `deploy.yaml` of
-//! unitree's tools, and JSON manifests with the same names. Only the names listed here are read: paths, robot descriptions and whatever
-//! else an author's machine has left in a file go nowhere. What can fail: a value is not what its name says, which is a problem.
+//! The sources are the flat metadata of Isaac Lab and mjlab exports (comma-separated), JSON
+//! metadata of the same meaning, `deploy.yaml` of unitree's tools, and JSON manifests with the same
+//! names. Only the names listed here are read: paths, robot descriptions and anything else that an
+//! author's machine has left in a file are ignored. What can fail: a value does not fit its name,
+//! which is a problem.
 
 mod deploy;
 
@@ -12,13 +15,13 @@ use crate::yaml::Value;
 
 pub(crate) use deploy::deploy;
 
-/// What one source says.
+/// Description from one source.
 #[derive(Debug, Default)]
 pub(crate) struct Said {
     pub robot: Robot,
     /// Names that were understood, for the notes.
     pub used: Vec<String>,
-    /// Gains that were printed with too few decimals: what the source calls them, and which they are.
+    /// Gains that were printed with too few decimals, with the source's names for them.
     pub lost: Vec<(String, Gain)>,
 }
 
@@ -29,7 +32,7 @@ pub(crate) enum Gain {
     Damping,
 }
 
-/// Names under which exporters put the same thing.
+/// Names that exporters use for the same field.
 const JOINTS: [&str; 3] = ["joint_names", "dof_names", "joints"];
 const STIFFNESS: [&str; 4] = ["joint_stiffness", "stiffness", "kp", "kps"];
 const DAMPING: [&str; 4] = ["joint_damping", "damping", "kd", "kds"];
@@ -47,7 +50,7 @@ const RATE: [&str; 4] = [
     "policy_hz",
 ];
 
-/// Metadata of a model file: keys and texts.
+/// Reads the metadata of a model file: keys and texts.
 pub(crate) fn metadata<'m>(
     pairs: impl Iterator<Item = (&'m str, &'m str)>,
     problems: &mut Problems,
@@ -56,7 +59,7 @@ pub(crate) fn metadata<'m>(
     flat(&Value::Map(values.collect()), "metadata", problems)
 }
 
-/// JSON where it is JSON, else a comma-separated list of numbers or of names.
+/// Parses JSON if the text is JSON, else a comma-separated list of numbers or of names.
 fn value(text: &str) -> Value {
     let text = text.trim();
     if text.starts_with(['[', '{']) {
@@ -74,7 +77,7 @@ fn value(text: &str) -> Value {
     Value::List(numbers.unwrap_or_else(texts))
 }
 
-/// A JSON manifest.
+/// Reads a JSON manifest.
 pub(crate) fn manifest(text: &str, source: &str, problems: &mut Problems) -> Said {
     match serde_json::from_str::<serde_json::Value>(text) {
         Ok(json) if json.is_object() => flat(&json.into(), source, problems),
@@ -89,7 +92,7 @@ pub(crate) fn manifest(text: &str, source: &str, problems: &mut Problems) -> Sai
     }
 }
 
-/// Values under the names that exporters use.
+/// Reads values under the names that exporters use.
 fn flat(values: &Value, source: &str, problems: &mut Problems) -> Said {
     let mut said = Said::default();
     let mut find = |names: &[&str]| {
@@ -154,7 +157,7 @@ fn flat(values: &Value, source: &str, problems: &mut Problems) -> Said {
     said
 }
 
-/// Whether gains were printed with too few decimals.
+/// Returns whether gains were printed with too few decimals.
 fn rounded_away(each: &Each) -> bool {
     let values = match each {
         Each::One(value) => std::slice::from_ref(value),
@@ -188,7 +191,7 @@ fn single(each: &Each) -> Option<f64> {
     }
 }
 
-/// A number, a list of them, or a map from each joint to one.
+/// Reads a number, a list of them, or a map from each joint to one.
 fn each(value: &Value, joints: Option<&[String]>) -> Option<Each> {
     if let Some(number) = value.number() {
         return Some(Each::One(number));

@@ -1,4 +1,5 @@
-//! The form that a person fills in: TOML with all that is known, and a commented line for all that is missing.
+//! Template of the description that a person fills in: TOML with everything known, and a commented
+//! line for everything missing.
 
 use std::fmt::{self, Display, Write};
 
@@ -8,7 +9,7 @@ use crate::problem::Problems;
 use crate::resolve::Edges;
 use crate::robot::{Clip, Each, From, History, Layout, Order, Robot, Start, Term};
 
-/// The whole form.
+/// Formats the whole template.
 pub(crate) fn template(edges: &Edges, robot: &Robot, problems: &Problems) -> String {
     let mut form = Form::default();
     form.line("# What stands between sensors and policy. Take away the `#` in front of a field and say what it asks for.");
@@ -292,7 +293,7 @@ impl Form {
         let _: fmt::Result = writeln!(self.text, "{line}");
     }
 
-    /// A field with what is known, or as a comment with an example.
+    /// Writes a field with its known value, or as a comment with an example.
     fn field(&mut self, name: &str, known: Option<String>, example: &str, what: &str) {
         let what = if what.is_empty() {
             String::new()
@@ -326,7 +327,7 @@ fn each(each: &Each) -> String {
     }
 }
 
-/// A float of TOML: with a point or an exponent.
+/// Formats a float of TOML: with a point or an exponent.
 fn number(value: f64) -> String {
     format!("{value:?}")
 }

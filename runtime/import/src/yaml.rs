@@ -1,7 +1,7 @@
 //! YAML read as data: numbers, texts, lists, and maps whose keys keep their order.
 //!
-//! Tags are skipped, whatever they ask for: nothing is ever constructed or executed. What can fail: the text is no YAML, it is nested
-//! too deeply, or its aliases stand for more values than a description of a robot has.
+//! Tags are skipped, so nothing is constructed or executed. What can fail: the text is not YAML, it
+//! is nested too deeply, or its aliases stand for more values than a description of a robot has.
 
 use std::collections::HashMap;
 
@@ -20,13 +20,13 @@ pub(crate) enum Value {
 }
 
 impl Value {
-    /// The value of a key of a map.
+    /// Returns the value of a key of a map.
     pub fn get(&self, key: &str) -> Option<&Value> {
         let found = self.pairs().iter().find(|(known, _)| known == key);
         found.map(|(_, value)| value)
     }
 
-    /// The pairs of a map, none of anything else.
+    /// Returns the pairs of a map; none for other values.
     pub fn pairs(&self) -> &[(String, Value)] {
         match self {
             Value::Map(pairs) => pairs,
@@ -55,7 +55,7 @@ impl Value {
         }
     }
 
-    /// A list of numbers.
+    /// Returns the numbers of a list.
     pub fn numbers(&self) -> Option<Vec<f64>> {
         self.list()?.iter().map(Value::number).collect()
     }
@@ -79,10 +79,10 @@ impl From<serde_json::Value> for Value {
     }
 }
 
-/// The most values of a document, those that aliases stand for counted each time.
+/// Largest number of values of a document, those that aliases stand for counted each time.
 const MAX_VALUES: usize = 100_000;
 
-/// The deepest nesting.
+/// Largest depth of nesting.
 const MAX_DEPTH: usize = 32;
 
 /// A list or a map that is not complete yet.
@@ -190,7 +190,7 @@ impl Reader {
     }
 }
 
-/// What a plain scalar of YAML's core schema is; a quoted one is a text.
+/// Converts a plain scalar by YAML's core schema; a quoted one is a text.
 fn scalar(text: &str, style: ScalarStyle) -> Value {
     if style != ScalarStyle::Plain {
         return Value::Text(text.into());

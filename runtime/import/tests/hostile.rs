@@ -1,7 +1,9 @@
-//! Random edits of policies, descriptions and what lies beside them: every outcome is a bundle or a report, never a panic.
+//! Applies random edits to policies, descriptions and the files beside them: every outcome is a
+//! bundle or a report, never a panic.
 //!
-//! `LADS_FUZZ_SECONDS` goes on for so long, on `LADS_FORMS` too: a folder with more policies and a description of each, `NAME.onnx` and
-//! `NAME.toml` (`tests/parity/test_import.py FOLDER` writes one).
+//! `LADS_FUZZ_SECONDS` sets the duration, and `LADS_FORMS` further inputs: a folder with more
+//! policies and a description of each, `NAME.onnx` and `NAME.toml`
+//! (`tests/parity/test_import.py FOLDER` writes one).
 
 mod common;
 
@@ -12,10 +14,10 @@ use std::time::{Duration, Instant};
 use lads_import::{ImportError, Request, import, template};
 use tempfile::TempDir;
 
-/// Edit scripts without `LADS_FUZZ_SECONDS`.
+/// Number of edit scripts without `LADS_FUZZ_SECONDS`.
 const SCRIPTS: usize = 300;
 
-/// Texts that mean something to a reader of one of the forms.
+/// Texts with a meaning to a reader of one of the forms.
 const TOKENS: [&str; 14] = [
     "\n[[term]]\n",
     "nan",
@@ -33,7 +35,7 @@ const TOKENS: [&str; 14] = [
     "from = \"gravity\"\n",
 ];
 
-/// The numbers of a linear congruential generator, the high bits.
+/// Linear congruential generator, of whose numbers the high bits are used.
 struct Random(u64);
 
 impl Random {
@@ -45,7 +47,7 @@ impl Random {
         (self.0 >> 33) as usize % most.max(1)
     }
 
-    /// A few edits: a bit, a byte, a token, a piece cut out or doubled.
+    /// Applies a few edits: a bit, a byte, a token, a piece cut out or doubled.
     fn edit(&mut self, bytes: &mut Vec<u8>) {
         for _ in 0..=self.below(4) {
             let at = self.below(bytes.len());
@@ -68,7 +70,7 @@ impl Random {
     }
 }
 
-/// Policies, each with its description.
+/// Returns policies, each with its description.
 fn policies() -> Vec<[Vec<u8>; 2]> {
     let biped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../host/examples/biped");
     let mut folders = vec![biped];

@@ -1,4 +1,5 @@
-//! What is missing, what contradicts, and files that are broken or hostile: all of it told at once, by name, and nothing imported.
+//! Tests that missing and contradictory fields, and broken or hostile files, are all reported at
+//! once, by name, and nothing is imported.
 
 mod common;
 

@@ -1,4 +1,5 @@
-//! What an import puts between raw sensor values and a graph, looked at through policies that only mirror what they read.
+//! Tests the nodes that an import puts between raw sensor values and a graph, through policies that
+//! only mirror their input.
 
 mod common;
 
@@ -54,7 +55,7 @@ fn joints_come_and_go_in_the_robots_order() {
     assert_eq!(row(contract.action())[0].0, joint("toe"));
 }
 
-/// Histories of two terms, `a` of one element and `b` of two, over three steps.
+/// Returns histories of two terms, `a` of one element and `b` of two, over three steps.
 fn history(layout: &str, order: &str, start: &str) -> Vec<Vec<f32>> {
     let robot = format!(
         "{HEAD}history = {{ length = 3, layout = \"{layout}\", order = \"{order}\", start = \"{start}\" }}\n\

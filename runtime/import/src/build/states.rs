@@ -1,11 +1,11 @@
 //! States of the bundle: those of the policy's graphs, and those that the terms need.
 
-/// A state as the contract has it.
+/// A state in the contract's form.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Kept {
-    /// Taken over as a whole from one step to the next; zeros at first.
+    /// Values replaced as a whole in each step; zeros at first.
     Plain { name: String, shape: Vec<usize> },
-    /// The last rows of a channel; the first one stands for those before it.
+    /// Ring of the last rows of a channel; the first row stands for those before it.
     Ring {
         name: String,
         rows: usize,
@@ -22,7 +22,7 @@ impl Kept {
     }
 }
 
-/// The name of a state of the policy's own graphs.
+/// Returns the name of a state of the policy's own graphs.
 pub(super) fn name(number: usize) -> String {
     format!("state.{number}")
 }

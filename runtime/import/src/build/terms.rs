@@ -1,7 +1,9 @@
-//! Terms as nodes: raw values of one or several steps, processed, and laid out as the graph reads them.
+//! Builds terms from nodes: raw values of one or several steps, processed, and laid out as the
+//! graph reads them.
 //!
-//! A history that begins with its first step is a ring of raw values; one that begins with zeros is a state of processed values, because
-//! it is there that training has its zeros. The last action, whose first value is zero, is a state in either case.
+//! A history that begins with its first step is a ring of raw values; one that begins with zeros is
+//! a state of processed values, because training puts its zeros after the processing. The last
+//! action, whose first value is zero, is a state in either case.
 
 use std::collections::HashMap;
 
@@ -9,28 +11,29 @@ use super::{Kept, Net, entry};
 use crate::plan::{Bounds, Feed, Plan, Source, Stack, Term};
 use crate::robot::{Layout, Order, Start, Wave};
 
-/// States beside those of the graphs.
+/// Name of the state that holds the last action.
 const LAST_ACTION: &str = "last.action";
 const CLOCK: &str = "gait.clock";
 const STEPS: &str = "episode.steps";
 
-/// What terms share.
+/// Nodes that terms share.
 pub(super) struct Pieces<'p> {
     plan: &'p Plan,
-    /// Rows of each channel's ring; the ring is an input already where the number is there.
+    /// Number of rows of each channel's ring, for the rings that are inputs already.
     rings: HashMap<usize, usize>,
-    /// How the columns of each channel are processed, where all terms agree on it.
+    /// Processing of the columns of each channel, if all terms agree on it.
     whole: Vec<Option<Whole>>,
-    /// Processed values, by the raw ones.
+    /// Names of processed values, by the names of the raw ones.
     done: HashMap<String, String>,
     last_action: bool,
-    /// The clock's turn in a step.
+    /// Angle by which the clock turns in a step.
     clock: Option<f64>,
     steps: bool,
     histories: usize,
 }
 
-/// Offset, clip and scale of every column of a channel: one operation for the channel instead of one for each term.
+/// Offset, clip and scale of every column of a channel: one operation for the channel instead of
+/// one for each term.
 struct Whole {
     offset: Vec<f64>,
     clip: Bounds,
@@ -38,7 +41,8 @@ struct Whole {
 }
 
 impl Whole {
-    /// `None` if two terms read a column differently.
+    /// Returns the common processing of a channel's columns; `None` if two terms read a column
+    /// differently.
     fn of(plan: &Plan, wanted: usize) -> Option<Self> {
         let mut columns: Vec<Option<[f64; 4]>> = vec![None; plan.channels[wanted].elements.len()];
         for (_, feed) in &plan.feeds {
@@ -94,7 +98,7 @@ impl Whole {
 /// Bounds of a column that is not clipped.
 const UNBOUNDED: (f64, f64) = (f32::MIN as f64, f32::MAX as f64);
 
-/// The files whose outputs an input is made of.
+/// Returns the files whose outputs an input is made of.
 pub(super) fn outputs(feed: &Feed) -> Vec<usize> {
     match feed {
         Feed::Wire(edge) => vec![edge.file],
@@ -125,7 +129,7 @@ impl<'p> Pieces<'p> {
         }
     }
 
-    /// An input of a graph, `[1, n]`.
+    /// Builds an input of a graph, `[1, n]`.
     pub fn input(&mut self, net: &mut Net, terms: &[Term], stack: Stack) -> String {
         let mut parts = vec![];
         for term in terms {
@@ -160,7 +164,7 @@ impl<'p> Pieces<'p> {
         }
     }
 
-    /// The processed values of a term, `[history, width]`, the oldest first.
+    /// Builds the processed values of a term, `[history, width]`, the oldest first.
     fn rows(&mut self, net: &mut Net, term: &Term, start: Start) -> String {
         let channel = match &term.source {
             Source::Columns { channel, .. } | Source::Gravity { channel, .. } => Some(*channel),
@@ -193,7 +197,8 @@ impl<'p> Pieces<'p> {
         all
     }
 
-    /// The last rows of a channel. The ring has as many as the longest history of it.
+    /// Builds the last rows of a channel. The ring has as many rows as the longest history of the
+    /// channel.
     fn ring(&mut self, net: &mut Net, channel: usize, history: usize) -> String {
         let found = &self.plan.channels[channel];
         let name = format!("ring.{}", found.name);
@@ -216,7 +221,7 @@ impl<'p> Pieces<'p> {
         net.gathered(&value, &last, 0)
     }
 
-    /// `clip(raw - offset) * scale` of a term's columns of a channel's rows.
+    /// Computes `clip(raw - offset) * scale` of a term's columns of a channel's rows.
     fn processed(&mut self, net: &mut Net, channel: usize, term: &Term, raw: String) -> String {
         let width = self.plan.channels[channel].elements.len();
         match (&term.source, &self.whole[channel]) {
@@ -240,7 +245,8 @@ impl<'p> Pieces<'p> {
         }
     }
 
-    /// What the runtime makes itself, `[1, width]`; `None` for what the caller gives.
+    /// Builds a value that the runtime makes itself, `[1, width]`; `None` for a value that the
+    /// caller gives.
     fn own(&mut self, net: &mut Net, term: &Term) -> Option<String> {
         let value = match &term.source {
             Source::Action => {
@@ -276,7 +282,8 @@ impl<'p> Pieces<'p> {
         entry(STEPS)
     }
 
-    /// Sines and cosines of the clock, from a state of `cos - 1, sin` that is zero at first and turns by a constant angle.
+    /// Builds sines and cosines of the clock, from a state of `cos - 1, sin` that is zero at first
+    /// and turns by a constant angle.
     fn clock(&mut self, net: &mut Net, turn: f64, hands: &[(Wave, f64)]) -> String {
         if self.clock.is_none() {
             self.clock = Some(turn);
@@ -298,7 +305,7 @@ impl<'p> Pieces<'p> {
         net.op("MatMul", &[&now, &matrix], vec![])
     }
 
-    /// What the states of the terms are afterwards.
+    /// Builds the next values of the terms' states.
     pub fn finish(&mut self, net: &mut Net, raw_action: &str) {
         let width = self.plan.action.scale.len();
         if self.last_action {
@@ -326,13 +333,13 @@ impl<'p> Pieces<'p> {
     }
 }
 
-/// Cosine and sine of the clock, `[1, 2]`.
+/// Builds cosine and sine of the clock, `[1, 2]`.
 fn clock_now(net: &mut Net) -> String {
     let state = entry(CLOCK);
     net.moved("Add", state, &[1.0, 0.0])
 }
 
-/// The longest history of a channel that begins with its first step.
+/// Returns the longest history of a channel that begins with its first step.
 fn longest(plan: &Plan, wanted: usize) -> usize {
     let terms = plan.feeds.iter().flat_map(|(_, feed)| match feed {
         Feed::Terms { terms, stack, .. } if stack.start == Start::First => &terms[..],
@@ -351,7 +358,7 @@ fn finished(net: &mut Net, term: &Term, value: String) -> String {
     net.scaled(value, &term.scale)
 }
 
-/// The direction of gravity in the body's frame, of orientations of any length but zero:
+/// Computes the direction of gravity in the body's frame, from orientations of any length but zero:
 /// `2 (wy - xz), -2 (yz + wx), 2 (xx + yy) / 1 - 1`, each product divided by the squared length.
 fn gravity(net: &mut Net, raw: &str, columns: &[usize; 4]) -> String {
     let columns: Vec<i64> = columns.iter().map(|&column| column as i64).collect();

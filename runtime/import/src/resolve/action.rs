@@ -1,4 +1,5 @@
-//! The policy's output: which one it is, what a number of it means, and how far it may go.
+//! Resolves the policy's output: which output is the action, the meaning of its numbers, and their
+//! limits.
 
 use super::Edges;
 use super::elements::{Joints, bounds, limits, spread};
@@ -7,7 +8,7 @@ use crate::plan::{Action, Element};
 use crate::problem::Problems;
 use crate::robot::Robot;
 
-/// The action, if enough is said of it.
+/// Resolves the action, if its description is complete.
 pub(crate) fn resolve(
     edges: &Edges,
     robot: &Robot,
@@ -104,7 +105,7 @@ pub(crate) fn resolve(
     })
 }
 
-/// Which output is the action.
+/// Returns the output that is the action.
 fn output<'e>(edges: &'e Edges, robot: &Robot, problems: &mut Problems) -> Option<&'e Edge> {
     match (&robot.action.output, &edges.outputs[..]) {
         (Some(name), outputs) => edges

@@ -1,14 +1,14 @@
-//! Joints, and lists with a number for each element.
+//! Resolves joints, and lists with a number for each element.
 
 use crate::problem::Problems;
 use crate::robot::{Clip, Each, Robot};
 
-/// The joints in the policy's order, and where each lies among the robot's.
+/// Joints in the policy's order and in the robot's.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct Joints {
-    /// In the policy's order.
+    /// Names in the policy's order.
     pub policy: Vec<String>,
-    /// In the robot's order.
+    /// Names in the robot's order.
     pub robot: Vec<String>,
 }
 
@@ -60,7 +60,7 @@ impl Joints {
         Self { policy, robot }
     }
 
-    /// For joints in the policy's order: their indices, in the order of the robot.
+    /// Returns the indices of joints in the policy's order, sorted by the robot's order.
     pub fn by_robot(&self, names: &[String]) -> Vec<usize> {
         let mut order: Vec<usize> = (0..names.len()).collect();
         let place = |i: &usize| self.robot.iter().position(|known| *known == names[*i]);
@@ -69,7 +69,8 @@ impl Joints {
     }
 }
 
-/// A number for each element. A list of another length, or what is no number, is a problem.
+/// Returns a number for each element. A list of another length, or a value that is not a number, is
+/// a problem.
 pub(crate) fn spread(
     each: Option<&Each>,
     width: usize,
@@ -97,7 +98,7 @@ pub(crate) fn spread(
     Some(values)
 }
 
-/// The bounds of a clip for each element.
+/// Returns the bounds of a clip for each element.
 pub(crate) fn bounds(
     clip: Option<&Clip>,
     width: usize,
@@ -117,7 +118,7 @@ pub(crate) fn bounds(
     Some((low, high))
 }
 
-/// Smallest and largest value of each element.
+/// Returns the smallest and largest value of each element.
 pub(crate) fn limits(
     [min, max]: [Option<&Each>; 2],
     width: usize,

@@ -1,4 +1,5 @@
-//! Where the raw values of a term come from: elements of a channel, or what the runtime makes itself.
+//! Resolves the source of a term's raw values: elements of a channel, or values that the runtime
+//! makes itself.
 
 use super::elements::limits;
 use super::terms::{Context, plain};
@@ -6,10 +7,11 @@ use crate::plan::{Channel, Element, Part, Source};
 use crate::problem::Problems;
 use crate::robot::{self, From, QuaternionOrder};
 
-/// The channel of terms that name none.
+/// Name of the channel of terms that name none.
 const OBSERVATION: &str = "observation";
 
-/// A unit quaternion's elements, and a little more for the rounding of whoever computes it.
+/// Limit of a unit quaternion's elements, with a margin for the rounding of the program that
+/// computes it.
 const QUATERNION: f64 = 1.01;
 
 pub(super) fn source(
@@ -193,7 +195,7 @@ fn gravity(context: &mut Context, term: &robot::Term, about: &str) -> Option<Sou
     })
 }
 
-/// The channel that a term belongs to, a new one if need be.
+/// Returns the channel that a term belongs to, a new one if need be.
 fn channel(context: &mut Context, term: &robot::Term, about: &str) -> Option<usize> {
     let name = term.channel.as_deref().unwrap_or(OBSERVATION);
     let reserved = lads_compiler::family::RESERVED;
@@ -219,12 +221,12 @@ fn channel(context: &mut Context, term: &robot::Term, about: &str) -> Option<usi
     }))
 }
 
-/// Whether another input reads the same values already.
+/// Relation of a term to the elements that another input reads already.
 enum Shared {
     No,
-    /// They begin at this element of the channel.
+    /// Equal elements, which begin at this element of the channel.
     With(usize),
-    /// Under the same name, but others: that is a problem, and told.
+    /// Other elements under the same name: a problem, which is reported.
     Differently,
 }
 
@@ -258,7 +260,7 @@ fn shared(
     Shared::Differently
 }
 
-/// Puts a term's elements behind those that the channel has; returns where they begin.
+/// Appends a term's elements to those of the channel; returns where they begin.
 fn append(channel: &mut Channel, term: &str, elements: impl Iterator<Item = Element>) -> usize {
     let first = channel.elements.len();
     channel.elements.extend(elements);
@@ -278,7 +280,7 @@ fn element(term: &str, name: &str) -> String {
     }
 }
 
-/// What a controller cannot take.
+/// Checks for channels that a controller cannot take.
 pub(super) fn check_channels(channels: &[Channel], problems: &mut Problems) {
     let most = lads_core::MAX_OBSERVATIONS;
     if channels.len() > most {

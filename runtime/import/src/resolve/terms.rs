@@ -1,4 +1,5 @@
-//! What an input of a graph is made of: its terms, what is done with their values, and how values of several steps are put together.
+//! Resolves an input of a graph: its terms, the processing of their values, and the layout of
+//! several steps.
 
 use super::Edges;
 use super::elements::{Joints, bounds, spread};
@@ -10,7 +11,7 @@ use crate::plan::{Channel, Feed, Stack, Term};
 use crate::problem::Problems;
 use crate::robot::{self, From, History, Layout, Order, Robot, Start};
 
-/// What the terms are resolved in.
+/// Context in which terms are resolved.
 pub(super) struct Context<'r, 'p> {
     pub edges: &'r Edges,
     pub robot: &'r Robot,
@@ -20,7 +21,7 @@ pub(super) struct Context<'r, 'p> {
     pub problems: &'p mut Problems,
 }
 
-/// What an input is made of, if enough is said of its terms.
+/// Resolves the composition of an input, if the description of its terms is complete.
 pub(super) fn feed(context: &mut Context, input: &Edge, said: &[&robot::Term]) -> Option<Feed> {
     let name = context.edges.name(input);
     let about = format!("input `{name}`");
@@ -61,8 +62,9 @@ pub(super) fn feed(context: &mut Context, input: &Edge, said: &[&robot::Term]) -
     })
 }
 
-/// A term with what its name says, and whether it is relative to the default posture by definition. What a sensor gives is said once,
-/// also where several inputs read it.
+/// Completes a term with the facts that follow from its name, and returns whether it is relative to
+/// the default posture by definition. The description of a sensor is given once, even if several
+/// inputs read it.
 fn completed(robot: &Robot, term: &robot::Term) -> (robot::Term, bool) {
     let mut term = term.clone();
     let same = |other: &&robot::Term| {
@@ -236,7 +238,7 @@ fn resolved(
     })
 }
 
-/// Whether a name is one of a term: it becomes a part of names of values and states.
+/// Returns whether a name is valid for a term: it becomes a part of names of values and states.
 pub(super) fn plain(name: &str) -> bool {
     name.chars()
         .all(|c| c.is_alphanumeric() || "_-.".contains(c))

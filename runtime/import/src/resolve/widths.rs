@@ -1,10 +1,11 @@
-//! How many elements each term of an input has: what was said, or what the graph itself leaves for the only term of which nothing was.
+//! Resolves the number of elements of each term of an input: as described, or the graph's remainder
+//! for the only term without a description.
 
 use super::terms::Context;
 use crate::model::Edge;
 use crate::robot::{self, From};
 
-/// The width of each term; they add up to the graph's.
+/// Returns the width of each term; they add up to the graph's.
 pub(super) fn widths(
     context: &mut Context,
     about: &str,

@@ -1,13 +1,15 @@
-//! `deploy.yaml` of unitree's tools.
+//! Reads `deploy.yaml` of unitree's tools.
 //!
-//! What can fail: the text is no YAML, or a field is there and is not what its name says; each is a problem with its name.
+//! What can fail: the text is not YAML, or a field does not fit its name; each is a problem with
+//! its name.
 
 use super::{Said, each, named, single};
 use crate::problem::Problems;
 use crate::robot::{Clip, Each, History, Layout, Order, Start, Term};
 use crate::yaml::Value;
 
-/// `deploy.yaml`: positions, scales and offsets are in the policy's order, gains in the robot's.
+/// Reads a `deploy.yaml`: positions, scales and offsets are in the policy's order, gains in the
+/// robot's.
 pub(crate) fn deploy(text: &str, source: &str, problems: &mut Problems) -> Said {
     let document = match crate::yaml::read(text) {
         Ok(document) => document,
@@ -102,7 +104,7 @@ pub(crate) fn deploy(text: &str, source: &str, problems: &mut Problems) -> Said 
     said
 }
 
-/// A term of the policy's input.
+/// Reads a term of the policy's input.
 fn term(name: &str, row: &Value, commands: &Value, refuse: &mut impl FnMut(&str, &str)) -> Term {
     let mut term = named(name.into());
     if let Some(scale) = row.get("scale").filter(|scale| **scale != Value::Null) {
@@ -140,7 +142,8 @@ fn term(name: &str, row: &Value, commands: &Value, refuse: &mut impl FnMut(&str,
     term
 }
 
-/// Gains in the policy's order. They come in the order of the robot's joints that the policy moves.
+/// Returns gains in the policy's order. The given gains are in the order of the robot's joints that
+/// the policy moves.
 fn by_policy(map: Option<&[usize]>, values: &[f64]) -> Option<Vec<f64>> {
     let Some(map) = map else {
         return Some(values.to_vec());
@@ -154,7 +157,7 @@ fn by_policy(map: Option<&[usize]>, values: &[f64]) -> Option<Vec<f64>> {
         .filter(|gains| gains.len() == values.len())
 }
 
-/// The field `clip` of a row, where it has one.
+/// Reads the field `clip` of a row, if it has one.
 fn clip(name: &str, row: &Value, refuse: &mut impl FnMut(&str, &str)) -> Option<(Each, Each)> {
     let value = row.get("clip").filter(|value| **value != Value::Null)?;
     let found = bounds(value);
@@ -164,7 +167,7 @@ fn clip(name: &str, row: &Value, refuse: &mut impl FnMut(&str, &str)) -> Option<
     found
 }
 
-/// `[low, high]`, or a list of such pairs.
+/// Reads bounds `[low, high]`, or a list of such pairs.
 fn bounds(value: &Value) -> Option<(Each, Each)> {
     if let Some(&[low, high]) = value.numbers().as_deref() {
         return Some((Each::One(low), Each::One(high)));
@@ -180,7 +183,7 @@ fn bounds(value: &Value) -> Option<(Each, Each)> {
     Some((Each::Many(low), Each::Many(high)))
 }
 
-/// Names and limits of a command's elements; one without a range is not given to the policy.
+/// Reads names and limits of a command's elements; one without a range is not given to the policy.
 fn ranged(term: &mut Term, ranges: &Value, refuse: &mut impl FnMut(&str, &str)) {
     let mut rows: Vec<(&String, [f64; 2])> = vec![];
     for (name, range) in ranges.pairs() {

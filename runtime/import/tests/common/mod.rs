@@ -1,4 +1,5 @@
-//! Small policies whose action is what they read, so that what an import puts in front of them can be looked at.
+//! Small policies whose action mirrors their input, so that the nodes that an import puts before
+//! them can be tested.
 #![allow(dead_code, reason = "each suite uses its part")]
 
 use std::path::PathBuf;
@@ -12,7 +13,7 @@ use lads_import::{ImportError, Imported, Request, import};
 use prost::Message as _;
 use tempfile::TempDir;
 
-/// A value at a graph's edge; a length below zero is an axis called `batch`.
+/// Makes an input or output of a graph; a length below zero is an axis called `batch`.
 pub fn value(name: &str, dims: &[i64]) -> ValueInfoProto {
     let dim = |&dim: &i64| DimensionProto {
         dim_value: (dim >= 0).then_some(dim),
@@ -80,7 +81,7 @@ pub fn model(
     }
 }
 
-/// The action is what was observed, and nothing else.
+/// Makes a policy whose action is its observation.
 pub fn mirror(width: i64) -> ModelProto {
     model(
         vec![value("obs", &[1, width])],
@@ -99,7 +100,7 @@ pub fn says(model: &mut ModelProto, pairs: &[(&str, &str)]) {
     }
 }
 
-/// What every description of a test says of a mirror's action.
+/// Returns the part of a description that all tests of a mirror's action share.
 pub fn wide_action(width: usize) -> String {
     let names: Vec<String> = (0..width).map(|i| format!("\"a{i}\"")).collect();
     format!(
@@ -158,7 +159,7 @@ impl Case {
         import(&request)
     }
 
-    /// All that is to settle, as one text.
+    /// Returns the problems of a refused import, as one text.
     pub fn refused(&self) -> String {
         match self.import() {
             Ok(_) => panic!("it was imported"),
@@ -166,18 +167,18 @@ impl Case {
         }
     }
 
-    /// The actions of all steps.
+    /// Returns the actions of all steps.
     pub fn actions(&self, steps: &[Happens]) -> Vec<Vec<f32>> {
         let imported = self.import().unwrap_or_else(|error| panic!("{error}"));
         run(&imported.bundle, steps)
     }
 }
 
-/// What happens in a control period.
+/// Event of a control period.
 pub enum Happens {
     /// A step with the values of all channels.
     Step(Vec<Vec<f32>>),
-    /// Another episode begins.
+    /// The start of another episode.
     Reset,
 }
 
@@ -211,7 +212,7 @@ pub fn run(bundle: &[u8], steps: &[Happens]) -> Vec<Vec<f32>> {
     all
 }
 
-/// Whether two actions are the same but for rounding.
+/// Asserts that two actions are equal up to rounding.
 #[track_caller]
 pub fn close(got: &[f32], wanted: &[f32]) {
     assert_eq!(got.len(), wanted.len());
