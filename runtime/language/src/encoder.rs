@@ -1,4 +1,4 @@
-//! The encoder: tokens by `tokenizers`, the network by tract.
+//! The language encoder: tokens by `tokenizers`, the network by tract.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -14,24 +14,25 @@ use crate::manifest::Manifest;
 const MODEL: &str = "encoder.onnx";
 const TOKENIZER: &str = "tokenizer.json";
 
-/// Characters of a sentence that messages show.
+/// Number of characters of a sentence that messages show.
 const SHOWN: usize = 60;
 
-/// A language encoder, ready to hear sentences for one bundle.
+/// A language encoder that is loaded for one bundle.
 pub struct Encoder {
     tokenizer: Tokenizer,
     network: Arc<TypedRunnableModel>,
     manifest: Manifest,
-    /// The hidden layer that the policy hears, from 0; `None` for the mean of the last over all tokens, as one word.
+    /// Index of the hidden layer that the policy reads, from 0; `None` for the mean of the last
+    /// over all tokens, as one word.
     layer: Option<usize>,
-    /// Words that the policy hears at most.
+    /// Largest number of words that the policy takes.
     most: usize,
 }
 
 impl Encoder {
     /// Loads the encoder in `folder` (see [`default_folder`](crate::default_folder)), if it is the one that made the bundle's embeddings.
     ///
-    /// Takes some seconds: the network is checked against its sha256 and optimised.
+    /// This takes some seconds: the network is checked against its sha256 and optimised.
     pub fn open(folder: &Path, contract: &Contract) -> Result<Self, LanguageError> {
         let (Some(wanted), Some([most, _])) = (&contract.language, contract.words()) else {
             return Err(LanguageError::Deaf);
@@ -76,10 +77,11 @@ impl Encoder {
         })
     }
 
-    /// The word embeddings `[n, E]`, row by row, of a sentence.
+    /// Returns the word embeddings `[n, E]` of a sentence, row by row.
     ///
-    /// They are those of the exporter to 1e-4: hidden layer `language.layer` without the leading `[CLS]` and with the trailing `[SEP]`, or the mean
-    /// of the last layer over all tokens, as the contract says.
+    /// They equal the exporter's to 1e-4: hidden layer `language.layer` without the leading `[CLS]`
+    /// and with the trailing `[SEP]`, or the mean of the last layer over all tokens, as the
+    /// contract states.
     pub fn words(&self, text: &str) -> Result<Vec<f32>, LanguageError> {
         let failed = |problem: String| LanguageError::Run {
             text: shown(text),
@@ -113,7 +115,7 @@ impl Encoder {
         Ok(self.heard(&hidden, tokens))
     }
 
-    /// All hidden layers, `[layers, tokens, E]` row by row.
+    /// Computes all hidden layers, `[layers, tokens, E]` row by row.
     fn hidden(&self, ids: &[i64]) -> Result<Vec<f32>, String> {
         let run = || {
             let ids = Tensor::from_shape(&[ids.len()], ids)?;
@@ -133,7 +135,7 @@ impl Encoder {
         Ok(hidden)
     }
 
-    /// What the policy hears of the hidden layers of `tokens` tokens.
+    /// Selects the embeddings that the policy reads from the hidden layers of `tokens` tokens.
     fn heard(&self, hidden: &[f32], tokens: usize) -> Vec<f32> {
         let dim = self.manifest.dim;
         let mut layers = hidden.chunks_exact(tokens * dim);
@@ -151,7 +153,7 @@ impl Encoder {
     }
 }
 
-/// A sentence as messages show it: one line of bounded length.
+/// Shortens a sentence for messages: one line of bounded length.
 fn shown(text: &str) -> String {
     let mut start: String = text.chars().take(SHOWN).collect();
     if start.len() < text.len() {

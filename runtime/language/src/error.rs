@@ -1,85 +1,85 @@
-//! What can go wrong, each one line that names the thing and the remedy.
+//! Errors of the language encoder, each one line that names the thing and the remedy.
 
 use std::path::PathBuf;
 
 use thiserror::Error;
 
-/// Why there are no word embeddings.
+/// Reason why there are no word embeddings.
 #[derive(Debug, Error)]
 pub enum LanguageError {
-    /// An encoder whose name is no file name.
+    /// The encoder's name is not a plain file name.
     #[error(
         "the bundle's language encoder is called '{0}', which names no folder; export the bundle again"
     )]
     Name(String),
-    /// A policy that takes no instructions.
+    /// The policy takes no instructions.
     #[error(
         "the policy takes no instructions, so no sentence can be put to it; leave the sentence out"
     )]
     Deaf,
-    /// Nothing says where the cache is.
+    /// No environment variable gives the folder of the cache.
     #[error(
         "no folder for the language encoder: none of LADS_CACHE, XDG_CACHE_HOME and HOME is set; set LADS_CACHE"
     )]
     NoCache,
-    /// There is no encoder.
+    /// The encoder is missing.
     #[error("the language encoder {encoder} is not in {}; export it once with `python -m lads_exporter language`", folder.display())]
     Missing {
-        /// Its name.
+        /// Name of the encoder.
         encoder: String,
-        /// Where it was looked for.
+        /// Folder in which it was looked for.
         folder: PathBuf,
     },
-    /// A file of it cannot be read, or is not what its manifest says.
+    /// A file of the encoder cannot be read, or does not match its manifest.
     #[error("{}: {problem}; export it again with `python -m lads_exporter language`", path.display())]
     Damaged {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// Fault of the file.
         problem: String,
     },
-    /// An encoder with other weights than the one that made the bundle's embeddings.
+    /// The encoder has other weights than the one that made the bundle's embeddings.
     #[error(
         "the language encoder in {} has weights of sha256 {got:.12}, the bundle's embeddings were made by {encoder} with {needed:.12}; name the folder of that one, or export it with `python -m lads_exporter language`",
         folder.display()
     )]
     Other {
-        /// Where it lies.
+        /// Folder of the encoder.
         folder: PathBuf,
-        /// SHA-256 of its weights.
+        /// SHA-256 of the encoder's weights.
         got: String,
-        /// The name in the bundle.
+        /// Name of the encoder in the bundle.
         encoder: String,
-        /// The SHA-256 in the bundle.
+        /// SHA-256 of the weights in the bundle.
         needed: String,
     },
-    /// The bundle asks for what this encoder does not have.
+    /// The bundle asks for something that this encoder does not have.
     #[error(
         "the bundle's field `language.{field}` is {wanted}, the language encoder {encoder} has {has}; export the bundle again"
     )]
     Contract {
-        /// The contract's field.
+        /// Name of the contract's field.
         field: &'static str,
-        /// Its value.
+        /// Value of the field.
         wanted: String,
-        /// The encoder.
+        /// Name of the encoder.
         encoder: String,
-        /// What it has.
+        /// Value that the encoder has.
         has: String,
     },
-    /// A sentence in which there is nothing to hear.
+    /// The sentence has no words.
     #[error("'{0}': an empty sentence; say what is to be done")]
     Empty(String),
-    /// A sentence longer than the policy or the encoder can hear.
+    /// The sentence is longer than the policy or the encoder takes.
     #[error("'{text}': {got} word pieces, {who} hears at most {most}; say it in fewer words")]
     TooLong {
         /// The sentence, or its beginning.
         text: String,
-        /// Word pieces in it.
+        /// Number of word pieces in the sentence.
         got: usize,
-        /// The most that are heard.
+        /// Largest number that is taken.
         most: usize,
-        /// Who hears no more.
+        /// Which of the two takes no more: the policy or the encoder.
         who: &'static str,
     },
     /// The encoder failed on a sentence that it should take.
@@ -87,9 +87,9 @@ pub enum LanguageError {
         "'{text}': the language encoder failed ({problem}); export it again with `python -m lads_exporter language`"
     )]
     Run {
-        /// The sentence.
+        /// The sentence, or its beginning.
         text: String,
-        /// What it says.
+        /// Error of the network.
         problem: String,
     },
 }

@@ -1,11 +1,14 @@
-//! Sentences that are in no bundle's table, to the word embeddings `[n, E]` that the core's `Controller::set_instruction` takes.
+//! Encodes sentences that are in no bundle's table as the word embeddings `[n, E]` that the core's
+//! `Controller::set_instruction` takes.
 //!
-//! The language encoder is no part of a bundle: the exporter writes it once into a [cache](default_folder), and [`Encoder::open`] takes
-//! it only if its weights are those that made the bundle's own embeddings. It runs on the host, before the first control step, and
-//! allocates; the controller never waits for it. A policy follows whatever it hears, nonsense too: before it is told a sentence,
-//! `lads_core::similarity::nearest` says which known instruction the words are most like and how much, and the contract's
-//! `language.acceptance` from where on that is enough. What can fail: the encoder is missing, damaged or another one; a sentence is empty or longer
-//! than encoder or policy can hear. Each is one line with its remedy.
+//! The language encoder is not part of a bundle: the exporter writes it once into a
+//! [cache](default_folder), and [`Encoder::open`] loads it only if its weights made the bundle's
+//! own embeddings. It runs on the host, before the first control step, and allocates; the
+//! controller never waits for it. A policy follows any words, nonsense too: before it is given a
+//! sentence, find the most similar known instruction by `lads_core::similarity::nearest`, and
+//! compare the similarity with the contract's `language.acceptance`. What can fail: the encoder is
+//! missing, damaged or another one; a sentence is empty or longer than encoder or policy can take.
+//! Each is one line with its remedy.
 #![forbid(unsafe_code)]
 
 mod encoder;
@@ -22,12 +25,13 @@ pub use error::LanguageError;
 #[doc = include_str!("../../../README.md")]
 pub struct Readme;
 
-/// Names the folder that holds what was downloaded or built once for this user.
+/// Environment variable that names the folder of this user's downloaded and built files.
 pub const CACHE_VARIABLE: &str = "LADS_CACHE";
 
-/// Where the exporter puts an encoder: `language/NAME` in `$LADS_CACHE`, else in `lads` in `$XDG_CACHE_HOME` or `~/.cache`.
+/// Returns the folder into which the exporter writes an encoder: `language/NAME` in `$LADS_CACHE`,
+/// else in `lads` in `$XDG_CACHE_HOME` or `~/.cache`.
 ///
-/// The name comes from a bundle, so one that is no plain file name is refused.
+/// The name comes from a bundle, so a name that is not a plain file name is refused.
 pub fn default_folder(encoder: &str) -> Result<PathBuf, LanguageError> {
     let plain = !encoder.is_empty()
         && !encoder.starts_with('.')

@@ -1,4 +1,4 @@
-//! `manifest.json`: what lies in an encoder's folder.
+//! Reads `manifest.json`, the description of an encoder's folder.
 
 use std::collections::BTreeMap;
 use std::io::ErrorKind;
@@ -14,22 +14,23 @@ const FORMAT: &str = "lads-language";
 const FORMAT_VERSION: u32 = 1;
 const FILE: &str = "manifest.json";
 
-/// What an exported encoder is; `python -m lads_exporter language` writes it.
+/// Description of an exported encoder; `python -m lads_exporter language` writes it.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 pub struct Manifest {
     format: String,
     format_version: u32,
-    /// Its name in contracts.
+    /// Name of the encoder in contracts.
     pub encoder: String,
-    /// SHA-256 of the weights that it was exported from, hexadecimal: the one in contracts.
+    /// SHA-256 of the weights that the encoder was exported from, hexadecimal, as contracts state
+    /// it.
     pub sha256: String,
-    /// Hidden layers, the embeddings included.
+    /// Number of hidden layers, the embeddings included.
     pub layers: usize,
-    /// Elements of a word embedding, `E`.
+    /// Number of elements of a word embedding, `E`.
     pub dim: usize,
-    /// Tokens of the longest sentence, with the two that mark its ends.
+    /// Number of tokens of the longest sentence, with the two that mark its ends.
     pub max_tokens: usize,
-    /// SHA-256 of each file, by its name.
+    /// SHA-256 of each file of the folder, by its name.
     files: BTreeMap<String, String>,
 }
 
@@ -59,7 +60,7 @@ impl Manifest {
         Ok(read)
     }
 
-    /// Whether this encoder made the bundle's embeddings.
+    /// Checks whether this encoder made the bundle's embeddings.
     pub fn check(&self, folder: &Path, wanted: &Language) -> Result<(), LanguageError> {
         if self.sha256 != wanted.sha256 {
             return Err(LanguageError::Other {
@@ -80,7 +81,7 @@ impl Manifest {
         Ok(())
     }
 
-    /// Reads a file of the folder, if it has the checksum that the manifest says.
+    /// Reads a file of the folder, if it has the checksum that the manifest states.
     pub fn file(&self, folder: &Path, name: &str) -> Result<Vec<u8>, LanguageError> {
         let path = folder.join(name);
         let damaged = |problem: String| LanguageError::Damaged {

@@ -1,4 +1,5 @@
-//! The encoder on a small network: `PyTorch`'s embeddings, and everything that it refuses.
+//! Compares the encoder of a small network with `PyTorch`'s embeddings, and tests everything that
+//! it refuses.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,7 +11,7 @@ use serde::Deserialize;
 
 const TOLERANCE: f32 = 1e-5;
 
-/// A sentence and `PyTorch`'s hidden layers of it; see data/README.md.
+/// A sentence with `PyTorch`'s hidden layers of it; see data/README.md.
 #[derive(Deserialize)]
 struct Row {
     text: String,
@@ -23,7 +24,7 @@ fn tiny() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny-encoder")
 }
 
-/// The contract of a bundle whose words the small encoder made.
+/// Makes the contract of a bundle whose words the small encoder made.
 fn contract(layer: i32, pooling: Pooling, most: usize) -> Contract {
     let path = "../compiler/tests/data/tiny.onnx";
     let bundle = Bundle::open(&Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap();
@@ -230,7 +231,7 @@ fn one_line(error: &LanguageError, parts: &[&str]) {
     }
 }
 
-/// The small encoder in a folder of its own.
+/// Copies the small encoder to a folder of its own.
 fn copy() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     for file in ["encoder.onnx", "tokenizer.json", "manifest.json"] {
@@ -239,7 +240,7 @@ fn copy() -> tempfile::TempDir {
     folder
 }
 
-/// Lets the manifest agree with a file.
+/// Updates the manifest to match a file.
 fn trust(folder: &Path, file: &str, bytes: &[u8]) {
     let path = folder.join("manifest.json");
     let mut manifest: serde_json::Value =

@@ -1,4 +1,5 @@
-//! Embeddings against the exporter's: those in the tables of the shipped bundles, and those of sentences in no table.
+//! Compares embeddings with the exporter's: those in the tables of the shipped bundles, and those
+//! of sentences in no table.
 //!
 //! `tests/parity/test_language_parity.py` exports the encoder and names its folder in `LADS_LANGUAGE`, where `cases.json` has the sentences;
 //! without it there is nothing to compare with, and the test says so.
@@ -12,15 +13,15 @@ use lads_language::Encoder;
 const VARIABLE: &str = "LADS_LANGUAGE";
 const TOLERANCE: f32 = 1e-4;
 
-/// A sentence and what the exporter makes of it for one bundle.
+/// A sentence with the exporter's results for one bundle.
 #[derive(serde::Deserialize)]
 struct Case {
     bundle: String,
     text: String,
     words: Vec<f32>,
-    /// Id of the known instruction that it is most like.
+    /// Id of the known instruction that the sentence is most similar to.
     nearest: String,
-    /// How much.
+    /// Similarity of the sentence to that instruction.
     similarity: f32,
 }
 
