@@ -1,27 +1,30 @@
-//! Periods with absolute deadlines, as a control loop has them: a late tick does not shift the ones after it.
+//! Periodic clock with absolute deadlines, as in a control loop: a late tick does not shift the
+//! ones after it.
 //!
-//! Nothing can fail: where the kernel cannot sleep until a deadline (no Linux), the ticker sleeps for what is left.
+//! Nothing can fail: where the kernel cannot sleep until a deadline (not Linux), the ticker sleeps
+//! for the remaining time.
 
 use std::time::Duration;
 
 use rustix::time::{ClockId, Timespec, clock_gettime};
 
-/// The monotonic clock in nanoseconds.
+/// Returns the time of the monotonic clock in nanoseconds.
 pub fn now() -> u64 {
     let time = clock_gettime(ClockId::Monotonic);
     time.tv_sec as u64 * 1_000_000_000 + time.tv_nsec as u64
 }
 
-/// When the calls of a block are due.
+/// Timing of the calls of a block.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Pace {
-    /// One after the other, without sleeping: caches stay warm.
+    /// Calls follow each other without sleeping: caches stay warm.
     Hot,
-    /// Once every period, asleep in between: caches, clock frequency and branch predictors are what a robot's are.
+    /// One call in every period, asleep in between: caches, clock frequency and branch predictors
+    /// are in the state of a robot's.
     Every(Duration),
 }
 
-/// Wakes up at the deadlines of a pace.
+/// Timer that wakes up at the deadlines of a pace.
 #[derive(Debug)]
 pub struct Ticker {
     period: Option<u64>,
@@ -29,7 +32,7 @@ pub struct Ticker {
 }
 
 impl Ticker {
-    /// The first deadline is one period from now.
+    /// Starts a timer, whose first deadline is one period from now.
     pub fn start(pace: Pace) -> Self {
         let period = match pace {
             Pace::Hot => None,
@@ -38,8 +41,8 @@ impl Ticker {
         Self { period, due: now() }
     }
 
-    /// Sleeps until the next deadline and says by how many nanoseconds it was missed. A deadline that has passed already is
-    /// skipped together with all others that have, as a control loop does that cannot run twice at once.
+    /// Sleeps until the next deadline and returns by how many nanoseconds it was missed. Deadlines
+    /// that have already passed are skipped, as in a control loop, which cannot run twice at once.
     pub fn wait(&mut self) -> u64 {
         let Some(period) = self.period else {
             return 0;

@@ -1,7 +1,8 @@
-//! What is measured, and who competes.
+//! Contenders of a measurement, and the work that is measured.
 //!
-//! A [`Contender`] runs one policy. It is measured in blocks: a few calls one after the other, hot or paced, of one kind of work,
-//! so that contenders can take turns and a change of the machine's mood hits them all.
+//! A [`Contender`] runs one policy. It is measured in blocks: a few calls one after the other, hot
+//! or paced, of one kind of work, so that contenders can take turns and a change of the machine's
+//! state affects them all.
 
 use lads_core::Policy;
 use lads_host::schedule;
@@ -10,23 +11,26 @@ use lads_image::Tables;
 use crate::clock::{Pace, Ticker, now};
 use crate::error::BenchError;
 
-/// What one call did.
+/// Kind of a measured call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Kind {
-    /// The action for an index that is given, such as that of a plan: what alone runs in every control step.
+    /// Action for a given index, such as that of a plan: the only part that runs in every control
+    /// step.
     Act,
     /// A control step inside a period of the schedule; any control step of a policy without one.
     Ordinary,
-    /// A control step that begins a period of the schedule: it also runs what comes every so many steps, such as picking a plan.
+    /// A control step that begins a period of the schedule: it also runs the periodic calls, such
+    /// as picking a plan.
     Decision,
     /// A new instruction: its words go through the transformer.
     Instruct,
-    /// The logits from the whole history at once, as a plain export without a KV cache computes them.
+    /// Computation of the logits from the whole history at once, as in a plain export without a KV
+    /// cache.
     Recompute,
 }
 
 impl Kind {
-    /// All of them, in the order of reports.
+    /// All kinds, in the order of reports.
     pub const ALL: [Self; 5] = [
         Self::Act,
         Self::Ordinary,
@@ -35,7 +39,7 @@ impl Kind {
         Self::Recompute,
     ];
 
-    /// Its name in tables and JSON.
+    /// Returns the name of the kind in tables and JSON.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Act => "act",
@@ -47,40 +51,42 @@ impl Kind {
     }
 }
 
-/// The work of a block.
+/// Work of a block.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Work {
-    /// The action for an index that is given.
+    /// Computation of the action for a given index.
     Act,
-    /// Control steps from this one of an episode on. Contenders that cannot go on from one call to the next repeat the middle one.
+    /// Control steps of an episode, starting at this one. Contenders that cannot continue from one
+    /// call to the next repeat the middle one.
     Steps {
-        /// The first control step, from 0.
+        /// Number of the first control step, from 0.
         first: usize,
     },
-    /// The instruction, again and again.
+    /// Setting the instruction, again and again.
     Instruct,
-    /// Full recompute at this control step.
+    /// Full recomputation at this control step.
     Recompute {
-        /// The control step, from 0.
+        /// Number of the control step, from 0.
         step: usize,
     },
 }
 
-/// A few calls one after the other.
+/// A few consecutive calls that are measured together.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Block {
-    /// What to do.
+    /// Work of each call.
     pub work: Work,
-    /// When.
+    /// Timing of the calls.
     pub pace: Pace,
-    /// How often.
+    /// Number of recorded calls.
     pub calls: usize,
-    /// Calls before the recorded ones: they bring the contender's own state into the caches that the pace leaves it.
+    /// Number of calls before the recorded ones, which bring the contender's own state into the
+    /// caches that the pace leaves it.
     pub settle: usize,
 }
 
 impl Block {
-    /// The control step in the middle: the context of contenders that stay where they are.
+    /// Returns the control step in the middle: the context of contenders that do not advance.
     pub fn middle(&self) -> usize {
         match self.work {
             Work::Steps { first } => first + self.calls / 2,
@@ -90,20 +96,20 @@ impl Block {
     }
 }
 
-/// One call, in nanoseconds.
+/// Measurement of one call, in nanoseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Sample {
-    /// What it did.
+    /// Kind of the call.
     pub kind: Kind,
-    /// Its control step.
+    /// Number of the control step.
     pub step: usize,
-    /// From the deadline to the wake-up.
+    /// Time from the deadline to the wake-up.
     pub late: u64,
-    /// From the wake-up to the result.
+    /// Time from the wake-up to the result.
     pub took: u64,
 }
 
-/// What a contender computed in one control step.
+/// Result of a contender in one control step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Computed {
     /// The index in force, if the policy selects one.
@@ -112,25 +118,27 @@ pub struct Computed {
     pub action: Vec<f32>,
 }
 
-/// A recorded episode, the same for all contenders.
+/// A recorded episode that all contenders replay.
 #[derive(Debug, Clone)]
 pub struct Episode {
     /// Number of the instruction; `None` for a policy that takes none.
     pub instruction: Option<u32>,
-    /// Control steps after which the schedule repeats; 1 for a policy whose steps are alike.
+    /// Number of control steps after which the schedule repeats; 1 for a policy whose steps are
+    /// alike.
     pub period: usize,
-    /// Control steps that fit into the context; as many as were recorded where there is no such bound.
+    /// Number of control steps that fit into the context; the number recorded if it is unbounded.
     pub context_steps: usize,
-    /// Observations; a longer episode starts with the first again. Empty ones for a policy that has more than one channel of floats.
+    /// Observations; a longer episode starts with the first again. They are empty for a policy that
+    /// has more than one channel of floats.
     pub observations: Vec<Vec<f32>>,
-    /// What the policy did, by the runtime that recorded it.
+    /// Results of the policy, by the runtime that recorded it.
     pub recorded: Vec<Computed>,
-    /// The limits of each action element.
+    /// Limits of each action element.
     pub limits: Vec<(f32, f32)>,
 }
 
 impl Episode {
-    /// The golden episode of a policy.
+    /// Reads the golden episode of a policy.
     pub fn of(policy: &Policy<'_>) -> Result<Self, BenchError> {
         let contract = policy.contract();
         let golden = policy.golden().ok_or_else(|| {
@@ -161,18 +169,18 @@ impl Episode {
         })
     }
 
-    /// The observation of a control step.
+    /// Returns the observation of a control step.
     pub fn observation(&self, step: usize) -> &[f32] {
         let index = step % self.observations.len().max(1);
         self.observations.get(index).map_or(&[], Vec::as_slice)
     }
 
-    /// Whether a control step begins a period of the schedule.
+    /// Returns whether a control step begins a period of the schedule.
     pub fn decides(&self, step: usize) -> bool {
         self.period > 1 && step.is_multiple_of(self.period)
     }
 
-    /// [`Kind::Decision`] or [`Kind::Ordinary`].
+    /// Returns the kind of a control step: [`Kind::Decision`] or [`Kind::Ordinary`].
     pub fn kind(&self, step: usize) -> Kind {
         if self.decides(step) {
             Kind::Decision
@@ -181,8 +189,8 @@ impl Episode {
         }
     }
 
-    /// The first control step of a block of `calls` around the one with `tokens` in its context, of which `words` are the
-    /// instruction's.
+    /// Returns the first control step of a block of `calls` around the one with `tokens` in its
+    /// context, of which `words` are the instruction's.
     pub fn first_around(&self, tokens: usize, words: usize, calls: usize) -> usize {
         // Step t finds the words, s_0 and two tokens for each of the t - 1 steps after it.
         let middle = tokens.saturating_sub(words).div_ceil(2);
@@ -191,25 +199,27 @@ impl Episode {
     }
 }
 
-/// Somebody who can run the policy.
+/// A runtime or program that can run the policy.
 pub trait Contender {
-    /// Short, unique in a run.
+    /// Returns a short name, unique in a run.
     fn name(&self) -> &str;
 
-    /// Version and settings, for the report.
+    /// Returns version and settings, for the report.
     fn detail(&self) -> String;
 
-    /// The first `steps` control steps of the episode, untimed: what it computes is compared before anything is measured.
+    /// Runs the first `steps` control steps of the episode, untimed: the results are compared
+    /// before anything is measured.
     fn replay(&mut self, steps: usize) -> Result<Vec<Computed>, BenchError>;
 
-    /// Whether it can do a block's work at all.
+    /// Returns whether the contender can do a block's work at all.
     fn offers(&self, work: Work) -> bool;
 
     /// Measures one block.
     fn block(&mut self, block: &Block, samples: &mut Vec<Sample>) -> Result<(), BenchError>;
 }
 
-/// Makes the calls of a block and records all but the first `settle`. `call` says what the call was, and is given its number.
+/// Makes the calls of a block and records all but the first `settle`. `call` gets the number of the
+/// call and returns its kind and step.
 pub fn measure<E>(
     block: &Block,
     samples: &mut Vec<Sample>,
@@ -234,7 +244,8 @@ pub fn measure<E>(
     Ok(())
 }
 
-/// Compares what two contenders computed: indices in force equal, actions within `tolerance`. Says the largest difference of an action.
+/// Compares the results of two contenders: indices in force equal, actions within `tolerance`.
+/// Returns the largest difference of an action.
 pub fn compare(
     name: &str,
     got: &[Computed],

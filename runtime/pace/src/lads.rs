@@ -1,4 +1,4 @@
-//! lads itself as a contender.
+//! The lads runtime as a contender.
 
 use lads_core::{ChannelId, Controller, Data, Decision, GoldenStep, Instruction, Role, StepReport};
 use lads_image::{Op, Tables};
@@ -7,7 +7,7 @@ use crate::clock::Pace;
 use crate::contender::{Block, Computed, Contender, Episode, Kind, Sample, Work, measure};
 use crate::error::BenchError;
 
-/// A controller and the episode that it is measured on.
+/// A controller with the episode that it is measured on.
 #[derive(Debug)]
 pub struct Lads<'c, 'a, 'm> {
     name: String,
@@ -19,7 +19,8 @@ pub struct Lads<'c, 'a, 'm> {
 }
 
 impl<'c, 'a, 'm> Lads<'c, 'a, 'm> {
-    /// Measures `controller` on `episode`; `weights` says how its weights are stored.
+    /// Makes a contender that measures `controller` on `episode`; `weights` names the format of its
+    /// weights.
     pub fn new(
         weights: &str,
         controller: &'c mut Controller<'a, 'm>,
@@ -69,7 +70,7 @@ impl<'c, 'a, 'm> Lads<'c, 'a, 'm> {
         done.map_err(|error| self.refused(error))
     }
 
-    /// A control step with the noise that was recorded.
+    /// Runs a control step with the recorded noise.
     fn replayed(&mut self, step: usize) -> Result<Computed, BenchError> {
         let recorded = &self.recorded[step % self.recorded.len()];
         let mut channels = self.controller.policy().contract().channels();
@@ -90,7 +91,7 @@ impl<'c, 'a, 'm> Lads<'c, 'a, 'm> {
         })
     }
 
-    /// Unmeasured steps up to `step`.
+    /// Runs unmeasured steps up to `step`.
     fn forward_to(&mut self, step: usize) -> Result<(), BenchError> {
         self.instruct()?;
         for before in 0..step {
@@ -100,7 +101,7 @@ impl<'c, 'a, 'm> Lads<'c, 'a, 'm> {
     }
 }
 
-/// How an image stores its KV cache, if it has one.
+/// Returns the format of an image's KV cache, if it has one.
 fn cache_format(image: &[u8]) -> Option<&'static str> {
     let tables = Tables::new(image).ok()?;
     let entries = (0..tables.entries_len()).filter_map(|i| tables.entry(i));

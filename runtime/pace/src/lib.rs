@@ -1,4 +1,5 @@
-//! Measures a policy: hot, at a robot's pace, and beside what its users would pick instead.
+//! Measures the speed of a policy: hot, at a robot's rate, and compared with the runtimes that its
+//! users would choose instead.
 //!
 //! ```text
 //! Contender (lads, or who else runs the policy)
@@ -10,8 +11,8 @@
 //! Summary, Ratio (per round, then the median)         stats
 //! ```
 //!
-//! [`paced`] is the protocol of a whole run with its report. What can fail is a [`BenchError`], one line; a contender that computes
-//! something else than the others is never timed.
+//! [`paced`] is the protocol of a whole run with its report. What can fail is a [`BenchError`], one
+//! line; a contender whose results differ from the others' is never timed.
 #![forbid(unsafe_code)]
 
 pub mod clock;

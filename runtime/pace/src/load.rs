@@ -1,15 +1,16 @@
-//! Work beside the control thread, such as perception and logging would be: threads that sweep memory through the caches and
-//! compute in between.
+//! Makes load beside the control thread, as perception and logging would: threads that sweep memory
+//! through the caches and compute in between.
 
 use std::hint::black_box;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 
-/// Elements that one thread sweeps: 64 MiB, more than the last-level cache of most machines.
+/// Number of elements that one thread sweeps: 64 MiB, more than the last-level cache of most
+/// machines.
 const SWEPT: usize = 64 * 1024 * 1024 / size_of::<u64>();
 
-/// Threads that make load until this is dropped.
+/// Threads that make load until this value is dropped.
 #[derive(Debug)]
 pub struct Load {
     stop: Arc<AtomicBool>,
@@ -17,7 +18,8 @@ pub struct Load {
 }
 
 impl Load {
-    /// Starts `count` threads. Do so before the control thread becomes a real-time one: threads inherit.
+    /// Starts `count` threads. Start them before the control thread becomes a real-time one,
+    /// because threads inherit its scheduling.
     pub fn start(count: usize) -> Self {
         let stop = Arc::new(AtomicBool::new(false));
         let threads = (0..count).map(|_| {
@@ -39,7 +41,8 @@ impl Drop for Load {
     }
 }
 
-/// Reads and writes one cache line after the other, and after every 1024 lines computes for a while.
+/// Reads and writes one cache line after the other, and computes for a while after every 1024
+/// lines.
 fn work(stop: &AtomicBool) -> u64 {
     let mut swept = vec![1_u64; SWEPT];
     let mut sum = 0_u64;

@@ -1,4 +1,5 @@
-//! A policy at its real rate, over whole episodes, alone or beside peers; what a control thread would see.
+//! Measures a policy at its real rate, over whole episodes, alone or beside peers, as a control
+//! thread would see it.
 //!
 //! A run is made of rounds. In a round every contender gets one block at one part of the episode (two periods of the schedule long),
 //! one of actions for a given index and one of new instructions, where the policy has them; within a block the calls come at the period's absolute deadlines. The rounds go through
@@ -18,38 +19,38 @@ use crate::stats::{Ratio, Rounds, Summary, median};
 use crate::suite::{Candidate, Entrant, Field, Others, with_contenders};
 use crate::turns::take_turns;
 
-/// Calls before the recorded ones of each block.
+/// Number of calls before the recorded ones of each block.
 const SETTLE: usize = 3;
 
-/// Actions for a given index in a round.
+/// Number of actions for a given index in a round.
 const ACTIONS: usize = 10;
 
-/// New instructions in a round.
+/// Number of new instructions in a round.
 const INSTRUCTIONS: usize = 2;
 
-/// The fewest control steps of a part of the episode.
+/// Smallest number of control steps of a part of the episode.
 const FEWEST: usize = 8;
 
-/// How to measure.
+/// Settings of a measurement.
 #[derive(Debug, Clone)]
 pub struct Protocol {
-    /// Control steps per second.
+    /// Number of control steps per second.
     pub rate: f64,
-    /// Seconds for each contender.
+    /// Duration for each contender, in seconds.
     pub seconds: f64,
-    /// Threads that make load beside it.
+    /// Number of threads that make load during the measurement.
     pub load: usize,
 }
 
-/// A field of a [`Protocol`] that makes no sense.
+/// An invalid field of a [`Protocol`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{field}: {wrong}; {remedy}")]
 pub struct Senseless {
     /// Name of the field.
     pub field: &'static str,
-    /// What is wrong with it.
+    /// Fault of the field.
     pub wrong: String,
-    /// What to give instead.
+    /// Value to give instead.
     pub remedy: String,
 }
 
@@ -83,7 +84,7 @@ impl Protocol {
     }
 }
 
-/// What was measured.
+/// Results of a measurement.
 #[derive(Debug)]
 pub struct Report {
     protocol: Protocol,
@@ -91,7 +92,7 @@ pub struct Report {
     entrants: Vec<Entrant>,
     absent: Vec<String>,
     runs: Vec<Rounds>,
-    /// Control steps of one part of the episode.
+    /// Number of control steps of one part of the episode.
     part: usize,
     steps: usize,
 }
@@ -158,7 +159,7 @@ impl Report {
         (1e9 / self.protocol.rate) as u64
     }
 
-    /// How the first contender compares with each of the others, call by call.
+    /// Compares the first contender with each of the others, by kind of call.
     fn ratios(&self) -> Vec<(&Entrant, Kind, Ratio, Ratio)> {
         let mut all = vec![];
         let Some((ours, others)) = self.runs.split_first() else {
@@ -175,7 +176,7 @@ impl Report {
         all
     }
 
-    /// A decision step against an ordinary one of the same contender.
+    /// Compares a decision step with an ordinary one of the same contender.
     fn decision(run: &Rounds) -> Option<Ratio> {
         Ratio::of(
             &run.quantiles(Kind::Decision, 0.5),
@@ -183,7 +184,7 @@ impl Report {
         )
     }
 
-    /// Median of the ordinary steps in each part of the episode.
+    /// Returns the median of the ordinary steps in each part of the episode.
     fn growth(&self, run: &Rounds) -> Vec<(usize, f64)> {
         let of_part = |first: usize| {
             let inside = |step: usize| (first..first + self.part).contains(&step);
@@ -198,7 +199,7 @@ impl Report {
         parts.filter(|(_, took)| !took.is_nan()).collect()
     }
 
-    /// All of it as one JSON object; times in microseconds.
+    /// Formats the report as one JSON object; times in microseconds.
     pub fn json(&self) -> Value {
         let contenders = self.entrants.iter().zip(&self.runs).map(|(entrant, run)| {
             let kinds: serde_json::Map<_, _> = run
@@ -363,7 +364,7 @@ impl Report {
     }
 }
 
-/// A ratio with its quartiles, in columns.
+/// Displays a ratio with its quartiles, in columns.
 struct Shown(Ratio);
 
 impl Display for Shown {

@@ -1,4 +1,5 @@
-//! What an operating system grants a control thread: SCHED_FIFO and locked memory. Where it refuses, the report says so.
+//! Real-time privileges of a control thread: SCHED_FIFO and locked memory. If the operating system
+//! refuses them, the report says so.
 
 use std::fmt;
 
@@ -7,10 +8,10 @@ use thread_priority::{
     set_thread_priority_and_policy, thread_native_id,
 };
 
-/// Above ordinary threads, below the kernel's own real-time threads.
+/// Real-time priority above ordinary threads, below the kernel's own real-time threads.
 const PRIORITY: u8 = 50;
 
-/// What this thread was granted; ends when it is dropped.
+/// Privileges that this thread was granted; they end when the value is dropped.
 #[derive(Debug)]
 pub struct Realtime {
     fifo: Result<(), String>,
@@ -27,7 +28,7 @@ impl Realtime {
         granted
     }
 
-    /// Asks for SCHED_FIFO alone. Threads that are started meanwhile have it too.
+    /// Asks for SCHED_FIFO alone. Threads that are started meanwhile inherit it.
     pub fn scheduling() -> Self {
         let priority = PRIORITY
             .try_into()
@@ -38,7 +39,7 @@ impl Realtime {
         Self { fifo, locked: None }
     }
 
-    /// Whether the thread runs before all ordinary ones.
+    /// Returns whether the thread runs before all ordinary ones.
     pub fn is_fifo(&self) -> bool {
         self.fifo.is_ok()
     }

@@ -1,38 +1,39 @@
 //! Distributions of latencies, and ratios that hold on a busy machine.
 //!
-//! A ratio is taken within one round, in which all contenders were measured within a second or so, and then the median over the
-//! rounds: what slows the machine for longer than a round slows both sides of a ratio.
+//! A ratio is taken within one round, in which all contenders were measured within a second or so,
+//! and then the median over the rounds: a slowdown of the machine that lasts longer than a round
+//! affects both sides of a ratio.
 
 use hdrhistogram::Histogram;
 use serde::Serialize;
 
 use crate::contender::{Kind, Sample};
 
-/// Latencies of one kind of call, in nanoseconds.
+/// Distribution of the latencies of one kind of call, in nanoseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Summary {
-    /// Calls.
+    /// Number of calls.
     pub count: u64,
-    /// Half of the calls took at most this.
+    /// Median latency: half of the calls took at most this.
     pub p50: u64,
-    /// Nine in ten.
+    /// 90th percentile of the latency.
     pub p90: u64,
-    /// 99 in 100.
+    /// 99th percentile of the latency.
     pub p99: u64,
-    /// 999 in 1,000; with fewer calls, the longest.
+    /// 99.9th percentile of the latency; with fewer than 1,000 calls, the longest.
     pub p999: u64,
-    /// The longest.
+    /// Longest latency.
     pub max: u64,
     /// Median absolute deviation of the rounds' medians.
     pub spread: u64,
 }
 
-/// The median of some numbers; NaN of none.
+/// Returns the median of some numbers; NaN if there are none.
 pub fn median(numbers: &[f64]) -> f64 {
     quantile(numbers, 0.5)
 }
 
-/// A quantile of some numbers, interpolated; NaN of none.
+/// Returns a quantile of some numbers, interpolated; NaN if there are none.
 pub fn quantile(numbers: &[f64], q: f64) -> f64 {
     let mut sorted = numbers.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -47,19 +48,19 @@ pub fn quantile(numbers: &[f64], q: f64) -> f64 {
     }
 }
 
-/// The median absolute deviation from the median.
+/// Returns the median absolute deviation from the median.
 pub fn spread(numbers: &[f64]) -> f64 {
     let centre = median(numbers);
     let deviations: Vec<_> = numbers.iter().map(|x| (x - centre).abs()).collect();
     median(&deviations)
 }
 
-/// The samples of one contender, round by round.
+/// Samples of one contender, round by round.
 #[derive(Debug, Clone, Default)]
 pub struct Rounds(pub Vec<Vec<Sample>>);
 
 impl Rounds {
-    /// All samples of a kind.
+    /// Returns all samples of a kind.
     pub fn of(&self, kind: Kind) -> impl Iterator<Item = &Sample> {
         self.0
             .iter()
@@ -67,13 +68,13 @@ impl Rounds {
             .filter(move |sample| sample.kind == kind)
     }
 
-    /// The kinds that there are.
+    /// Returns the kinds that occur.
     pub fn kinds(&self) -> Vec<Kind> {
         let present = |kind: &Kind| self.of(*kind).next().is_some();
         Kind::ALL.into_iter().filter(present).collect()
     }
 
-    /// A quantile of each round, in nanoseconds; NaN where a round has no such call.
+    /// Returns a quantile of each round, in nanoseconds; NaN for a round without such a call.
     pub fn quantiles(&self, kind: Kind, q: f64) -> Vec<f64> {
         let of_round = |round: &Vec<Sample>| {
             let took: Vec<_> = round
@@ -86,7 +87,7 @@ impl Rounds {
         self.0.iter().map(of_round).collect()
     }
 
-    /// The distribution over all rounds; `None` without such calls.
+    /// Returns the distribution over all rounds; `None` without such calls.
     pub fn summary(&self, kind: Kind) -> Option<Summary> {
         summary(
             self.of(kind).map(|sample| sample.took),
@@ -94,12 +95,12 @@ impl Rounds {
         )
     }
 
-    /// The distribution of how late wake-ups were.
+    /// Returns the distribution of the wake-ups' lateness.
     pub fn lateness(&self) -> Option<Summary> {
         summary(self.0.iter().flatten().map(|sample| sample.late), &[])
     }
 
-    /// Calls whose result came after the next deadline.
+    /// Counts the calls whose result came after the next deadline.
     pub fn misses(&self, period_ns: u64) -> usize {
         let late = |sample: &&Sample| sample.late + sample.took > period_ns;
         self.0.iter().flatten().filter(late).count()
@@ -127,7 +128,7 @@ fn summary(values: impl Iterator<Item = u64>, medians: &[f64]) -> Option<Summary
     })
 }
 
-/// How one side compares with the other: the median over rounds, and the quartiles.
+/// Ratio of two sides: the median over rounds, and the quartiles.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Ratio {
     /// Median over the rounds.
@@ -139,7 +140,7 @@ pub struct Ratio {
 }
 
 impl Ratio {
-    /// Of two rows of numbers, one pair for each round.
+    /// Computes the ratio of two rows of numbers, one pair for each round.
     pub fn of(above: &[f64], below: &[f64]) -> Option<Self> {
         let pairs = above.iter().zip(below).map(|(a, b)| a / b);
         let ratios: Vec<_> = pairs.filter(|ratio| ratio.is_finite()).collect();
@@ -151,7 +152,8 @@ impl Ratio {
     }
 }
 
-/// The exponent `e` of `y = c x^e` by least squares on logarithms, and how well it fits (R²).
+/// Fits the exponent `e` of `y = c x^e` by least squares on logarithms, and returns it with the
+/// quality of the fit (R²).
 pub fn exponent(points: &[(f64, f64)]) -> Option<(f64, f64)> {
     let logs: Vec<_> = points
         .iter()

@@ -1,4 +1,4 @@
-//! Brings all contenders to the start: opens what they need and compares what they compute, before anything is timed.
+//! Prepares all contenders: opens them and compares their results, before anything is timed.
 
 use lads_compiler::{CacheFormat, Options, Storage, WeightFormat};
 use lads_core::{Controller, Policy};
@@ -9,14 +9,15 @@ use crate::contender::{Contender, Episode, compare};
 use crate::error::BenchError;
 use crate::lads::Lads;
 
-/// Control steps that are compared.
+/// Number of control steps that are compared.
 const COMPARED: usize = 60;
 
-/// An action that is further from the recorded one than this is not rounding.
+/// Largest difference of an action from the recorded one that may be rounding.
 const BROKEN: f32 = 0.1;
 
-/// How a policy is compiled to be measured: with fewer bits for the weights, the cache has half of them too, and the tolerance, which
-/// is otherwise the machine's, only has to tell a sound policy from a broken one.
+/// Returns the options that compile a policy for a measurement: with fewer bits for the weights,
+/// the cache has half of them too, and the tolerance, which is otherwise the machine's, only has to
+/// distinguish a sound policy from a broken one.
 pub fn options(weights: WeightFormat) -> Options {
     if weights == WeightFormat::F32 {
         return Options::exact();
@@ -28,10 +29,10 @@ pub fn options(weights: WeightFormat) -> Options {
     }
 }
 
-/// An image to measure.
+/// A program image to measure.
 #[derive(Debug, Clone, Copy)]
 pub struct Candidate<'i> {
-    /// How its weights are stored, such as `f32`.
+    /// Format of the weights, such as `f32`.
     pub weights: &'i str,
     /// The compiled program image, aligned to four bytes.
     pub image: &'i [u8],
@@ -39,9 +40,10 @@ pub struct Candidate<'i> {
     pub tolerance: f32,
 }
 
-/// Whoever runs the same policy by other means.
+/// Other programs that run the same policy.
 pub trait Others {
-    /// Opens them; who was asked for and cannot be run is told to `absent`, with the reason.
+    /// Opens the other contenders; those that were asked for and cannot be run are reported to
+    /// `absent`, with the reason.
     fn open<'e>(
         &self,
         episode: &'e Episode,
@@ -49,7 +51,7 @@ pub trait Others {
     ) -> Vec<Box<dyn Contender + 'e>>;
 }
 
-/// Nobody else.
+/// An empty set of other contenders.
 #[derive(Debug, Clone, Copy)]
 pub struct Nobody;
 
@@ -59,35 +61,36 @@ impl Others for Nobody {
     }
 }
 
-/// A contender at the start.
+/// A contender that is ready to be measured.
 #[derive(Debug, Clone, serde::Serialize)]
 pub struct Entrant {
-    /// Its name.
+    /// Name of the contender.
     pub name: String,
-    /// Version and settings.
+    /// Version and settings of the contender.
     pub detail: String,
     /// Largest difference of an action from the recorded episode.
     pub largest_error: f32,
-    /// The first instruction and control step of this process, in nanoseconds.
+    /// Time of the first instruction and control step of this process, in nanoseconds.
     pub first_ns: u64,
-    /// The same again, median, in nanoseconds.
+    /// Median time of a repeated instruction and control step, in nanoseconds.
     pub again_ns: u64,
 }
 
-/// What was measured on.
+/// Episode and contenders of a measurement.
 #[derive(Debug)]
 pub struct Field<'f> {
-    /// The episode.
+    /// Episode that was measured.
     pub episode: &'f Episode,
-    /// Words of its instruction; 0 without one.
+    /// Number of words of the episode's instruction; 0 without one.
     pub words: usize,
-    /// Who takes part.
+    /// Contenders that take part.
     pub entrants: Vec<Entrant>,
-    /// Others that were asked for and could not be run, with the reason.
+    /// Contenders that were asked for and could not be run, with the reason.
     pub absent: Vec<String>,
 }
 
-/// Opens all contenders, compares them, and lends them to `body`. Guests come last and are not compared: they run no policy.
+/// Opens all contenders, compares them, and lends them to `body`. Guests come last and are not
+/// compared, because they run no policy.
 pub fn with_contenders<R>(
     candidates: &[Candidate<'_>],
     others: &dyn Others,

@@ -1,10 +1,12 @@
-//! All contenders in one run, block by block: A B C, then C B A, and so on, so that what changes slowly hits all alike.
+//! Runs all contenders in turns, block by block: A B C, then C B A, and so on, so that slow changes
+//! affect all alike.
 
 use crate::contender::{Block, Contender};
 use crate::error::BenchError;
 use crate::stats::Rounds;
 
-/// Measures rounds of blocks for every contender that offers them. `progress` is told the rounds done.
+/// Measures rounds of blocks for every contender that offers them. `progress` gets the number of
+/// finished rounds.
 pub fn take_turns(
     contenders: &mut [&mut dyn Contender],
     rounds: &[Vec<Block>],
