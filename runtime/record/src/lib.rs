@@ -1,5 +1,5 @@
-//! The flight recorder: episodes as an MCAP file, for Foxglove and whatever else reads MCAP. `lads-run replay` computes a log of
-//! `lads-run --log` again.
+//! Flight recorder: episodes as an MCAP file, for Foxglove and other programs that read MCAP.
+//! `lads-run replay` repeats the computation of a log that `lads-run --log` wrote.
 //!
 //! One channel per kind of message, JSON with a JSON schema each:
 //!
@@ -18,7 +18,7 @@
 //! faults and versions. Numbers are written so that they read back bit for bit. Chunks carry checksums and are not compressed, which keeps
 //! C libraries out of the build.
 //!
-//! What can fail: the disk; and reading a file that is cut off, damaged or something else.
+//! What can fail: the disk; and reading a file that is truncated, damaged or not a log.
 #![forbid(unsafe_code)]
 
 mod read;
@@ -38,7 +38,7 @@ use crate::trace::Trace;
 pub use read::read;
 pub use write::write;
 
-/// Version of the messages; changes when one changes its meaning or goes.
+/// Version of the messages; it changes when a message changes its meaning or is removed.
 ///
 /// Version 1, which is read too, has names of elements with spaces between them; version 2 has them as a JSON array.
 pub const FORMAT_VERSION: u32 = 2;
@@ -46,17 +46,17 @@ pub const FORMAT_VERSION: u32 = 2;
 /// Name of the metadata record.
 const METADATA: &str = "lads";
 
-/// Its key for [`Origin::period`].
+/// Metadata key of [`Origin::period`].
 const PERIOD: &str = "horizon";
 
-/// What the episodes of a log depend on besides themselves.
+/// Origin of a log: everything that its episodes depend on besides themselves.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Origin {
-    /// sha256 of the bundle's contract and weights, as the contract has it.
+    /// SHA-256 of the bundle's contract and weights, as the contract states it.
     pub bundle_sha256: String,
-    /// The environment's id.
+    /// Id of the environment.
     pub environment: String,
-    /// Version of its behaviour.
+    /// Version of the environment's behaviour.
     pub environment_version: String,
     /// Seed of the run.
     pub seed: u64,
@@ -64,67 +64,68 @@ pub struct Origin {
     pub noise: String,
     /// Time between two control steps, in seconds.
     pub control_period_s: f64,
-    /// Control steps per plan; `None` of a policy that selects none.
+    /// Number of control steps per plan; `None` for a policy that selects none.
     pub period: Option<usize>,
     /// Names of the elements of an observation.
     pub observation_names: Vec<String>,
     /// Names of the elements of an action.
     pub action_names: Vec<String>,
-    /// Everything else that is worth knowing: faults, versions.
+    /// Other notes: faults, versions.
     pub notes: BTreeMap<String, String>,
 }
 
 /// A recorded episode with the instruction's words, which outlive its index.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Flight {
-    /// The instruction's id in the contract.
+    /// Id of the instruction in the contract.
     pub instruction_id: String,
-    /// Its text.
+    /// Text of the instruction.
     pub instruction_text: String,
-    /// Word embeddings `[n, E]` that were heard; `None` where they were the bundle's own.
+    /// Word embeddings `[n, E]` that the policy was given; `None` if they were the bundle's own.
     pub words: Option<Vec<f32>>,
     /// Names of the completed sub-tasks, in the order of `trace.outcome.completions`.
     pub completed: Vec<String>,
-    /// The control steps and what they came to. Read from a log, a completion's sub-task is its place in `completed`.
+    /// Control steps and outcome of the episode. In a trace read from a log, a completion's
+    /// sub-task is its index in `completed`.
     pub trace: Trace,
 }
 
-/// A log.
+/// Content of a log.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Log {
-    /// Where it comes from.
+    /// Origin of the episodes.
     pub origin: Origin,
-    /// Its episodes.
+    /// Episodes of the log.
     pub flights: Vec<Flight>,
 }
 
-/// Why a log could not be read.
+/// Reason why a log could not be read.
 #[derive(Debug, Error)]
 pub enum LogError {
     /// The file cannot be read.
     #[error("it cannot be read ({0})")]
     Io(#[from] std::io::Error),
-    /// It is no MCAP file, or cut off, or damaged.
+    /// The file is not an MCAP file, or truncated, or damaged.
     #[error("it is no whole MCAP file ({0}); record it again")]
     Mcap(#[from] mcap::McapError),
-    /// It is MCAP, but not what [`write()`] makes.
+    /// The file is MCAP, but not a log that [`write()`] makes.
     #[error("it is no log of lads ({0}); record one with lads-run --log")]
     Foreign(String),
 }
 
-/// `/episode`.
+/// Message of the topic `/episode`.
 #[derive(Debug, Serialize, Deserialize)]
 struct EpisodeMessage {
     instruction: u32,
     instruction_id: String,
     instruction_text: String,
-    /// Of an instruction that the language encoder heard.
+    /// Words of an instruction that the language encoder encoded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     words: Option<Vec<f32>>,
     episode: u32,
-    /// In decimal digits: a JSON number would lose bits in JavaScript.
+    /// Seed of the sampling in decimal digits: a JSON number would lose bits in JavaScript.
     sampling_seed: Option<String>,
-    /// The same, of what else the policy draws at random; left out where it draws nothing.
+    /// Seed of the policy's other random draws, in decimal digits; left out if there are none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     noise_seed: Option<String>,
     commanded: bool,
@@ -132,20 +133,20 @@ struct EpisodeMessage {
     success: bool,
 }
 
-/// `/observation` and `/logits`.
+/// Message of the topics `/observation` and `/logits`.
 #[derive(Debug, Serialize, Deserialize)]
 struct Values {
     values: Vec<f32>,
 }
 
-/// `/action`.
+/// Message of the topic `/action`.
 #[derive(Debug, Serialize, Deserialize)]
 struct ActionMessage {
     policy: Vec<f32>,
     executed: Vec<f32>,
 }
 
-/// `/plan`.
+/// Message of the topic `/plan`.
 #[derive(Debug, Serialize, Deserialize)]
 struct PlanMessage {
     index: Option<u32>,
@@ -153,13 +154,13 @@ struct PlanMessage {
     margin: Option<f32>,
 }
 
-/// `/timing`.
+/// Message of the topic `/timing`.
 #[derive(Debug, Serialize, Deserialize)]
 struct TimingMessage {
     controller_ns: u64,
 }
 
-/// `/gripper`, in metres.
+/// Message of the topic `/gripper`, in metres.
 #[derive(Debug, Serialize, Deserialize)]
 struct GripperMessage {
     x: f64,
@@ -167,7 +168,7 @@ struct GripperMessage {
     z: f64,
 }
 
-/// `/completion`.
+/// Message of the topic `/completion`.
 #[derive(Debug, Serialize, Deserialize)]
 struct CompletionMessage {
     sub_task: String,

@@ -1,4 +1,4 @@
-//! An MCAP file back into episodes.
+//! Reads an MCAP file back into episodes.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -18,7 +18,7 @@ use crate::{
 };
 use lads_proof::episode::{Completion, Episode};
 
-/// Reads a log as [`crate::write`] writes it; messages of other topics are passed over.
+/// Reads a log that [`crate::write`] wrote; messages of other topics are skipped.
 pub fn read(path: &Path) -> Result<Log, LogError> {
     let bytes = lads_host::input::read(path)?;
     whole(&bytes)?;
@@ -43,7 +43,7 @@ pub fn read(path: &Path) -> Result<Log, LogError> {
     Ok(Log { origin, flights })
 }
 
-/// Compares all checksums: of chunks, of the data and of the summary.
+/// Checks all checksums: of chunks, of the data and of the summary.
 fn whole(bytes: &[u8]) -> Result<(), LogError> {
     let options = LinearReaderOptions::default()
         .with_prevalidate_chunk_crcs(true)
@@ -68,7 +68,7 @@ fn foreign(what: impl Into<String>) -> LogError {
     LogError::Foreign(what.into())
 }
 
-/// The origin, and the number of episodes that follow.
+/// Reads the origin, and the number of episodes that follow.
 fn origin(bytes: &[u8]) -> Result<(Origin, usize), LogError> {
     // The summary stands at the end of the file: a file that is cut off has none.
     let summary = Summary::read(bytes)?.ok_or_else(|| foreign("it has no summary"))?;
@@ -120,7 +120,7 @@ fn origin(bytes: &[u8]) -> Result<(Origin, usize), LogError> {
     Ok((origin, number(&entries, "episodes")?))
 }
 
-/// Left out of a policy that selects nothing.
+/// Reads the period, which is left out for a policy that selects nothing.
 fn period(entries: &BTreeMap<String, String>) -> Result<Option<usize>, LogError> {
     let given = entries.contains_key(PERIOD);
     given.then(|| number(entries, PERIOD)).transpose()
@@ -228,7 +228,7 @@ fn message<M: DeserializeOwned>(topic: usize, data: &[u8]) -> Result<M, LogError
     })
 }
 
-/// All steps there, all of the lengths that the metadata say.
+/// Checks that all steps are present, with the lengths that the metadata state.
 fn check(flight: &Flight, origin: &Origin) -> Result<(), LogError> {
     let trace = &flight.trace;
     let of = format!("{} episode {}", flight.instruction_id, trace.episode);

@@ -1,14 +1,14 @@
-//! The channels and their JSON schemas.
+//! Channels of a log and their JSON schemas.
 
 use serde_json::{Value, json};
 
 /// A topic with the name and the JSON schema of its messages.
 pub struct Topic {
-    /// Its name.
+    /// Name of the topic.
     pub name: &'static str,
     /// Name of the schema.
     pub schema: &'static str,
-    /// What the messages are, for people.
+    /// Description of the messages, for people.
     about: &'static str,
     /// Name, JSON type and meaning of each field.
     fields: &'static [(&'static str, Kind, &'static str)],
@@ -41,7 +41,7 @@ impl Kind {
 }
 
 impl Topic {
-    /// The JSON schema as text.
+    /// Returns the JSON schema as text.
     pub fn json_schema(&self) -> String {
         let properties: serde_json::Map<String, Value> = self
             .fields
@@ -71,7 +71,7 @@ pub const TIMING: usize = 5;
 pub const GRIPPER: usize = 6;
 pub const COMPLETION: usize = 7;
 
-/// All topics, by the constants above.
+/// All topics, named by the constants above.
 pub const TOPICS: [Topic; 8] = [
     Topic {
         name: "/episode",

@@ -1,4 +1,4 @@
-//! What is written is read.
+//! Tests that a written log is read back unchanged.
 
 use std::io::Cursor;
 use std::path::Path;

@@ -1,4 +1,4 @@
-//! Episodes into an MCAP file.
+//! Writes episodes to an MCAP file.
 
 use std::collections::BTreeMap;
 use std::io::{BufWriter, Seek, Write};
@@ -18,7 +18,7 @@ use crate::{
 /// Simulated time between two episodes, in nanoseconds, so that they stay apart on a time axis.
 const PAUSE_NS: u64 = 1_000_000_000;
 
-/// Writes a log; the file is whole once this returns without an error.
+/// Writes a log; the file is complete once this returns without an error.
 pub fn write<W: Write + Seek>(log: &Log, to: W) -> mcap::McapResult<()> {
     let options = WriteOptions::new()
         .compression(None)
@@ -59,7 +59,7 @@ fn metadata(origin: &Origin, episodes: usize) -> Metadata {
     }
 }
 
-/// Names as a JSON array.
+/// Formats names as a JSON array.
 fn listed(names: &[String]) -> String {
     serde_json::json!(names).to_string()
 }
