@@ -71,7 +71,7 @@ max = 3
 
 
 class Exported(torch.nn.Module):
-    """What isaaclab_rl exports of a policy of rsl_rl: the normaliser of observations and the actor."""
+    """The export of an rsl_rl policy by isaaclab_rl: the normaliser of observations and the actor."""
 
     def __init__(self, seed=0):
         super().__init__()
@@ -85,7 +85,7 @@ class Exported(torch.nn.Module):
 
 
 def export(policy, folder):
-    """policy.onnx and params/deploy.yaml."""
+    """Writes policy.onnx and params/deploy.yaml."""
     torch.onnx.export(policy, torch.zeros(1, 11), folder / "policy.onnx", input_names=["obs"], output_names=["actions"], opset_version=18, dynamo=False)
     (folder / "params").mkdir(exist_ok=True)
     (folder / "params/deploy.yaml").write_text(DEPLOY)
@@ -118,7 +118,7 @@ class Leg:
 
 
 def by_motor(values):
-    """Values of the policy's joints in the order of the motors."""
+    """Returns the values of the policy's joints in the order of the motors."""
     wired = np.empty_like(values)
     wired[MOTOR] = values
     return wired
@@ -142,7 +142,7 @@ class Trained:
 
 
 def main(folder, episodes=60):
-    """-> the certificate; everything is written into the folder."""
+    """Writes everything into the folder and verifies the import -> the certificate."""
     folder = Path(folder)
     policy = Exported()
     export(policy, folder)

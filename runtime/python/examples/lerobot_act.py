@@ -125,7 +125,7 @@ class Deployed(nn.Module):
 
 
 class Reach:
-    """A point that moves to where it is told at 10 Hz, and a target, with the API of Gymnasium."""
+    """A point that moves to its commanded position at 10 Hz, and a target, with the API of Gymnasium."""
 
     dt = 0.1
 
@@ -143,7 +143,7 @@ class Reach:
 
 
 def export(folder):
-    """policy.onnx of the folder's files -> the network with its processors."""
+    """Exports policy.onnx from the folder's files -> the network with its processors."""
     network = Act()
     weights = load_file(folder / "model.safetensors")
     network.load_state_dict({name.removeprefix("model."): value for name, value in weights.items()})
@@ -153,7 +153,7 @@ def export(folder):
 
 
 def main(folder, episodes=60):
-    """-> the certificate; everything is written into the folder."""
+    """Writes everything into the folder and verifies the import -> the certificate."""
     folder = Path(folder)
     network = pretrained(folder)
     export(folder)
@@ -163,7 +163,7 @@ def main(folder, episodes=60):
     scaled = lambda name, values: (values - statistics[f"{name}.mean"]) / (statistics[f"{name}.std"] + 1e-8)
 
     def trained(observation):
-        """LeRobot's loop: preprocessor, policy, postprocessor."""
+        """Runs LeRobot's loop: preprocessor, policy, postprocessor."""
         seen = torch.from_numpy(observation[None])
         with torch.inference_mode():
             chunk, _ = network({STATE: scaled(STATE, seen[:, :2]), TARGET: scaled(TARGET, seen[:, 2:])})

@@ -39,7 +39,7 @@ max = 2
 
 
 class Pendulums(VecEnv):
-    """Pendulum-v1, many times, as rsl_rl takes environments."""
+    """Many copies of Pendulum-v1, in the form of rsl_rl's environments."""
 
     def __init__(self, count):
         self.environments = gymnasium.vector.SyncVectorEnv([lambda: gymnasium.make("Pendulum-v1")] * count)
@@ -60,7 +60,7 @@ class Pendulums(VecEnv):
 
 
 def train(iterations):
-    """-> rsl_rl's runner."""
+    """Trains a policy -> rsl_rl's runner."""
     torch.manual_seed(0)
     network = {"class_name": "MLPModel", "hidden_dims": [64, 64], "activation": "elu", "obs_normalization": True}
     settings = {
@@ -77,7 +77,7 @@ def train(iterations):
 
 
 def main(folder, iterations=100, episodes=60):
-    """-> the certificate; everything is written into the folder."""
+    """Writes everything into the folder and verifies the import -> the certificate."""
     folder = Path(folder)
     runner = train(iterations)
     runner.export_policy_to_onnx(str(folder))

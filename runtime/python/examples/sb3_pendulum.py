@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 
 def train(steps):
-    """-> the policy, and the environment with its normaliser."""
+    """Trains a policy -> the policy, and the environment with its normaliser."""
     environment = VecNormalize(DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")]), norm_reward=False)
     model = PPO("MlpPolicy", environment, n_steps=256, seed=0, device="cpu")
     return model.learn(steps), environment
@@ -44,7 +44,7 @@ def export(model, path):
 
 
 def described(environment):
-    """What the export does not say: units, limits, and the normaliser, which is clip((raw - mean) / std)."""
+    """Describes what the export lacks: units, limits, and the normaliser, which is clip((raw - mean) / std)."""
     statistics = environment.obs_rms
     scale = 1 / np.sqrt(statistics.var + environment.epsilon)
     return f"""
@@ -73,7 +73,7 @@ max = 2
 
 
 def verified(model, environment, policy, episodes):
-    """Is it the policy that was trained? -> lads.Certificate."""
+    """Verifies that the import is the policy that was trained -> lads.Certificate."""
 
     def trained(observation):
         return model.predict(environment.normalize_obs(observation), deterministic=True)[0]
@@ -84,7 +84,7 @@ def verified(model, environment, policy, episodes):
 
 
 def main(folder, steps=20_000, episodes=60):
-    """-> the certificate; everything is written into the folder."""
+    """Writes everything into the folder and verifies the import -> the certificate."""
     folder = Path(folder)
     model, environment = train(steps)
     export(model, folder / "policy.onnx")

@@ -1,7 +1,8 @@
-//! Arrays of numpy in and out: checked against a channel, then copied.
+//! Converts numpy arrays in and out: checks them against a channel, then copies.
 //!
-//! What can fail: an object that is no array, another element type, another shape, rows that are not contiguous, elements that are not
-//! aligned, an array to write into that is read-only. Nothing is converted: a cast would hide a mistake and cost time in every step.
+//! What can fail: an object that is not an array, another element type, another shape, rows that
+//! are not contiguous, elements that are not aligned, an array to write into that is read-only.
+//! Nothing is converted: a cast would hide a mistake and cost time in every step.
 
 use lads_core::{Channel, ChannelId, Contract, DType, Data};
 use numpy::{
@@ -20,7 +21,7 @@ enum Values {
     I32(Vec<i32>),
 }
 
-/// Copies of what was given for a channel, for one controller or for a batch of them.
+/// Copies of the values given for a channel, for one controller or for a batch of them.
 pub struct Staged {
     id: ChannelId,
     name: String,
@@ -29,18 +30,19 @@ pub struct Staged {
 }
 
 impl Staged {
-    /// Room for a channel of one controller.
+    /// Allocates room for a channel of one controller.
     pub fn of(channel: &Channel<'_>) -> Self {
         Self::with_shape(channel, shape(channel))
     }
 
-    /// Room for a channel of `count` controllers: its shape is `[count, ...]`.
+    /// Allocates room for a channel of `count` controllers: its shape is `[count, ...]`.
     pub fn batch(channel: &Channel<'_>, count: usize) -> Self {
         let each = shape(channel);
         Self::with_shape(channel, [vec![count], each].concat())
     }
 
-    /// Room for values of another shape than the channel's, such as all draws of noise of a step.
+    /// Allocates room for values of another shape than the channel's, such as all draws of noise of
+    /// a step.
     pub fn with_shape(channel: &Channel<'_>, shape: Vec<usize>) -> Self {
         let len = shape.iter().product();
         Self {
@@ -55,7 +57,7 @@ impl Staged {
         }
     }
 
-    /// The channel's name.
+    /// Returns the channel's name.
     pub fn name(&self) -> &str {
         &self.name
     }
@@ -70,12 +72,12 @@ impl Staged {
         }
     }
 
-    /// All values.
+    /// Returns all values of the channel.
     pub fn data(&self) -> (ChannelId, Data<'_>) {
         self.row(0, 1)
     }
 
-    /// The values of row `i` of `count` rows.
+    /// Returns the values of row `i` of `count` rows.
     pub fn row(&self, i: usize, count: usize) -> (ChannelId, Data<'_>) {
         fn part<T>(values: &[T], i: usize, count: usize) -> &[T] {
             let len = values.len() / count;
@@ -90,13 +92,14 @@ impl Staged {
     }
 }
 
-/// The shape of a channel.
+/// Returns the shape of a channel.
 pub fn shape(channel: &Channel<'_>) -> Vec<usize> {
     channel.shape().iter().map(|&dim| dim as usize).collect()
 }
 
-/// Reads what was given for the channels: one array where there is one channel that has to be given, or a dictionary by name. `given` marks
-/// which of `staged` were given, of which the first `needed` have to be.
+/// Reads the values given for the channels: one array if exactly one channel has to be given, or a
+/// dictionary by name. `given` marks which of `staged` were given; the first `needed` of them are
+/// required.
 pub fn read(
     given: &Bound<'_, PyAny>,
     staged: &mut [Staged],
@@ -174,7 +177,7 @@ pub fn copy<T: Element + Copy>(
     })
 }
 
-/// The values of an array of exactly this type and shape, for as long as `work` takes.
+/// Lends the values of an array of exactly this type and shape to `work`.
 fn read_with<T: Element, R>(
     given: &Bound<'_, PyAny>,
     what: &str,
@@ -191,14 +194,14 @@ fn read_with<T: Element, R>(
     Ok(work(values))
 }
 
-/// Where an answer goes: into an array that the caller gave, or into a new one.
+/// Destination of an answer: an array that the caller gave, or a new one.
 pub struct Target<'py> {
     shape: Vec<usize>,
     given: Option<(Bound<'py, PyAny>, PyReadwriteArrayDyn<'py, f32>)>,
 }
 
 impl<'py> Target<'py> {
-    /// Checks what was given for `out`; from then on nothing else writes it.
+    /// Checks the array given for `out`, which nothing else writes from then on.
     pub fn of(out: Option<Bound<'py, PyAny>>, name: &str, shape: &[usize]) -> PyResult<Self> {
         let given = out.map(|out| Ok::<_, PyErr>((out.clone(), writable(&out, name, shape)?)));
         Ok(Self {
@@ -207,7 +210,7 @@ impl<'py> Target<'py> {
         })
     }
 
-    /// Puts the values there, which are as many as the shape says.
+    /// Writes the values to the destination; their number matches the shape.
     pub fn put(self, py: Python<'py>, values: &[f32]) -> PyResult<Bound<'py, PyAny>> {
         let Some((out, mut write)) = self.given else {
             let made = PyArray1::from_slice(py, values);
@@ -221,7 +224,7 @@ impl<'py> Target<'py> {
     }
 }
 
-/// An array of this type and shape that may be written.
+/// Returns an array of this type and shape that may be written.
 fn writable<'py>(
     given: &Bound<'py, PyAny>,
     name: &str,
@@ -241,7 +244,7 @@ fn writable<'py>(
     Ok(write)
 }
 
-/// All values of an array of this type and rank, and its shape.
+/// Returns all values of an array of this type and rank, and its shape.
 pub fn values<T: Element + Copy>(
     given: &Bound<'_, PyAny>,
     name: &str,
@@ -304,7 +307,7 @@ fn not_an_array(given: &Bound<'_, PyAny>, what: &str, name: &str) -> PyResult<Py
     )))
 }
 
-/// A shape as Python writes it.
+/// Formats a shape as Python writes it.
 fn tuple(shape: &[usize]) -> String {
     let dims: Vec<_> = shape.iter().map(ToString::to_string).collect();
     match &dims[..] {
@@ -313,7 +316,8 @@ fn tuple(shape: &[usize]) -> String {
     }
 }
 
-/// Room for everything that a control step may be given: observations first, then noise where the policy takes some.
+/// Allocates room for everything that a control step may be given: observations first, then noise
+/// if the policy takes any.
 pub fn stage(contract: &Contract<'_>, noise_len: usize) -> Vec<Staged> {
     let observations = contract.observations().map(|channel| Staged::of(&channel));
     let noise = contract.noise_channel().filter(|_| noise_len > 0);
@@ -321,7 +325,7 @@ pub fn stage(contract: &Contract<'_>, noise_len: usize) -> Vec<Staged> {
     observations.chain(noise).collect()
 }
 
-/// The channels that were given.
+/// Returns the channels that were given.
 pub fn given<'s>(staged: &'s [Staged], given: &[bool]) -> Vec<(ChannelId, Data<'s>)> {
     let marked = staged.iter().zip(given).filter(|(_, given)| **given);
     marked.map(|(row, _)| row.data()).collect()

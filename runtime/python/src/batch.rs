@@ -1,7 +1,8 @@
-//! A batch of controllers of one policy over threads: many observations in, as many actions out.
+//! Steps a batch of controllers of one policy over threads: many observations in, as many actions
+//! out.
 //!
-//! All observations are checked before the first controller steps, so that one that is refused leaves all as they were. The threads are the
-//! batch's own, started once.
+//! All observations are checked before the first controller steps, so that a refusal leaves all
+//! controllers unchanged. The threads are the batch's own, started once.
 
 use std::num::NonZero;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
@@ -20,7 +21,7 @@ use crate::errors::{self, BusyError, ClosedError, InputError, StepError, Workspa
 use crate::policy::Policy;
 use crate::process::Process;
 
-/// One of the controllers, and what its last step gave.
+/// One of the controllers, with the results of its last step.
 struct Row {
     working: Working,
     report: lads_core::StepReport,
@@ -28,7 +29,7 @@ struct Row {
 }
 
 struct Inner {
-    /// Not dropped in a forked child, which has none of its threads.
+    /// Threads of the batch; not dropped in a forked child, which has none of its threads.
     pool: rayon::ThreadPool,
     rows: Vec<Row>,
     staged: Vec<Staged>,
@@ -88,7 +89,7 @@ impl Controllers {
         self.checked.view().contract()
     }
 
-    /// The rows that are meant: all, or those of a list.
+    /// Returns the selected rows: all, or those of a list.
     fn chosen(&self, rows: Option<Vec<usize>>) -> PyResult<Vec<usize>> {
         let rows = rows.unwrap_or_else(|| (0..self.count).collect());
         match rows.iter().find(|&&row| row >= self.count) {
@@ -103,8 +104,9 @@ impl Controllers {
 
 #[pymethods]
 impl Controllers {
-    /// `count` controllers of a policy, with `threads` threads (all of the machine's by default, never more than controllers). `instruction` is
-    /// one for all, or a list of as many. The seed of row i is `sample + i` and `noise + i`.
+    /// Makes `count` controllers of a policy, with `threads` threads (all of the machine's by
+    /// default, never more than controllers). `instruction` is one for all, or a list with one for
+    /// each. The seed of row i is `sample + i` and `noise + i`.
     #[new]
     #[pyo3(signature = (policy, count, instruction=None, *, threads=None, sample=None, noise=None, portable=false))]
     fn new(
@@ -177,7 +179,8 @@ impl Controllers {
         Ok(batch)
     }
 
-    /// One control step of all: the actions, float32 [count, actions], and a lads.vector.Report.
+    /// Runs one control step of all controllers: returns the actions, float32 [count, actions], and
+    /// a lads.vector.Report.
     ///
     /// `observations` is an array [count, ...] of the channel's dtype, contiguous, or a dictionary of them by the channels' names. With
     /// `out`, the actions are written there.
@@ -248,8 +251,8 @@ impl Controllers {
         })
     }
 
-    /// Follows an instruction: one for all rows, or a list of one for each of `rows` (all by default). Where one is refused, the rows
-    /// before it follow theirs.
+    /// Sets an instruction: one for all rows, or a list of one for each of `rows` (all by default).
+    /// If one is refused, the rows before it follow theirs.
     #[pyo3(signature = (instruction, rows=None))]
     fn instruct(
         &self,
@@ -300,8 +303,8 @@ impl Controllers {
         })
     }
 
-    /// Tells what was really executed in all rows: float32 [count, actions]. Where one is refused, such as that of a row without a step,
-    /// the rows before it were told.
+    /// Tells which actions were executed in all rows: float32 [count, actions]. If one is refused,
+    /// such as that of a row without a step, the rows before it have been told.
     fn executed(&self, actions: &Bound<'_, PyAny>) -> PyResult<()> {
         self.work(|inner| {
             let len = self.contract().action_len();
@@ -321,19 +324,19 @@ impl Controllers {
         })
     }
 
-    /// Gives memory and threads back; whatever is called afterwards is refused.
+    /// Frees memory and threads; all later calls are refused.
     fn close(&self) -> PyResult<()> {
         *self.lock()? = None;
         Ok(())
     }
 
-    /// The policy at work.
+    /// Returns the policy of the controllers.
     #[getter]
     fn policy(&self, py: Python<'_>) -> Py<Policy> {
         self.policy.clone_ref(py)
     }
 
-    /// How many threads there are.
+    /// Returns the number of threads.
     #[getter]
     fn threads(&self) -> usize {
         self.threads
@@ -358,7 +361,7 @@ impl Controllers {
     }
 }
 
-/// The reports of all rows as arrays.
+/// Returns the reports of all rows as arrays.
 fn report<'py>(py: Python<'py>, rows: &[Row]) -> PyResult<Bound<'py, PyAny>> {
     let timesteps: Vec<_> = rows
         .iter()

@@ -1,4 +1,5 @@
-//! A policy with the image that it views, and a controller with the memory that it borrows, each as one value.
+//! Self-contained values: a policy with the image that it views, and a controller with the memory
+//! that it borrows.
 
 use std::sync::Arc;
 
@@ -10,7 +11,7 @@ type View<'a> = lads_core::Policy<'a>;
 type Core<'a> = Controller<'a, 'a>;
 
 self_cell!(
-    /// A policy that was opened, and the view on it that was checked once.
+    /// An opened policy with its checked view.
     pub struct Checked {
         owner: Opened,
         #[covariant]
@@ -19,30 +20,30 @@ self_cell!(
 );
 
 impl Checked {
-    /// Checks what was opened; it was checked before, so that this cannot fail.
+    /// Checks an opened policy; it was checked before, so this cannot fail.
     pub fn of(opened: Opened) -> Arc<Self> {
         Arc::new(Self::new(opened, Opened::policy))
     }
 
-    /// What was opened.
+    /// Returns the opened policy.
     pub fn opened(&self) -> &Opened {
         self.borrow_owner()
     }
 
-    /// The view on it.
+    /// Returns the checked view on the policy.
     pub fn view(&self) -> &View<'_> {
         self.borrow_dependent()
     }
 }
 
-/// What a controller borrows.
+/// Policy and memory that a controller borrows.
 pub struct Ground {
     policy: Arc<Checked>,
     memory: MutBorrow<Memory>,
 }
 
 self_cell!(
-    /// A controller and its memory.
+    /// A controller with its memory.
     pub struct Working {
         owner: Ground,
         #[not_covariant]
@@ -51,7 +52,7 @@ self_cell!(
 );
 
 impl Working {
-    /// A fresh controller on these instructions of the processor.
+    /// Makes a fresh controller on this instruction set.
     pub fn of(policy: &Arc<Checked>, isa: Isa) -> Result<Self, MemoryError> {
         let ground = Ground {
             memory: MutBorrow::new(Memory::of(policy.view())?),
@@ -63,7 +64,7 @@ impl Working {
         })
     }
 
-    /// Works with the controller.
+    /// Calls `work` with the controller.
     pub fn with<R>(&mut self, work: impl for<'c> FnOnce(&mut Core<'c>) -> R) -> R {
         self.with_dependent_mut(|_, controller| work(controller))
     }

@@ -1,8 +1,8 @@
-//! A controller for Python: one step after another, in memory that was allocated once.
+//! Controller for Python: one step after another, in memory that was allocated once.
 //!
-//! What is given is copied in while the interpreter is held, the step runs without it, and what comes out is copied again: other threads may
-//! do with their arrays what they like. Two threads in one controller at once are refused, not queued: a control loop that
-//! waits for another is a mistake.
+//! Inputs are copied while the interpreter is held, the step runs without it, and results are
+//! copied again, so other threads may change their arrays at any time. Two threads in one
+//! controller at once are refused, not queued: a control loop that waits for another is a mistake.
 
 use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
 
@@ -18,19 +18,19 @@ use crate::policy::Policy;
 use crate::process::Process;
 use crate::report::StepReport;
 
-/// How a controller was made, besides its instruction.
+/// Settings of a controller, besides its instruction.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
     /// Seed of sampling.
     pub sample: Option<u64>,
     /// Seed of the noise.
     pub noise: Option<u64>,
-    /// Whether it runs on the kernels that every processor has.
+    /// True if the controller runs on the kernels that every processor has.
     pub portable: bool,
 }
 
 impl Settings {
-    /// A fresh controller with these settings.
+    /// Makes a fresh controller with these settings.
     pub fn working(self, policy: &Arc<Checked>) -> PyResult<Working> {
         let isa = if self.portable {
             Isa::portable()
@@ -51,7 +51,7 @@ impl Settings {
     }
 }
 
-/// What a policy is told.
+/// Instruction that a policy is given.
 pub enum Told {
     /// Number of a known instruction.
     Known(u32),
@@ -60,7 +60,8 @@ pub enum Told {
 }
 
 impl Told {
-    /// The id or the text of a known instruction, or an array of word embeddings [words, dim].
+    /// Reads the id or the text of a known instruction, or an array of word embeddings [words,
+    /// dim].
     pub fn of(policy: &Checked, given: &Bound<'_, PyAny>) -> PyResult<Self> {
         let contract = policy.view().contract();
         if let Ok(text) = given.cast::<PyString>() {
@@ -86,7 +87,7 @@ impl Told {
         Ok(Self::Words(words))
     }
 
-    /// As the controller takes it.
+    /// Returns the instruction in the controller's form.
     pub fn as_instruction(&self) -> Instruction<'_> {
         match self {
             Self::Known(id) => Instruction::Id(*id),
@@ -95,19 +96,19 @@ impl Told {
     }
 }
 
-/// What works, and the room for what goes in and out.
+/// The running controller, with buffers for its inputs and outputs.
 struct Inner {
     working: Working,
     staged: Vec<Staged>,
     given: Vec<bool>,
-    /// How many of the staged channels have to be given.
+    /// Number of the staged channels that are required.
     needed: usize,
     action: Vec<f32>,
     told: Option<Told>,
 }
 
 impl Inner {
-    /// Takes in what is given for the channels.
+    /// Reads the values given for the channels.
     fn read(&mut self, observation: &Bound<'_, PyAny>) -> PyResult<()> {
         arrays::read(observation, &mut self.staged, self.needed, &mut self.given)
     }
@@ -126,7 +127,7 @@ pub struct Controller {
 }
 
 impl Controller {
-    /// A fresh one without an instruction.
+    /// Makes a fresh controller without an instruction.
     pub fn of(policy: &Bound<'_, Policy>, settings: Settings) -> PyResult<Self> {
         let checked = Arc::clone(policy.get().checked());
         let view = checked.view();
@@ -148,17 +149,17 @@ impl Controller {
         })
     }
 
-    /// Its settings.
+    /// Returns the settings of the controller.
     pub fn settings(&self) -> Settings {
         self.settings
     }
 
-    /// The policy at work.
+    /// Returns the policy of the controller.
     pub fn checked(&self) -> &Arc<Checked> {
         &self.checked
     }
 
-    /// The rule that picks indices, in words.
+    /// Describes the rule that picks indices.
     pub fn rule(&self) -> String {
         let rule = match self.settings.sample {
             Some(seed) => lads_cli::sampling(self.checked.view(), seed),
@@ -200,12 +201,14 @@ impl Controller {
 
 #[pymethods]
 impl Controller {
-    /// One control step: the action, float32 [actions], for what is observed, both in the contract's units, and a lads.StepReport.
+    /// Runs one control step: returns the action, float32 [actions], for the observation, both in
+    /// the contract's units, and a lads.StepReport.
     ///
-    /// `observation` is an array of exactly the channel's dtype and shape, contiguous; for a policy with several channels a dictionary of
-    /// arrays by the channels' names, to which the noise channel may be added. With `out`, the action is written there and `out` is
-    /// returned; for a policy of one channel nothing is allocated then but the report. An observation that is refused leaves the controller
-    /// as it was.
+    /// `observation` is an array of exactly the channel's dtype and shape, contiguous; for a policy
+    /// with several channels a dictionary of arrays by the channels' names, to which the noise
+    /// channel may be added. With `out`, the action is written there and `out` is returned; for a
+    /// policy of one channel only the report is allocated then. An observation that is refused
+    /// leaves the controller unchanged.
     #[pyo3(signature = (observation, out=None))]
     fn step<'py>(
         &self,
@@ -244,8 +247,9 @@ impl Controller {
         })
     }
 
-    /// Follows an instruction from the next step on, as a new episode: the id or the text of a known one, or word embeddings, float32
-    /// [words, dim]. One that is refused changes nothing.
+    /// Sets the instruction to follow from the next step on, as a new episode: the id or the text
+    /// of a known one, or word embeddings, float32 [words, dim]. An instruction that is refused
+    /// changes nothing.
     pub fn instruct(&self, py: Python<'_>, instruction: &Bound<'_, PyAny>) -> PyResult<()> {
         self.work(|inner| {
             let told = Told::of(&self.checked, instruction)?;
@@ -259,7 +263,7 @@ impl Controller {
         })
     }
 
-    /// Starts a new episode of the same instruction. Sampling and noise go on where they were.
+    /// Starts a new episode with the same instruction. Sampling and noise continue where they were.
     fn reset(&self) -> PyResult<()> {
         self.work(|inner| {
             inner.working.with(|controller| controller.reset());
@@ -267,7 +271,8 @@ impl Controller {
         })
     }
 
-    /// Tells what was really executed since the last step, where that is not the action that it returned: float32 [actions].
+    /// Tells which action was executed since the last step, if it is not the one that the step
+    /// returned: float32 [actions].
     fn executed(&self, action: &Bound<'_, PyAny>) -> PyResult<()> {
         self.work(|inner| {
             let mut done = vec![0.0; inner.action.len()];
@@ -277,7 +282,8 @@ impl Controller {
         })
     }
 
-    /// The action, float32 [actions], for what is observed and an index that the caller chose; changes nothing in the episode.
+    /// Returns the action, float32 [actions], for an observation and an index that the caller
+    /// chose; changes nothing in the episode.
     #[pyo3(signature = (observation, index, out=None))]
     fn follow<'py>(
         &self,
@@ -310,7 +316,8 @@ impl Controller {
         })
     }
 
-    /// Brings code, weights and caches into the processor's caches, for right before the first step or after a pause.
+    /// Brings code, weights and caches into the processor's caches; call it right before the first
+    /// step or after a pause.
     fn warm(&self, py: Python<'_>) -> PyResult<()> {
         self.work(|inner| {
             let working = &mut inner.working;
@@ -319,19 +326,20 @@ impl Controller {
         })
     }
 
-    /// Gives its memory back; whatever is called afterwards is refused.
+    /// Frees the controller's memory; all later calls are refused.
     fn close(&self) -> PyResult<()> {
         *self.lock()? = None;
         Ok(())
     }
 
-    /// Whether it is closed.
+    /// Returns whether the controller is closed.
     #[getter]
     fn closed(&self) -> PyResult<bool> {
         Ok(self.lock()?.is_none())
     }
 
-    /// The scores of the last selection, one per index: float32 [indices]; empty for a policy that selects nothing.
+    /// Returns the scores of the last selection, one per index: float32 [indices]; empty for a
+    /// policy that selects nothing.
     #[getter]
     fn scores<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<f32>>> {
         self.work(|inner| {
@@ -342,7 +350,7 @@ impl Controller {
         })
     }
 
-    /// The action of the last step, or what `executed` said: float32 [actions].
+    /// Returns the action of the last step, or the one that `executed` reported: float32 [actions].
     #[getter]
     fn last_action<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<f32>>> {
         self.work(|inner| {
@@ -353,7 +361,8 @@ impl Controller {
         })
     }
 
-    /// The id of the known instruction that it follows; None for word embeddings or without one.
+    /// Returns the id of the known instruction that the controller follows; None for word
+    /// embeddings or without one.
     #[getter]
     fn instruction(&self) -> PyResult<Option<String>> {
         self.work(|inner| {
@@ -365,7 +374,7 @@ impl Controller {
         })
     }
 
-    /// What `instruct` was given last: the id of a known one, word embeddings, or None.
+    /// Returns the last argument of `instruct`: the id of a known one, word embeddings, or None.
     #[getter(_instruction)]
     fn told<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
         if let Some(id) = self.instruction()? {
@@ -381,13 +390,13 @@ impl Controller {
         })
     }
 
-    /// Whether there is an instruction to follow, or the policy takes none.
+    /// Returns whether an instruction is set, or the policy takes none.
     #[getter]
     fn instructed(&self) -> PyResult<bool> {
         self.work(|inner| Ok(inner.working.with(|controller| controller.is_instructed())))
     }
 
-    /// The rule that picks indices: 'argmax' or 'sample'.
+    /// Returns the rule that picks indices: 'argmax' or 'sample'.
     #[getter]
     fn decision(&self) -> PyResult<&'static str> {
         self.work(|inner| {
@@ -400,19 +409,20 @@ impl Controller {
         })
     }
 
-    /// The instructions of the processor that it runs on: 'portable', 'avx2' or 'avx512'.
+    /// Returns the processor's instruction set that the controller runs on: 'portable', 'avx2' or
+    /// 'avx512'.
     #[getter]
     fn isa(&self) -> PyResult<&'static str> {
         self.work(|inner| Ok(inner.working.with(|controller| controller.isa().name())))
     }
 
-    /// The policy at work.
+    /// Returns the policy of the controller.
     #[getter]
     fn policy(&self, py: Python<'_>) -> Py<Policy> {
         self.policy.clone_ref(py)
     }
 
-    /// The keyword arguments that Policy.controller was given, without the instruction.
+    /// Returns the keyword arguments that Policy.controller was given, without the instruction.
     #[getter(_settings)]
     fn keywords(&self) -> (Option<u64>, Option<u64>, bool) {
         let Settings {

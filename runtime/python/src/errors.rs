@@ -1,4 +1,4 @@
-//! The exceptions that are raised: classes of `lads/errors.py`, with the texts of the command.
+//! Raises exceptions: classes of `lads/errors.py`, with the texts of the command.
 
 use std::fmt::Display;
 
@@ -20,7 +20,7 @@ pyo3::import_exception!(lads.errors, SelfTestError);
 pyo3::import_exception!(lads.errors, StepError);
 pyo3::import_exception!(lads.errors, WorkspaceError);
 
-/// Why a file is no policy.
+/// Makes the exception for a file that is not a policy.
 pub fn opening(error: &lads_host::OpenError) -> PyErr {
     let text = lads_cli::chain(error);
     match error.problem {
@@ -29,14 +29,14 @@ pub fn opening(error: &lads_host::OpenError) -> PyErr {
     }
 }
 
-/// What was given is not what a channel takes.
+/// Makes the exception for values that a channel does not take.
 pub fn input(wrong: impl Display) -> PyErr {
     InputError::new_err(format!(
         "{wrong}; give values inside the contract's limits, which policy.contract lists"
     ))
 }
 
-/// Why a control step was refused.
+/// Makes the exception for a refused control step.
 pub fn step(error: &CoreStepError, contract: &Contract<'_>) -> PyErr {
     match error {
         CoreStepError::Input(error) => input(lads_host::refused(error, contract)),
@@ -47,7 +47,7 @@ pub fn step(error: &CoreStepError, contract: &Contract<'_>) -> PyErr {
     }
 }
 
-/// Why an instruction was refused.
+/// Makes the exception for a refused instruction.
 pub fn instruction(error: &CoreInstructionError) -> PyErr {
     let remedy = match error {
         CoreInstructionError::NotTaken => "give none",

@@ -1,7 +1,7 @@
-//! Importing: any ONNX policy and a description of the robot into a policy, by the engine of `lads import`.
+//! Imports any ONNX policy and a description of the robot, by the engine of `lads import`.
 //!
-//! What can fail: a file that cannot be read, everything that is missing or contradicts, told at once with a line each, or an output that
-//! cannot be written; nothing is written then.
+//! What can fail: a file that cannot be read, missing or contradictory fields, all reported at once
+//! with a line each, or an output that cannot be written; nothing is written then.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -13,13 +13,13 @@ use pyo3::prelude::*;
 use crate::errors::{CompileError, ImportOnnxError, OpenError, opening};
 use crate::policy::Policy;
 
-/// One file of a policy, or all of several.
+/// Path of a policy's only file, or paths of all its files.
 #[derive(FromPyObject)]
 pub enum Files {
-    /// The policy.
+    /// The only file.
     #[pyo3(transparent)]
     One(PathBuf),
-    /// One's output is the input of another.
+    /// Several files, where one's output is the input of another.
     #[pyo3(transparent)]
     Several(Vec<PathBuf>),
 }
@@ -36,13 +36,15 @@ impl Files {
     }
 }
 
-/// Imports any ONNX policy: raw sensor values in, what the motors get out -> lads.Policy.
+/// Imports any ONNX policy: raw sensor values in, motor commands out -> lads.Policy.
 ///
-/// `policy` is a path, or a list of paths where one file's output is another's input; `robot_toml` is the path of what a person says about the
-/// robot, in the form that lads.template gives; `output` is the bundle to write, by default none. `beside` are files that say something
-/// about the policy, besides those that lie where exporters put them; `action` names the output that is the action; `states` has the
-/// output that becomes each recurrent input, `wires` the input that reads each output in the same step; `golden` is a recorded run (.csv).
-/// What is missing or contradicts is a lads.errors.ImportOnnxError with all `problems`.
+/// `policy` is a path, or a list of paths where one file's output is another's input; `robot_toml`
+/// is the path of a person's description of the robot, in the form that lads.template gives;
+/// `output` is the bundle to write, by default none. `beside` are further files that describe the
+/// policy, besides those in the places where exporters put them; `action` names the output that is
+/// the action; `states` has the output that becomes each recurrent input, `wires` the input that
+/// reads each output in the same step; `golden` is a recorded run (.csv). Missing or contradictory
+/// fields raise a lads.errors.ImportOnnxError with all `problems`.
 #[pyfunction]
 #[pyo3(signature = (policy, robot_toml=None, *, output=None, beside=None, action=None, states=None, wires=None, golden=None))]
 #[expect(
@@ -96,7 +98,8 @@ pub fn import_onnx(
     Ok(Policy::of(path, opened).with_notes(notes))
 }
 
-/// The form that `import_onnx` wants as its `robot_toml`: all that the files say, and all that nobody has said yet with what it means -> TOML.
+/// Returns the form that `import_onnx` takes as its `robot_toml`: everything that the files state,
+/// and everything missing with its meaning -> TOML.
 ///
 /// `policy`, `robot_toml` (a form that is not yet complete) and `beside` are those of `import_onnx`.
 #[pyfunction]
@@ -118,7 +121,7 @@ pub fn template(
     form.map_err(|error| refused(&models[0], &error))
 }
 
-/// Refuses an output that cannot be written or is one of the files that are read, before any work.
+/// Refuses an output that cannot be written or is one of the input files, before any work.
 fn free(request: &Request<'_>, output: &Path) -> PyResult<()> {
     let read = request.models.iter().chain(&request.beside);
     let read = read.chain(&request.robot).chain(&request.golden);
@@ -127,7 +130,7 @@ fn free(request: &Request<'_>, output: &Path) -> PyResult<()> {
     checked.map_err(|error| OpenError::new_err(error.to_string()))
 }
 
-/// Why there is no policy.
+/// Makes the exception for a failed import.
 fn refused(model: &Path, error: &ImportError) -> PyErr {
     let model = model.display();
     let problems = match error {

@@ -1,7 +1,8 @@
-//! The verdict of a verification: what was rolled out in Python, judged by lads-proof.
+//! Verdict of a verification: rollouts made in Python, judged by lads-proof.
 //!
-//! Reference and run come in the form of a reference's file. The compiled policy is asked the reference's questions here, on a fresh
-//! controller. What can fail: rollouts that contradict each other, an instruction that the policy does not know.
+//! Reference and run have the form of a reference's file. The compiled policy answers the
+//! reference's questions here, on a fresh controller. What can fail: rollouts that contradict each
+//! other, an instruction that the policy does not know.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -26,26 +27,26 @@ use crate::cell::Working;
 use crate::controller::Controller;
 use crate::errors::{ProofError, instruction as refused_instruction};
 
-/// What Python knows of a verification besides the rollouts.
+/// Python's facts about a verification, besides the rollouts.
 #[derive(Deserialize)]
 struct About {
     /// Id of the environment.
     environment: String,
-    /// The environment's noise, in words.
+    /// Noise of the environment, in words.
     noise: String,
     versions: BTreeMap<String, String>,
-    /// The environment's sub-tasks.
+    /// Names of the environment's sub-tasks.
     sub_tasks: Vec<String>,
-    /// Indices of those that each instruction commands.
+    /// Indices of the sub-tasks that each instruction commands.
     commanded: Vec<Vec<usize>>,
-    /// What the policy says of itself, in the fields that are stated.
+    /// Fields of the policy's contract that are compared.
     contract: Value,
-    /// What the reference and the environment say of the same.
+    /// Fields of the reference and the environment that are compared with the contract.
     stated: Value,
     not_covered: Vec<String>,
 }
 
-/// Judges -> (verdict, certificate as JSON, certificate as HTML).
+/// Judges a verification -> (verdict, certificate as JSON, certificate as HTML).
 ///
 /// `reference` and `run` are rollouts in the form of a reference's file; `replayed` has (instruction, episode, states float64 [n, S], whether
 /// the environment ended the episode) of the environment under the reference's actions; `about` is JSON.
@@ -124,7 +125,7 @@ pub fn judge(
     Ok((certificate.verdict.word(), json, page))
 }
 
-/// The numbers of the reference's instructions; `None` for a policy that takes none.
+/// Returns the numbers of the reference's instructions; `None` for a policy that takes none.
 fn known(reference: &Reference, controller: &Controller) -> PyResult<Vec<Option<u32>>> {
     let checked = controller.checked();
     let takes = checked.view().contract().instruction_channel().is_some();
@@ -141,14 +142,14 @@ fn known(reference: &Reference, controller: &Controller) -> PyResult<Vec<Option<
 struct Replayed {
     instruction: usize,
     episode: usize,
-    /// Elements of a state.
+    /// Number of elements of a state.
     len: usize,
     states: Vec<f64>,
-    /// Whether it was over when the actions were.
+    /// True if the environment ended the episode by the last action.
     ended: bool,
 }
 
-/// The environment alone: its states under the reference's actions.
+/// Compares the environment alone: its states under the reference's actions.
 fn environment(reference: &Reference, replayed: &[Replayed]) -> Physics {
     let mut physics = Physics::new();
     for Replayed {
@@ -190,7 +191,8 @@ fn environment(reference: &Reference, replayed: &[Replayed]) -> Physics {
     physics
 }
 
-/// The policy alone: its answers to what the reference was asked, with the reference's actions executed.
+/// Replays the policy alone: its answers to the reference's questions, with the reference's actions
+/// executed.
 fn ask(
     controller: &mut Working,
     contract: &Contract<'_>,
@@ -268,7 +270,7 @@ fn replay(
     replay
 }
 
-/// The values of all channels, which a trace holds as one row of floats.
+/// Values of all channels, which a trace holds as one row of floats.
 struct Given<'t> {
     parts: Vec<(ChannelId, &'t [f32], Part)>,
 }
@@ -312,7 +314,7 @@ impl<'t> Given<'t> {
     }
 }
 
-/// Both together: the run's episodes beside the reference's.
+/// Pairs the run's episodes with the reference's.
 fn pairs(
     reference: &Reference,
     numbering: &Numbering,

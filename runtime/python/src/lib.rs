@@ -1,9 +1,12 @@
-//! The native half of the Python package `lads`: policies, controllers, batches of controllers, and the statistics of proofs.
+//! Native half of the Python package `lads`: policies, controllers, batches of controllers, and the
+//! statistics of proofs.
 //!
-//! What people import lies in `python/lads`; this module, `lads._lads`, gives it classes over lads-host and lads-proof. Invariants: every
-//! array is checked (type, shape, layout) and copied while the interpreter is held, so nothing here shares memory with Python; a
-//! controller is used by one thread at a time and only in the process that made it; whatever is refused is an exception of
-//! `lads.errors` that names the thing and the remedy, and leaves the controller as it was. No unsafe code: `PyO3` and `rust-numpy` have it.
+//! The public package is `python/lads`; this module, `lads._lads`, gives it classes over lads-host
+//! and lads-proof. Invariants: every array is checked (type, shape, layout) and copied while the
+//! interpreter is held, so nothing here shares memory with Python; a controller is used by one
+//! thread at a time and only in the process that made it; every refusal is an exception of
+//! `lads.errors` that names the thing and the remedy, and leaves the controller unchanged. There is
+//! no unsafe code outside `PyO3` and `rust-numpy`.
 #![deny(unsafe_code)]
 // `Controller::reset` is the method of one lifetime, the closure around it that of all.
 #![allow(clippy::redundant_closure_for_method_calls)]
@@ -34,7 +37,7 @@ fn command(py: Python<'_>, arguments: Vec<OsString>) -> u8 {
     py.detach(|| lads_cli::command(arguments))
 }
 
-/// Writes a text to a file, which is there whole or not at all.
+/// Writes a text to a file, completely or not at all.
 #[pyfunction]
 fn write(py: Python<'_>, path: PathBuf, text: &str) -> PyResult<()> {
     py.detach(|| lads_host::output::write(&path, text.as_bytes()))

@@ -1,4 +1,4 @@
-//! Opening policies, and what can be asked of one that was opened.
+//! Opens policies, and describes opened ones.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -27,10 +27,11 @@ pub struct Policy {
 
 /// Opens a policy, a bundle (.onnx), which is compiled on the way, or a compiled image (.lads).
 ///
-/// `weights` and `low_level` are 'f32', 'f16', 'bf16', 'int16' or 'int8', `cache` is 'f32' or 'f16'. Without `weights`,
-/// what is left out is as the bundle was tuned (`lads-run tune`), and 'f32' where it was not; with it, `low_level` is as `weights` and
-/// `cache` 'f32'. Fewer bits have to pass the gate: the golden episode replays with the same indices and with actions inside `tolerance`
-/// (in the action's units); with `force` they need not.
+/// `weights` and `low_level` are 'f32', 'f16', 'bf16', 'int16' or 'int8', `cache` is 'f32' or
+/// 'f16'. Without `weights`, formats that are left out are as the bundle was tuned
+/// (`lads-run tune`), or 'f32' if it was not tuned; with it, `low_level` defaults to `weights` and
+/// `cache` to 'f32'. Fewer bits have to pass the gate: the golden episode replays with the same
+/// indices and with actions inside `tolerance` (in the action's units); with `force` they need not.
 #[pyfunction]
 #[pyo3(signature = (path, *, weights=None, low_level=None, cache=None, tolerance=None, force=false))]
 pub fn open(
@@ -84,7 +85,8 @@ pub fn open(
     Ok(Policy::of(path, opened))
 }
 
-/// Opens a policy from the bytes of its image, such as Policy.image; `path` names it in messages. This is what unpickling calls.
+/// Opens a policy from the bytes of its image, such as Policy.image; `path` names it in messages.
+/// Unpickling calls this function.
 #[pyfunction]
 pub fn from_image(py: Python<'_>, image: &[u8], path: PathBuf) -> PyResult<Policy> {
     let opened = py.detach(|| lads_host::from_bytes(image));
@@ -97,7 +99,7 @@ pub fn from_image(py: Python<'_>, image: &[u8], path: PathBuf) -> PyResult<Polic
     Ok(Policy::of(path, opened))
 }
 
-/// The format with this name.
+/// Returns the format with this name.
 fn format<T: Copy, const N: usize>(
     what: &str,
     name: &str,
@@ -114,7 +116,7 @@ fn format<T: Copy, const N: usize>(
 }
 
 impl Policy {
-    /// What was read from a file, or made of it.
+    /// Makes a policy that was read from a file, or made of it.
     pub fn of(path: PathBuf, opened: Opened) -> Self {
         Self {
             path,
@@ -124,17 +126,17 @@ impl Policy {
         }
     }
 
-    /// The same with what is worth saying about how it came to be.
+    /// Adds notes on how the policy was made.
     pub fn with_notes(self, notes: Vec<String>) -> Self {
         Self { notes, ..self }
     }
 
-    /// What was checked.
+    /// Returns the checked policy.
     pub fn checked(&self) -> &Arc<Checked> {
         &self.checked
     }
 
-    /// A fresh controller on the widest instructions.
+    /// Makes a fresh controller on the widest instruction set.
     fn working(&self) -> PyResult<Working> {
         Working::of(&self.checked, Isa::detect())
             .map_err(|error| WorkspaceError::new_err(error.to_string()))
@@ -147,19 +149,19 @@ impl Policy {
 
 #[pymethods]
 impl Policy {
-    /// The file that it was read from.
+    /// Returns the path of the file that the policy was read from.
     #[getter]
     fn path(&self) -> String {
         self.path.display().to_string()
     }
 
-    /// The compiled image, what `lads compile` writes: bytes.
+    /// Returns the compiled image, which `lads compile` writes: bytes.
     #[getter]
     fn image<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
         PyBytes::new(py, self.checked.opened().image())
     }
 
-    /// What the policy expects and promises, as a lads.Contract.
+    /// Returns the policy's contract, as a lads.Contract.
     #[getter]
     fn contract(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
         let read = self.contract.get_or_try_init(py, || {
@@ -170,18 +172,21 @@ impl Policy {
         Ok(read.clone_ref(py))
     }
 
-    /// What an import read and found out, a line each: tuple of str; empty for a policy that was opened.
+    /// Returns the notes of an import, a line each: tuple of str; empty for a policy that was
+    /// opened.
     #[getter]
     fn notes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
         PyTuple::new(py, &self.notes)
     }
 
-    /// Everything that `lads inspect --json` prints: channels, schedule, programs, states, sizes in bytes.
+    /// Returns the report of `lads inspect --json`: channels, schedule, programs, states, sizes in
+    /// bytes.
     fn inspect<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         py.import("json")?.call_method1("loads", (self.report(),))
     }
 
-    /// The recorded episode that the self-test replays, as a lads.Golden; None for a policy without one.
+    /// Returns the recorded episode that the self-test replays, as a lads.Golden; None for a policy
+    /// without one.
     #[getter]
     fn golden<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
         let view = self.checked.view();
@@ -264,12 +269,13 @@ impl Policy {
         ))
     }
 
-    /// A fresh controller with memory of its own.
+    /// Makes a fresh controller with memory of its own.
     ///
-    /// `instruction` is the id or the text of a known one, or word embeddings float32 [words, dim]; None for a policy that takes none, or to
-    /// give it later. `sample` is a seed: indices are sampled instead of following the contract's rule. `noise` is a seed:
-    /// standard normals for the noise channel instead of the contract's rule. `portable` runs on the kernels that every processor has, with
-    /// the same bits.
+    /// `instruction` is the id or the text of a known one, or word embeddings float32 [words, dim];
+    /// None for a policy that takes none, or to set it later. `sample` is a seed: indices are
+    /// sampled instead of following the contract's rule. `noise` is a seed: standard normals for
+    /// the noise channel instead of the contract's rule. `portable` runs on the kernels that every
+    /// processor has, with the same bits.
     #[pyo3(signature = (instruction=None, *, sample=None, noise=None, portable=false))]
     fn controller(
         slf: &Bound<'_, Self>,
@@ -309,7 +315,7 @@ impl Policy {
     }
 }
 
-/// Values as an array of this shape.
+/// Returns values as an array of this shape.
 fn shaped<'py, T: numpy::Element + Copy>(
     py: Python<'py>,
     values: &[T],

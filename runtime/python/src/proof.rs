@@ -1,11 +1,11 @@
-//! Success rates and their intervals, by lads-proof.
+//! Success rates and their intervals, computed by lads-proof.
 
 use lads_proof::metrics::{self, Outcome, Score};
 use pyo3::prelude::*;
 
 use crate::errors::ProofError;
 
-/// The Wilson score interval at 95 % of `successes` out of `trials` -> (low, high).
+/// Computes the Wilson score interval at 95 % of `successes` out of `trials` -> (low, high).
 #[pyfunction]
 pub fn wilson(successes: usize, trials: usize) -> PyResult<(f64, f64)> {
     if successes > trials {
@@ -17,8 +17,8 @@ pub fn wilson(successes: usize, trials: usize) -> PyResult<(f64, f64)> {
     Ok((interval.0, interval.1))
 }
 
-/// The score of episodes, each as (commanded sub-tasks completed, success) -> JSON: N-rate, K-rates, full success, their intervals. What else
-/// was completed is not counted.
+/// Computes the score of episodes, each as (commanded sub-tasks completed, success) -> JSON:
+/// N-rate, K-rates, full success, their intervals. Other completed sub-tasks are not counted.
 #[pyfunction]
 pub fn score(outcomes: Vec<(usize, bool)>) -> PyResult<String> {
     let outcomes = outcomes.into_iter();

@@ -1,7 +1,7 @@
-//! Recordings: episodes that Python has kept, written as an MCAP file by lads-record.
+//! Writes episodes recorded in Python as an MCAP file, by lads-record.
 //!
-//! The file is there whole or not at all. What can fail: a policy whose observation is not one vector of floats, arrays that contradict each
-//! other, the disk.
+//! The file is written completely or not at all. What can fail: a policy whose observation is not
+//! one vector of floats, arrays that contradict each other, the disk.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -16,7 +16,7 @@ use crate::arrays;
 use crate::errors::RecordError;
 use crate::policy::Policy;
 
-/// One episode; arrays have a row per control step.
+/// One recorded episode; arrays have a row per control step.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct Recorded<'py> {
@@ -36,8 +36,8 @@ pub struct Recorded<'py> {
     completions: Vec<(String, usize)>,
 }
 
-/// Refuses before the first step what [`write_log`] would refuse after the last: a policy whose observation is not one vector of floats, a
-/// path that cannot be written.
+/// Refuses, before the first step, everything that [`write_log`] would refuse after the last: a
+/// policy whose observation is not one vector of floats, a path that cannot be written.
 #[pyfunction]
 pub fn check_log(
     policy: &Policy,
@@ -51,7 +51,7 @@ pub fn check_log(
         .map_err(|error| RecordError::new_err(error.to_string()))
 }
 
-/// Where a log comes from; its period is known once there are episodes.
+/// Returns the origin of a log, whose period is known once there are episodes.
 fn origin(
     policy: &Policy,
     seed: u64,
@@ -87,7 +87,8 @@ fn origin(
     })
 }
 
-/// Writes episodes to an MCAP file. `noise` is the environment's, in words; `notes` is whatever else is worth knowing.
+/// Writes episodes to an MCAP file. `noise` is the environment's, in words; `notes` are other
+/// facts.
 #[pyfunction]
 pub fn write_log(
     py: Python<'_>,
@@ -123,7 +124,7 @@ pub fn write_log(
     })
 }
 
-/// Names of a channel's elements.
+/// Returns the names of a channel's elements.
 fn names(channel: &Channel<'_>) -> Vec<String> {
     let named = channel.elements().map(|element| element.name.to_owned());
     let named: Vec<_> = named.collect();
@@ -134,7 +135,7 @@ fn names(channel: &Channel<'_>) -> Vec<String> {
     named
 }
 
-/// Control steps from one decision to the next, where there are two.
+/// Returns the number of control steps from one decision to the next, if there are two decisions.
 fn period(episodes: &[Recorded<'_>]) -> Option<usize> {
     let mut steps = episodes.iter().map(|episode| {
         let decided = episode.decided.iter().enumerate();

@@ -1,8 +1,8 @@
-//! What a control step says besides its action.
+//! Report of a control step, besides its action.
 
 use pyo3::prelude::*;
 
-/// What happened in a control step.
+/// Result of a control step, besides its action.
 #[pyclass(frozen, eq, module = "lads")]
 #[derive(PartialEq)]
 pub struct StepReport {
@@ -12,17 +12,17 @@ pub struct StepReport {
     selected: Option<lads_core::Selected>,
 }
 
-/// The index in force, such as that of a latent plan.
+/// The index in force, such as that of a latent plan, and how it was selected.
 #[pyclass(frozen, eq, module = "lads")]
 #[derive(PartialEq)]
 pub struct Selected {
-    /// Which one, from 0.
+    /// Index selected, from 0.
     #[pyo3(get)]
     index: u32,
     /// The largest score of the last selection minus the second largest; infinite with a single one.
     #[pyo3(get)]
     margin: f32,
-    /// Whether this step selected it.
+    /// True if this step selected the index.
     #[pyo3(get)]
     fresh: bool,
 }
@@ -38,7 +38,7 @@ impl From<lads_core::StepReport> for StepReport {
 
 #[pymethods]
 impl StepReport {
-    /// The index in force; None for a policy that selects none.
+    /// Returns the index in force; None for a policy that selects none.
     #[getter]
     fn selected(&self) -> Option<Selected> {
         self.selected.map(|selected| Selected {

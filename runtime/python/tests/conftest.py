@@ -56,7 +56,7 @@ def seen(plain):
 
 
 def replay(controller, golden):
-    """The actions for a golden episode's observations and noise."""
+    """Returns the actions for a golden episode's observations and noise."""
     actions = []
     for step in range(len(golden.actions)):
         given = {name: values[step] for name, values in golden.observations.items()}
@@ -67,7 +67,7 @@ def replay(controller, golden):
 
 
 def busy(call, threads):
-    """What `call` is refused with while other threads are in it, and how often it was not."""
+    """Returns the refusals of `call` while other threads are in it, and the number of calls that were not refused."""
     stop, calls, refused = threading.Event(), [], []
 
     def work():

@@ -8,7 +8,7 @@ import numpy as np
 
 
 def inside(state):
-    """Inside the limits of the random policies' observations."""
+    """Clips an observation to the limits of the random policies."""
     return np.clip(state, -0.09, 0.5)
 
 
@@ -42,7 +42,7 @@ class Servo(gymnasium.Env):
 
 
 class Closing(Servo):
-    """Leaves a file of its process when it is closed."""
+    """Environment that writes a file, named by its process, when it is closed."""
 
     def __init__(self, folder):
         super().__init__()
@@ -81,7 +81,7 @@ def kitchen():
 
 
 def numbered(episode):
-    """Options that say which episode it is."""
+    """Returns options that contain the episode's number."""
     return {"episode": episode}
 
 

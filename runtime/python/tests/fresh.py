@@ -1,4 +1,4 @@
-"""The installed wheel, where nothing but numpy is: run as a program with a policy's path."""
+"""Tests the installed wheel with nothing but numpy: run as a program with a policy's path."""
 
 import importlib.metadata
 import sys

@@ -264,7 +264,7 @@ def test_a_full_context_is_refused_or_restarts(kitchen):
 
 
 def resident():
-    """Bytes of this process's memory."""
+    """Returns the number of bytes of this process's memory."""
     with open("/proc/self/statm") as file:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 

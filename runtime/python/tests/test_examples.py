@@ -16,7 +16,7 @@ FOLDER = PROJECT / "runtime/python/examples"
 
 
 def example(name):
-    """The example as a module; skipped where what it needs is not installed."""
+    """Loads the example as a module; skipped if its requirements are not installed."""
     spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module

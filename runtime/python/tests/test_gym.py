@@ -125,7 +125,7 @@ def test_classic_environments(plain, name, action):
 
 
 def test_the_official_kitchen_as_lads_run_has_it():
-    """The same completions at the same control steps as in the shipped results, which `lads-run` wrote."""
+    """The kitchen's completions equal those of the shipped results, which `lads-run` wrote, step by step."""
     policy = lads.open(PROJECT / "models/kitchen.onnx")
     shipped = json.loads((PROJECT / "models/kitchen.results.json").read_text())["instructions"][0]
     tasks = [row["sub_task"] for row in shipped["completions"]]

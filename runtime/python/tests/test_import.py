@@ -1,4 +1,4 @@
-"""Importing any ONNX policy: what PyTorch exports, beside PyTorch, and everything that is refused."""
+"""Tests importing any ONNX policy: PyTorch's exports, compared with PyTorch, and everything that is refused."""
 
 import pickle
 import subprocess
@@ -19,7 +19,7 @@ MEAN, STD = [0.1, -0.2, 0.3, 0.0, 0.5], [0.5, 1.0, 2.0, 0.8, 1.5]
 
 
 class Recurrent(nn.Module):
-    """A GRU that the caller carries the state of."""
+    """A GRU whose state the caller carries."""
 
     def __init__(self):
         super().__init__()
@@ -46,7 +46,7 @@ def actor(tmp_path):
 
 @pytest.fixture
 def robot(tmp_path):
-    """What a person says of it, with the normaliser."""
+    """Writes a person's description of the robot, with the normaliser."""
     path = tmp_path / "robot.toml"
     path.write_text(HEAD + SEEN.format("state", 5, f"offset = {MEAN}\nscale = {[1 / std for std in STD]}\n") + DONE)
     return path

@@ -1,4 +1,4 @@
-"""Opening policies and asking them."""
+"""Tests opening and inspecting policies."""
 
 import dataclasses
 import json

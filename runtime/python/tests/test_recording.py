@@ -11,7 +11,7 @@ import lads
 
 
 def read(path):
-    """Messages by topic, and the metadata."""
+    """Returns the messages by topic, and the metadata."""
     found = {}
     with path.open("rb") as file:
         opened = make_reader(file)

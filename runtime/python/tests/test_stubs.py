@@ -1,4 +1,4 @@
-"""The stubs of the native half say what the module has."""
+"""Tests that the stubs of the native half match the module."""
 
 import ast
 import inspect
@@ -13,7 +13,7 @@ COMMON = {"__doc__", "__module__", "__new__", "__repr__", "__eq__", "__ne__", "_
 
 
 def parameters(node):
-    """Names of a function's parameters in the stubs, with the number of those that have a default."""
+    """Returns the names of a function's parameters in the stubs, with the number of those that have a default."""
     arguments = node.args
     names = [argument.arg for argument in [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]]
     defaults = len(arguments.defaults) + sum(value is not None for value in arguments.kw_defaults)
@@ -21,7 +21,7 @@ def parameters(node):
 
 
 def signature(function):
-    """The same of the module."""
+    """Returns the names of a function's parameters in the module, with the number of those that have a default."""
     found = [row for row in inspect.signature(function).parameters.values() if row.kind is not row.VAR_POSITIONAL]
     found = [row for row in found if row.name != "self"]
     return [row.name for row in found], sum(row.default is not row.empty for row in found)

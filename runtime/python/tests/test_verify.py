@@ -40,7 +40,7 @@ class InPyTorch:
 
 
 class InOnnxRuntime:
-    """A policy with instructions and plans in ONNX Runtime, with what it selects."""
+    """A policy with instructions and plans in ONNX Runtime, with its selections."""
 
     def __init__(self, model):
         self.twin = Twin(model)
@@ -61,7 +61,7 @@ def drawn(made):
 
 
 def exported(kind, tmp_path, spoil=lambda policy: None, change=lambda contract: None):
-    """A policy in PyTorch and, opened, its export; `spoil` is a fault of the networks on the way, `change` one of the contract."""
+    """Returns a policy in PyTorch and its opened export; `spoil` is a fault of the networks on the way, `change` one of the contract."""
     made = KINDS[kind]
     policy, spoiled = drawn(made), drawn(made)
     with torch.no_grad():
@@ -245,7 +245,7 @@ def test_a_plan_without_scores_is_refused(tmp_path):
 
 
 def narrow():
-    """Less than the policy may answer."""
+    """Makes an environment whose action space is smaller than the contract's limits."""
     environment = environments.Servo()
     environment.action_space = gymnasium.spaces.Box(np.float32([-5, -0.5, -5]), np.float32([5, 0.5, 5]))
     return environment

@@ -1,8 +1,8 @@
 """Policies in Python, by the runtime that runs them in the machine.
 
-`open` reads a policy, a bundle (.onnx) or a compiled image (.lads), and `import_onnx` any other ONNX policy; `Policy.controller` puts it to
-work; `Controller.step` turns an observation into an action. `lads.gym` evaluates a controller in any environment of Gymnasium's API,
-`lads.vector` steps many of them over threads, and `verify` compares one with the policy that was trained. Whatever is refused is an exception
+`open` reads a policy, a bundle (.onnx) or a compiled image (.lads), and `import_onnx` any other ONNX policy; `Policy.controller` runs it;
+`Controller.step` turns an observation into an action. `lads.gym` evaluates a controller in any environment of Gymnasium's API,
+`lads.vector` steps many of them over threads, and `verify` compares one with the policy that was trained. Every refusal is an exception
 of `lads.errors`.
 """
 

@@ -1,4 +1,4 @@
-"""What a policy expects and promises, as frozen dataclasses; read from the report of `Policy.inspect`, which never lacks a field."""
+"""The contract of a policy, as frozen dataclasses; read from the report of `Policy.inspect`, which never lacks a field."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ class Element:
 
     name: str
     unit: str
-    """Unit of the value, `1` for none."""
+    """Unit of the value, `1` for a dimensionless one."""
     min: float
     max: float
     joint: str
-    """Joint that it belongs to; empty for none."""
+    """Joint that the element belongs to; empty for none."""
     interface: str
-    """What of the joint: position, velocity, effort; empty where the bundle does not say."""
+    """Quantity of the joint: position, velocity, effort; empty where the bundle does not say."""
     scale: float
     offset: float
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A value at the policy's edge: an observation, the action, the words of an instruction, noise, a demonstration."""
+    """One channel, an input or output of the policy: an observation, the action, the words of an instruction, noise, a demonstration."""
 
     name: str
     role: str
-    """`observation`, `action`, `instruction`, `noise` or `demonstration`."""
+    """Role of the channel: `observation`, `action`, `instruction`, `noise` or `demonstration`."""
     dtype: np.dtype
     shape: tuple[int, ...]
     elements: tuple[Element, ...]
-    """In order; empty for images and the like, whose elements have no names."""
+    """Elements in order; empty for images and the like, whose elements have no names."""
     min: float | None
-    """Smallest value of every element where they have no names, otherwise None."""
+    """Smallest value of every element if the elements have no names, otherwise None."""
     max: float | None
     quaternion_order: str
-    """`none`, `wxyz` or `xyzw`."""
+    """Order of the components of quaternions: `none`, `wxyz` or `xyzw`."""
     reference: str
 
 
@@ -53,7 +53,7 @@ class Instruction:
     id: str
     text: str
     words: int
-    """Length of its word embeddings."""
+    """Number of word embeddings."""
 
 
 @dataclass(frozen=True)
@@ -63,41 +63,41 @@ class Language:
     encoder: str
     sha256: str
     dim: int
-    """Elements of a word embedding."""
+    """Number of elements of a word embedding."""
     acceptance: float
-    """Similarity to a known instruction from which other sentences may be followed; above 1 where none may be."""
+    """Smallest similarity to a known instruction at which another sentence may be followed; above 1 if none may be."""
 
 
 @dataclass(frozen=True)
 class Context:
-    """How much a policy remembers."""
+    """Capacity of a policy's context."""
 
     words: int
-    """Words of the longest instruction; 0 for a policy that takes none."""
+    """Number of words of the longest instruction; 0 for a policy that takes none."""
     steps: int | None
-    """Control steps that it holds; None without such a bound."""
+    """Number of control steps that the context holds; None if it is unbounded."""
     beyond: str | None
-    """What happens then: `restart` or `refuse`."""
+    """Behaviour after that many control steps: `restart` or `refuse`."""
 
 
 @dataclass(frozen=True)
 class Contract:
-    """What a policy expects and promises."""
+    """The contract of a policy: its channels, instructions and rules."""
 
     family: str
     environment: str
     environment_version: str
     control_period: float
-    """Seconds from one control step to the next."""
+    """Control period, the time from one control step to the next, in seconds."""
     channels: tuple[Channel, ...]
     indices: int
-    """How many indices, such as those of latent plans, it selects from; 0 for a policy that selects nothing."""
+    """Number of indices, such as those of latent plans, that the policy selects from; 0 for a policy that selects nothing."""
     decision: str
-    """How an index is picked: `argmax` or `sample`."""
+    """Rule that picks an index: `argmax` or `sample`."""
     noise: str
-    """Where noise comes from: `zero` or `seeded`."""
+    """Source of noise: `zero` or `seeded`."""
     noise_elements: int
-    """Elements of noise that a control step takes at most."""
+    """Largest number of elements of noise that a control step takes."""
     context: Context
     language: Language | None
     instructions: tuple[Instruction, ...]
@@ -122,20 +122,20 @@ class Golden:
     instruction: str | None
     """Id of the instruction that was followed."""
     observations: dict[str, np.ndarray]
-    """For every channel `[steps, *shape]`."""
+    """Observations by channel, each `[steps, *shape]`."""
     noise: np.ndarray
     """All draws of each step, `[steps, noise_elements]`."""
     selected: np.ndarray | None
     """The index in force in each step; None for a policy that selects nothing."""
     actions: np.ndarray
-    """`[steps, actions]`, inside the limits."""
+    """Actions `[steps, actions]`, inside the limits."""
     tolerance: float
     """Largest difference of an action that the self-test accepts."""
 
 
 @dataclass(frozen=True)
 class SelfTest:
-    """What a self-test that passed has measured."""
+    """Measurements of a self-test that passed."""
 
     steps: int
     largest_error: float
@@ -146,7 +146,7 @@ class SelfTest:
 
 
 def read(report: str) -> Contract:
-    """The contract in a report of `Policy.inspect`, given as JSON."""
+    """Returns the contract in a report of `Policy.inspect`, given as JSON."""
     report = json.loads(report)
     found = report["contract"]
     return Contract(

@@ -1,4 +1,4 @@
-"""What can go wrong: every exception of the package, under one root. Their texts name the thing, what is wrong with it, and the remedy."""
+"""All exceptions of the package, under one root. Their texts name the thing, the fault, and the remedy."""
 
 
 class LadsError(Exception):
@@ -6,7 +6,7 @@ class LadsError(Exception):
 
 
 class OpenError(LadsError, ValueError):
-    """A file is no policy that can be used, or an option of compiling makes no sense."""
+    """A file cannot be used as a policy, or an option of compiling is invalid."""
 
 
 class CompileError(OpenError):
@@ -14,20 +14,20 @@ class CompileError(OpenError):
 
 
 class ImportOnnxError(OpenError):
-    """A policy cannot be imported: something is missing or contradicts."""
+    """A policy cannot be imported: fields are missing or contradictory."""
 
     def __init__(self, text: str, problems=()) -> None:
         super().__init__(text)
         self.problems: tuple[tuple[str, str], ...] = tuple(problems)
-        """All that is to be settled: what each is about, and what is wrong with it."""
+        """All problems, each with its subject and its fault."""
 
 
 class WorkspaceError(LadsError, MemoryError):
-    """There is no memory, or there are no threads, for a controller."""
+    """Memory or threads for a controller are not available."""
 
 
 class InputError(LadsError, ValueError):
-    """An array is not what a channel takes: its type, dtype, shape, layout or values."""
+    """An array does not fit a channel: by its type, dtype, shape, layout or values."""
 
 
 class InstructionError(LadsError, ValueError):
@@ -43,7 +43,7 @@ class RecordError(LadsError, OSError):
 
 
 class SelfTestError(LadsError, RuntimeError):
-    """The policy answers otherwise on this machine than recorded, or holds no golden episode."""
+    """The policy's answers on this machine differ from the recorded ones, or it holds no golden episode."""
 
 
 class ClosedError(LadsError, RuntimeError):
@@ -59,8 +59,8 @@ class ForkError(LadsError, RuntimeError):
 
 
 class EvaluationError(LadsError, RuntimeError):
-    """An evaluation cannot go on: what an environment gives or takes does not fit, or an episode failed."""
+    """An evaluation cannot continue: the environment does not fit the policy, or an episode failed."""
 
 
 class ProofError(LadsError, ValueError):
-    """Rollouts or numbers that are to be judged contradict each other."""
+    """Rollouts or numbers to be judged contradict each other."""

@@ -1,4 +1,4 @@
-"""Policies in environments of Gymnasium's API: `evaluate` measures success, `Policy` is for loops of one's own."""
+"""Runs policies in environments of Gymnasium's API: `evaluate` measures success, `Policy` is for the caller's own loops."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["Episode", "Evaluation", "Policy", "Rate", "Rollout", "evaluate"]
 class Policy:
     """A controller as a callable from an environment's observation to its action.
 
-    `observation` and `action` convert between the environment and the policy, where dtype, names and shapes alone do not say how; `space` is
+    `observation` and `action` convert between the environment and the policy, if dtype, names and shapes alone do not determine how; `space` is
     the environment's action space. Call `reset` at the start of every episode.
     """
 
@@ -38,11 +38,11 @@ class Policy:
         self._observation, self._action, self._space = observation, action, space
 
     def reset(self) -> None:
-        """Starts a new episode of the same instruction."""
+        """Starts a new episode with the same instruction."""
         self.controller.reset()
 
     def __call__(self, observation: Any) -> Any:
-        """The environment's action for its observation; `report` has the step's `lads.StepReport` afterwards."""
+        """Returns the environment's action for its observation; `report` has the step's `lads.StepReport` afterwards."""
         seen = self._observation(observation) if self._observation else observation
         action, self.report = self.controller.step(convert(seen, self._channels))
         return self._action(action) if self._action else command(action, self._space)
@@ -50,16 +50,16 @@ class Policy:
 
 @dataclass(frozen=True)
 class Rate:
-    """A share of episodes."""
+    """Share of episodes in which something happened."""
 
     count: int
-    """Episodes in which it happened."""
+    """Number of episodes in which it happened."""
     episodes: int
-    """Episodes in which it could."""
+    """Number of episodes in which it could happen."""
 
     @property
     def rate(self) -> float:
-        """`count` over `episodes`."""
+        """The share, `count` over `episodes`."""
         return self.count / self.episodes
 
     @property
@@ -78,30 +78,30 @@ class Episode:
 
     number: int
     seed: int
-    """What `reset` was given."""
+    """Seed that `reset` was given."""
     steps: int
     total_reward: float
     terminated: bool
     truncated: bool
     success: bool | None
-    """None where nothing says what success is."""
+    """True if the episode was a success; None if nothing defines success."""
     completions: tuple[tuple[str, int], ...]
-    """Sub-tasks with the number of control steps after which they were first done, 0 where from the start."""
+    """Sub-tasks with the number of control steps after which they were first done, 0 if from the start."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What a policy achieved."""
+    """Results of an evaluation."""
 
     episodes: tuple[Episode, ...]
-    """In order of their numbers."""
+    """Episodes in the order of their numbers."""
     seed: int
     score: dict | None
     """N-rate, K-rates and full success of episodes with sub-tasks, each with its interval; otherwise None."""
 
     @property
     def success(self) -> Rate | None:
-        """Share of successful episodes; None where nothing says what success is."""
+        """Share of successful episodes; None if nothing defines success."""
         known = [episode.success for episode in self.episodes if episode.success is not None]
         return Rate(sum(known), len(known)) if known else None
 
@@ -140,11 +140,11 @@ def evaluate(
     """Runs a controller's policy and instruction in `episodes` episodes of the environment that `make_env()` makes -> `Evaluation`.
 
     Every episode has a seed of its own, so that its result does not depend on the others nor on `processes`; it is run by a fresh
-    controller, `controller` itself stays as it is. `options` is for `reset`, a dictionary or a callable of the episode's number; `success` is a
-    key of the last `info` or a callable of the `Rollout`, by default `is_success` or `success` where there is one, or that all `sub_tasks`
-    are done; `completed` is a key of `info`, or a callable of it, for the names of those that are. `observation` and `action` convert, see
+    controller, `controller` itself is unchanged. `options` is for `reset`, a dictionary or a callable of the episode's number; `success` is a
+    key of the last `info` or a callable of the `Rollout`, by default `is_success` or `success` if the info has one, or that all `sub_tasks`
+    are done; `completed` is a key of `info`, or a callable of it, for the names of the completed ones. `observation` and `action` convert, see
     `Policy`. With several processes all of this has to be picklable (with cloudpickle, where that is installed). `progress` is a callable of
-    (finished, all), or False; by default a terminal is told.
+    (finished, all), or False; by default progress is shown on a terminal.
     """
     if episodes < 1 or processes < 1:
         raise EvaluationError(f"{episodes} episodes in {processes} processes; give one or more of each")
@@ -172,7 +172,7 @@ def _score(episodes):
 
 
 class Progress:
-    """A line on the terminal: episodes finished of all."""
+    """Shows a line on the terminal: the number of finished episodes."""
 
     def __init__(self, wanted=None):
         self.wanted = sys.stderr.isatty() if wanted is None else wanted
@@ -194,13 +194,13 @@ class _Job:
     action: object
 
     def controller(self, episode):
-        """A fresh controller, with seeds of the episode's own."""
+        """Makes a fresh controller, with seeds of the episode's own."""
         sample, noise, portable = self.settings
         own = lambda start: None if start is None else (start + episode) % 2**64
         return self.policy.controller(self.instruction, sample=own(sample), noise=own(noise), portable=portable)
 
     def episode(self, environment, number):
-        """Runs one."""
+        """Runs one episode."""
         with self.controller(number) as controller:
             policy = Policy(controller, self.observation, self.action, getattr(environment, "action_space", None))
             try:
@@ -236,7 +236,7 @@ def _pickled(job):
     try:
         return cloudpickle.dumps(job)
     except Exception as error:
-        raise EvaluationError(f"what the environment is made by cannot be sent to other processes ({error}); give functions of a module, or processes=1") from error
+        raise EvaluationError(f"make_env and the other callables cannot be sent to other processes ({error}); give functions of a module, or processes=1") from error
 
 
 def _parallel(job, episodes, processes):

@@ -1,4 +1,4 @@
-"""Control steps into a file: MCAP, for Foxglove and whatever else reads it. `lads-run replay` takes the logs of `lads-run --log` alone.
+"""Records control steps in a file: MCAP, for Foxglove and other readers. `lads-run replay` takes only the logs of `lads-run --log`.
 
 What can fail: a policy whose observation is not one vector of floats, noise that the caller gives, a path that cannot be written.
 """
@@ -17,11 +17,11 @@ from .errors import RecordError
 
 
 class Recorder:
-    """A controller that keeps what it does, for a policy that observes one vector.
+    """Controller that records its steps, for a policy that observes one vector.
 
     It has a controller's `step`, `executed`, `reset`, `instruct` and `policy`, which is what a control loop and `lads.gym.Policy` use. `reset`
-    and `instruct` begin a new episode, `end` says how the last one came out. Nothing is written before `close`, so that no step waits for a
-    disk; as a context manager it is closed at the end, and an exception leaves no file. A step costs a copy of what goes in and out.
+    and `instruct` begin a new episode, `end` gives the outcome of the last one. Nothing is written before `close`, so that no step waits for a
+    disk; as a context manager it is closed at the end, and an exception leaves no file. A step costs a copy of its inputs and outputs.
     """
 
     def __init__(
@@ -44,11 +44,11 @@ class Recorder:
 
     @property
     def policy(self) -> _lads.Policy:
-        """The policy at work."""
+        """The policy of the controller."""
         return self.controller.policy
 
     def step(self, observation: Any, out: np.ndarray | None = None) -> tuple[np.ndarray, _lads.StepReport]:
-        """The controller's `step`, kept."""
+        """Runs the controller's `step` and records it."""
         named = observation if isinstance(observation, dict) else {self._channel: observation}
         if self._drawn & named.keys():
             raise RecordError("a recording does not hold noise that is given; leave it out, or give policy.controller(noise=), a seed")
@@ -72,22 +72,22 @@ class Recorder:
         return action, report
 
     def executed(self, action: np.ndarray) -> None:
-        """The controller's `executed`, kept."""
+        """Calls the controller's `executed` and records the action."""
         self.controller.executed(action)
         self._steps[-1]["executed"] = np.array(action)
 
     def reset(self) -> None:
-        """Ends the episode, and starts a new one of the same instruction."""
+        """Ends the episode, and starts a new one with the same instruction."""
         self.controller.reset()
         self.end()
 
     def instruct(self, instruction: Any) -> None:
-        """Ends the episode, and follows an instruction from the next step on."""
+        """Ends the episode, and sets the instruction to follow from the next step on."""
         self.end()
         self.controller.instruct(instruction)
 
     def end(self, success: bool = False, completions: Sequence[tuple[str, int]] = ()) -> None:
-        """Ends the episode: whether it was a success, and sub-tasks with the first step, from 1, after which they were done."""
+        """Ends the episode with its outcome: `success`, and sub-tasks with the first step, from 1, after which they were done."""
         if not self._steps:
             return
         told = self.controller._instruction

@@ -1,7 +1,7 @@
-"""One episode of any environment of Gymnasium's API, and the ways to describe one: seeds, options, success, sub-tasks.
+"""Runs one episode of any environment of Gymnasium's API, described by seeds, options, success and sub-tasks.
 
-Nothing here imports gymnasium: an environment is what has `reset(seed=, options=)` and `step(action)`. What can fail: an environment whose
-`info` says nothing about what is asked of it (`EvaluationError`).
+Nothing here imports gymnasium: an environment is any object with `reset(seed=, options=)` and `step(action)`. What can fail: an environment whose
+`info` lacks a requested key (`EvaluationError`).
 """
 
 from collections.abc import Mapping
@@ -17,44 +17,44 @@ COMPLETED = "episode_task_completions"
 
 @dataclass(frozen=True)
 class Rollout:
-    """What happened in one episode."""
+    """Result of one episode."""
 
     steps: int
-    """Control steps executed."""
+    """Number of control steps executed."""
     total_reward: float
     """Sum of the rewards."""
     terminated: bool
     truncated: bool
-    """Whether the environment, or `max_steps`, ended it before it was over."""
+    """True if the environment, or `max_steps`, ended the episode early."""
     info: Mapping
-    """What the last step said."""
+    """Info of the last step."""
     completions: tuple[tuple[str, int], ...]
-    """Sub-tasks with the number of control steps after which they were first done, 0 where from the start, in order of time."""
+    """Sub-tasks with the number of control steps after which they were first done, 0 if from the start, in order of time."""
 
 
 @dataclass(frozen=True)
 class Rules:
-    """How episodes are begun, ended and judged."""
+    """Rules by which episodes are begun, ended and judged."""
 
     options: object = None
-    """For `reset`: a dictionary, or a callable of the episode's number."""
+    """Options of `reset`: a dictionary, or a callable of the episode's number."""
     max_steps: int | None = None
     success: object = None
-    """A key of the last `info`, or a callable of the `Rollout`."""
+    """Success of an episode: a key of the last `info`, or a callable of the `Rollout`."""
     sub_tasks: tuple[str, ...] = ()
     completed: object = None
-    """A key of `info`, or a callable of it, for the names of the sub-tasks that are done."""
+    """Names of the sub-tasks that are done: a key of `info`, or a callable of it."""
 
     def __post_init__(self):
         if self.max_steps is not None and self.max_steps < 1:
             raise EvaluationError(f"max_steps is {self.max_steps}; give 1 or more, or None for episodes as long as the environment's")
 
     def reset_options(self, episode):
-        """What `reset` is given."""
+        """Returns the options of `reset`."""
         return self.options(episode) if callable(self.options) else self.options
 
     def done(self, info):
-        """Names of the sub-tasks that are done, of those that are asked for."""
+        """Returns the names of the requested sub-tasks that are done."""
         if not self.sub_tasks:
             return []
         if callable(self.completed):
@@ -68,7 +68,7 @@ class Rules:
         return [name for name in self.sub_tasks if name in done]
 
     def judge(self, rollout):
-        """Whether an episode was a success; None where nothing says so."""
+        """Returns whether an episode was a success; None if nothing defines success."""
         if callable(self.success):
             return bool(self.success(rollout))
         if self.success is not None:
@@ -81,7 +81,7 @@ class Rules:
 
 
 def episode_seed(seed, episode):
-    """The seed of an episode, of 32 bits: the same whatever other episodes are run, and in whichever process."""
+    """Returns the seed of an episode, of 32 bits, independent of other episodes and of the process."""
     return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
 
 
@@ -111,12 +111,12 @@ def play(environment, act, rules, seed, episode, watch=None):
 
 
 def _says(rules, info):
-    """Whether the info of a reset says anything about sub-tasks; that of most environments does not."""
+    """Returns whether the info of a reset reports sub-tasks; that of most environments does not."""
     return callable(rules.completed) or (rules.completed or COMPLETED) in info
 
 
 def convert(observation, channels):
-    """An environment's observation as a controller takes it: arrays of each channel's dtype, one or a dictionary by name."""
+    """Converts an environment's observation to a controller's: arrays of each channel's dtype, one or a dictionary by name."""
     if isinstance(observation, Mapping):
         missing = [channel.name for channel in channels if channel.name not in observation]
         if missing:
@@ -146,7 +146,7 @@ def _cast(value, channel):
 
 
 def command(action, space):
-    """A policy's action, float32 [n], as the environment's action space takes it."""
+    """Converts a policy's action, float32 [n], to the environment's action space."""
     if space is None or not hasattr(space, "shape") or not hasattr(space, "dtype"):
         return action
     if np.dtype(space.dtype).kind != "f":

@@ -1,4 +1,4 @@
-"""Many controllers of one policy, stepped together over threads."""
+"""Steps many controllers of one policy together over threads."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ __all__ = ["Controllers", "Report"]
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What happened in a control step of every row; the last three are None for a policy that selects no index."""
+    """Result of a control step of every row; the last three fields are None for a policy that selects no index."""
 
     timestep: np.ndarray
-    """Control steps since each row's context began, int64 `[count]`."""
+    """Number of control steps since each row's context began, int64 `[count]`."""
     index: np.ndarray | None
     """The index in force, int64 `[count]`."""
     margin: np.ndarray | None
     """The largest score of the last selection minus the second largest, float32 `[count]`."""
     fresh: np.ndarray | None
-    """Whether this step selected it, bool `[count]`."""
+    """True if this step selected the index, bool `[count]`."""

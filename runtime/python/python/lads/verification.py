@@ -1,8 +1,8 @@
-"""Is the deployed policy the one that was trained? Three comparisons with a reference, judged by the statistics of `lads-run verify`.
+"""Verifies that the deployed policy is the one that was trained: three comparisons with a reference, judged by the statistics of `lads-run verify`.
 
 The policy alone (the reference's observations, asked again), the environment alone (the reference's actions, executed again), and both
-together (the same episodes in closed loop, as pairs). Here the episodes are run; `lads_proof`, in Rust, judges and writes the certificate. What
-can fail: an environment that does not say what success is, or takes less than the contract's limits allow; a reference whose action has
+together (the same episodes in closed loop, as pairs). This module runs the episodes; `lads_proof`, in Rust, judges and writes the certificate. What
+can fail: an environment that does not define success, or takes less than the contract's limits allow; a reference whose action has
 another shape, or which gives plans without scores.
 """
 
@@ -31,10 +31,10 @@ LARGEST = 1e300
 
 @dataclass(frozen=True)
 class Reply:
-    """What a reference answers that also says what it selected; one that gives an action alone is compared by its actions."""
+    """Answer of a reference that also states its selected index; a reference that returns only an action is compared by its actions."""
 
     action: np.ndarray
-    """`[actions]`, in the contract's units."""
+    """Action `[actions]`, in the contract's units."""
     plan: int | None = None
     """The index in force."""
     logits: np.ndarray | None = None
@@ -43,10 +43,10 @@ class Reply:
 
 @dataclass(frozen=True)
 class Certificate:
-    """The verdict with everything that it rests on."""
+    """The verdict of a verification, with its evidence."""
 
     verdict: str
-    """`EQUIVALENT`, `DIFFERENT` or `INCONCLUSIVE`."""
+    """Verdict: `EQUIVALENT`, `DIFFERENT` or `INCONCLUSIVE`."""
     reasons: tuple[str, ...]
     data: dict
     """The certificate of `lads-run verify`, as data."""
@@ -54,7 +54,7 @@ class Certificate:
     html: str
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Writes the page where the name ends in .html, otherwise the JSON; the file is there whole or not at all."""
+        """Writes the page if the name ends in .html, otherwise the JSON; the file is written completely or not at all."""
         _lads.write(path, self.html if Path(path).suffix == ".html" else self.json + "\n")
 
     def __str__(self) -> str:
@@ -84,12 +84,12 @@ def verify(
 ) -> Certificate:
     """Compares a controller's policy with a reference in the environment that `make_env()` makes -> `Certificate`.
 
-    `reference(observation)` is any callable: it gets what the controller gets, arrays of the channels' dtypes, and gives the action, an array
-    [actions], or a `Reply`. What it has of `reset` is called when an episode begins, with the instruction where `instructions` are given.
+    `reference(observation)` is any callable: it gets the controller's input, arrays of the channels' dtypes, and returns the action, an array
+    [actions], or a `Reply`. Its method `reset`, if any, is called when an episode begins, with the instruction if `instructions` are given.
     Without `action`, its actions are clipped to the environment's action space, inside which the contract's limits have to lie. Each of
     `episodes` is run by both, of each of `instructions` (by default the one that the controller follows); the first `traced` of them are
-    compared step by step. `sub_tasks` may be a dictionary by instruction. `state(environment, observation)` gives what the environment alone
-    is compared by, by default the observation. `control_period` is the reference's, in seconds, by default the environment's `dt`; without
+    compared step by step. `sub_tasks` may be a dictionary by instruction. `state(environment, observation)` returns the state by which the environment alone
+    is compared, by default the observation. `control_period` is the reference's, in seconds, by default the environment's `dt`; without
     either the contract is not compared, and nothing is EQUIVALENT. The other arguments are those of `lads.gym.evaluate`. 59 episodes are the fewest that can be EQUIVALENT, 146 with four sub-tasks.
     """
     if not 1 <= traced or episodes < 1:
@@ -147,16 +147,16 @@ class _Setting:
         return self.controller.policy.contract
 
     def seen(self, observation):
-        """What the policy gets."""
+        """Returns the policy's input."""
         return convert(self.observation(observation) if self.observation else observation, self.contract.observations)
 
     def row(self, seen):
-        """The same as one row of floats, channel by channel."""
+        """Returns the policy's input as one row of floats, channel by channel."""
         arrays = [seen[channel.name] for channel in self.contract.observations] if isinstance(seen, dict) else [seen]
         return np.concatenate([np.ravel(array) for array in arrays]).astype("<f4")
 
     def commanded(self, action, environment):
-        """What the environment gets."""
+        """Returns the environment's input for an action."""
         return self.action(action) if self.action else command(action, getattr(environment, "action_space", None))
 
     def state_of(self, environment, observation):
@@ -171,7 +171,7 @@ def _flat(value):
 
 
 class _Side:
-    """What drives an episode, and what it did: one of the two that are compared."""
+    """One of the two sides that are compared: drives an episode and records it."""
 
     def __init__(self, setting, environment):
         self.setting, self.environment = setting, environment
@@ -244,7 +244,7 @@ def _inside(channel, low, high):
 
 
 class _Deployed(_Side):
-    """The controller's policy; what it selects is kept where the reference says what it selects."""
+    """The controller's policy, whose selections are recorded if the reference states its own."""
 
     def __init__(self, setting, environment, instruction, asked):
         super().__init__(setting, environment)
@@ -268,7 +268,7 @@ class _Deployed(_Side):
 
 
 def _episode(environment, side, rules, setting, number):
-    """One episode in the form of a reference's file."""
+    """Runs one episode and returns it in the form of a reference's file."""
     traced = number < setting.traced
     states = []
 
@@ -309,7 +309,7 @@ def _text(rows, kind):
 
 
 def _replay(environment, commands, rules, setting, number):
-    """The environment's states under the reference's actions, float64 [n, S], and whether it ended the episode with the last of them."""
+    """Returns the environment's states under the reference's actions, float64 [n, S], and whether it ended the episode with the last of them."""
     states, rest = [], iter(commands)
     rollout = play(
         environment,
@@ -323,7 +323,7 @@ def _replay(environment, commands, rules, setting, number):
 
 
 def _about(setting, environment, tasks, theirs, control_period):
-    """What is judged besides the rollouts."""
+    """Returns the facts that are judged besides the rollouts."""
     contract = setting.contract
     not_covered = ["the contract beyond its control period: neither the reference nor the environment states more"]
     decides = any(episode["plans"] for row in theirs for episode in row["episodes"])
@@ -354,7 +354,7 @@ def _about(setting, environment, tasks, theirs, control_period):
 
 
 def _period(environment):
-    """The environment's control period in seconds, if it says one."""
+    """Returns the environment's control period in seconds, if it states one."""
     value = getattr(getattr(environment, "unwrapped", environment), "dt", None)
     return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else None
 
@@ -369,7 +369,7 @@ def _versions():
 
 
 def _file(head, rows):
-    """Rollouts in the form of a reference's file."""
+    """Returns rollouts in the form of a reference's file."""
     return json.dumps(
         {
             "format": FORMAT,
