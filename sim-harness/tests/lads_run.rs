@@ -414,7 +414,7 @@ fn a_log_replays_and_its_plans_run() {
     refused(
         &kitchen_bundle(),
         &["replay", log],
-        &["replay", "no whole MCAP file"],
+        &["replay", "not a complete MCAP file"],
     );
     refused(&kitchen_bundle(), &["--plans", log], &["--plans", "f.mcap"]);
     refused(&kitchen_bundle(), &["replay", "no.mcap"], &["no.mcap"]);

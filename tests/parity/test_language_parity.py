@@ -185,8 +185,8 @@ def test_a_log_of_a_sentence_replays(cache, tmp_path):
 
 def test_refusals(cache, tmp_path):
     long = "and then turn the faucet " * 120
-    assert "hears at most 24" in refusal(cache, "kitchen", "--instruction", "open the microwave, please, " * 5)
-    assert "hears at most 512" in refusal(cache, "lorel", "--instruction", long)
+    assert "takes at most 24" in refusal(cache, "kitchen", "--instruction", "open the microwave, please, " * 5)
+    assert "takes at most 512" in refusal(cache, "lorel", "--instruction", long)
     assert "empty sentence" in refusal(cache, "lorel", "--instruction", "\u200b")
     wrong = refusal(tmp_path / "no", "lorel", "--instruction", "open teh drawer")
     assert "lads_exporter language" in wrong and "open drawer" in wrong and str(tmp_path / "no") in wrong

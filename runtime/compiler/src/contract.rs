@@ -191,7 +191,7 @@ impl Contract {
             problem: problem.into(),
         };
         let value: serde_json::Value =
-            serde_json::from_str(json).map_err(|error| refused(format!("is no JSON: {error}")))?;
+            serde_json::from_str(json).map_err(|error| refused(format!("is not JSON: {error}")))?;
         let version = value
             .get("version")
             .ok_or_else(|| refused("missing field `version`".into()))?;

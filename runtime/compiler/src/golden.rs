@@ -61,11 +61,11 @@ impl Golden {
     fn read(base64: &str, contract: &Contract) -> Result<Self, String> {
         let blob = base64::engine::general_purpose::STANDARD
             .decode(base64.trim())
-            .map_err(|error| format!("is no base64: {error}"))?;
+            .map_err(|error| format!("is not base64: {error}"))?;
         let tensors = SafeTensors::deserialize(&blob)
-            .map_err(|error| format!("is no safetensors file: {error}"))?;
+            .map_err(|error| format!("is not a safetensors file: {error}"))?;
         let (_, metadata) = SafeTensors::read_metadata(&blob)
-            .map_err(|error| format!("is no safetensors file: {error}"))?;
+            .map_err(|error| format!("is not a safetensors file: {error}"))?;
         let tolerance = metadata
             .metadata()
             .as_ref()
@@ -73,7 +73,7 @@ impl Golden {
             .ok_or("its metadata has no `tolerance`")?;
         let tolerance: f32 = tolerance
             .parse()
-            .map_err(|_| format!("its `tolerance` \"{tolerance}\" is no number"))?;
+            .map_err(|_| format!("its `tolerance` \"{tolerance}\" is not a number"))?;
         if !(tolerance.is_finite() && tolerance > 0.0) {
             return Err(format!("its `tolerance` {tolerance} is not positive"));
         }
@@ -148,7 +148,7 @@ fn instruction(tensors: &SafeTensors, contract: &Contract) -> Result<usize, Stri
     };
     index.ok_or_else(|| {
         format!(
-            "`instruction` is no index of the {} instructions",
+            "`instruction` is not an index of the {} instructions",
             contract.instructions.len()
         )
     })

@@ -146,7 +146,7 @@ impl Reference {
         let mut after = rings;
         for (name, id) in &self.outputs {
             let Some(Value::Float(value)) = values.get(id) else {
-                return Err(refused(format!("output `{name}` is no float")));
+                return Err(refused(format!("output `{name}` is not a float")));
             };
             match name.strip_prefix("next_") {
                 Some(state) => {

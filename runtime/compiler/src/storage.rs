@@ -289,7 +289,7 @@ pub fn named<T: Copy, const N: usize>(
     let found = known.into_iter().find(|&format| name_of(format) == name);
     found.ok_or_else(|| {
         let known = known.map(name_of).join(", ");
-        format!("there is no format `{name}`; known are {known}")
+        format!("there is no format `{name}`; the formats are {known}")
     })
 }
 

@@ -25,7 +25,7 @@ const FIELDS: [(&str, &str); 6] = [
         "family",
         "the family of policies and its own fields; {\"kind\": \"plain\"} for one graph from observations to an action",
     ),
-    ("environment", "`id` and `version` of what it was made for"),
+    ("environment", "`id` and `version` of the environment that it was made for"),
     (
         "control_period_s",
         "the time from one control step to the next, in seconds",
@@ -301,7 +301,7 @@ fn of_bundle(
     Ok(())
 }
 
-const GOLDEN: &str = "a recorded episode, with which every target tests itself: what was observed, the actions, and how far an action may be from them";
+const GOLDEN: &str = "a recorded episode, with which every target tests itself: the observations, the actions, and how far an action may be from them";
 
 /// Lists the fields that a person has to state for a graph without a contract.
 fn of_stranger(inputs: &[&ValueInfoProto], graph: &GraphProto, missing: &mut Missing) {

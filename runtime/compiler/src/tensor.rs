@@ -185,7 +185,7 @@ fn words<T, const N: usize>(raw: &[u8], read: impl Fn([u8; N]) -> T) -> Result<V
     let (words, rest) = raw.as_chunks::<N>();
     if !rest.is_empty() {
         return Err(format!(
-            "it has {} bytes, which is no whole number of elements",
+            "it has {} bytes, which is not a whole number of elements",
             raw.len()
         ));
     }

@@ -458,13 +458,13 @@ impl fmt::Display for ContractError {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         match self {
             Self::Number => f.write_str(
-                "the control period, the temperature or the acceptance threshold makes no sense",
+                "the control period, the temperature or the acceptance threshold is invalid",
             ),
             Self::Channels => f.write_str(
                 "the channels are not observations and one action, each with a name of its own",
             ),
             Self::Shape { channel } => {
-                write!(f, "the shape of channel {} makes no sense", channel.0)
+                write!(f, "the shape of channel {} is invalid", channel.0)
             }
             Self::Limits { channel } => {
                 write!(

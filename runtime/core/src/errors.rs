@@ -189,7 +189,7 @@ impl fmt::Display for InstructionError {
                 "an instruction of {got} words; the policy takes 1 to {most}"
             ),
             Self::NotFinite { index } => write!(f, "word element {index} is not finite"),
-            Self::Run(error) => write!(f, "the instruction could not be taken in: {error}"),
+            Self::Run(error) => write!(f, "the instruction could not be processed: {error}"),
         }
     }
 }

@@ -245,7 +245,7 @@ impl fmt::Display for GuardError {
             }
             Self::Limits { index } => write!(
                 f,
-                "the limits of action element {index} leave nothing of the contract's range"
+                "the limits of action element {index} do not overlap the contract's range"
             ),
             Self::Rate { index } => write!(
                 f,

@@ -216,7 +216,7 @@ pub enum Problem {
     Changed,
     /// The file is not an image, and this build has no compiler.
     #[cfg(not(feature = "compile"))]
-    #[error("it is no program image; compile it from its bundle first")]
+    #[error("it is not a program image; compile it from its bundle first")]
     NoCompiler,
     /// The file is not a usable bundle.
     #[cfg(feature = "compile")]

@@ -286,7 +286,7 @@ impl fmt::Display for FormatError {
                 f,
                 "program image of version {version}; this runtime reads version {VERSION}"
             ),
-            Self::Length => f.write_str("the program image states a length that makes no sense"),
+            Self::Length => f.write_str("the program image states an invalid length"),
             Self::Table => f.write_str("the section table of the program image is malformed"),
         }
     }

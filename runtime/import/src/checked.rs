@@ -37,7 +37,7 @@ pub(crate) fn steps(
         if let Some(i) = action.iter().position(|value| !value.is_finite()) {
             problems.add(
                 format!("action `{}`", plan.action.elements[i].name),
-                format!("is no number in step {step} of observations inside their limits"),
+                format!("is not a number in step {step} of observations inside their limits"),
             );
             break;
         }

@@ -156,7 +156,7 @@ fn edge(
     axes: &BTreeMap<String, usize>,
 ) -> Result<Edge, String> {
     let tensor = value.r#type.as_ref().and_then(|ty| ty.tensor_type.as_ref());
-    let tensor = tensor.ok_or("is no tensor; export the policy with tensors at its edge")?;
+    let tensor = tensor.ok_or("is not a tensor; export the policy with tensors as inputs and outputs")?;
     let shape = tensor
         .shape
         .as_ref()
@@ -237,7 +237,7 @@ fn external(
         field(key)
             .map(str::parse::<u64>)
             .transpose()
-            .map_err(|_| format!("says a {key} of external data that is no number"))
+            .map_err(|_| format!("states a {key} of external data that is not a number"))
     };
     let location = field("location").ok_or("says no location of its external data")?;
     let relative = Path::new(location);
@@ -257,7 +257,7 @@ fn external(
     };
     if !resolved.starts_with(&home) || !resolved.is_file() {
         return Err(format!(
-            "has external data in `{location}`, which leads out of the model's folder or is no file; put the file itself there"
+            "has external data in `{location}`, which leads out of the model's folder or is not a file; put the file itself there"
         ));
     }
     let (offset, wanted) = (number("offset")?.unwrap_or(0), expected(tensor)?);
@@ -323,7 +323,7 @@ fn check(graph: &GraphProto, problems: &mut Problems) {
         if !finite(tensor) {
             problems.add(
                 format!("weight `{}`", tensor.name),
-                "holds a value that is no finite number; the training has diverged, export an earlier checkpoint",
+                "holds a value that is not a finite number; the training has diverged, export an earlier checkpoint",
             );
         }
     }

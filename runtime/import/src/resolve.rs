@@ -66,7 +66,7 @@ impl Edges {
         };
         match matches[..] {
             [edge] => Ok(edge),
-            [] => Err(format!("\"{said}\" is none of them; there are {}", known())),
+            [] => Err(format!("\"{said}\" is not one of them; there are {}", known())),
             _ => Err(format!(
                 "\"{said}\" is in several files; say one of {}",
                 known()
@@ -173,7 +173,7 @@ fn otherwise_fed<'e>(
             (None, None, None) => open.push(input),
             _ => problems.add(
                 format!("input `{}`", edges.name(input)),
-                "is said to be fed in several ways: as a state, by a constant or by a wire; say one",
+                "is fed in several ways: as a state, by a constant or by a wire; give one",
             ),
         }
     }
@@ -195,7 +195,7 @@ fn check_head(robot: &Robot, problems: &mut Problems) {
     match robot.control_period_s {
         None => problems.add(
             "control_period_s",
-            "is not said: the time from one control step to the next, in seconds",
+            "is not given: the time from one control step to the next, in seconds",
         ),
         Some(period) if !(period.is_finite() && period > 0.0) => {
             problems.add(
@@ -208,7 +208,7 @@ fn check_head(robot: &Robot, problems: &mut Problems) {
     if robot.environment.is_none() {
         problems.add(
             "environment",
-            "is not said: `{ id = \"my-robot\", version = \"1\" }`, what the policy was made for",
+            "is not given: `{ id = \"my-robot\", version = \"1\" }`, what the policy was made for",
         );
     }
 }

@@ -86,7 +86,7 @@ pub(crate) fn manifest(text: &str, source: &str, problems: &mut Problems) -> Sai
             Said::default()
         }
         Err(error) => {
-            problems.add(source, format!("is no JSON: {error}"));
+            problems.add(source, format!("is not JSON: {error}"));
             Said::default()
         }
     }
@@ -151,7 +151,7 @@ fn flat(values: &Value, source: &str, problems: &mut Problems) -> Said {
     if let Some((name, value)) = terms {
         match texts(&value) {
             Some(names) => robot.terms = names.into_iter().map(named).collect(),
-            None => problems.add(format!("{source}, `{name}`"), "is no list of names"),
+            None => problems.add(format!("{source}, `{name}`"), "is not a list of names"),
         }
     }
     said

@@ -12,14 +12,14 @@ use crate::robot::{Clip, Each, From, History, Layout, Order, Robot, Start, Term}
 /// Formats the whole template.
 pub(crate) fn template(edges: &Edges, robot: &Robot, problems: &Problems) -> String {
     let mut form = Form::default();
-    form.line("# What stands between sensors and policy. Take away the `#` in front of a field and say what it asks for.");
+    form.line("# Processing between sensors and policy. Remove the `#` in front of a field and fill in its value.");
     form.line(format_args!(
         "# The graph reads {} and gives {}.",
         listed(edges, &edges.inputs),
         listed(edges, &edges.outputs)
     ));
     if !problems.is_empty() {
-        form.line("# What is wrong with the files so far:");
+        form.line("# Problems of the files so far:");
     }
     for problem in problems.all() {
         form.line(format_args!("#   {}: {}", problem.about, problem.wrong));
@@ -175,7 +175,7 @@ fn term(form: &mut Form, said: &Term, robot: &Robot) {
             "unit",
             full.unit.as_deref().map(text),
             "\"rad\"",
-            "of what the sensor gives; \"1\" for none",
+            "unit of the sensor's values; \"1\" for none",
         );
         if let Some(interface) = &full.interface {
             form.line(format_args!("interface = {}", text(interface)));
@@ -184,9 +184,9 @@ fn term(form: &mut Form, said: &Term, robot: &Robot) {
             "min",
             full.min.as_ref().map(each),
             "-1.0",
-            "the smallest value that can be right",
+            "the smallest valid value",
         );
-        form.field("max", full.max.as_ref().map(each), "1.0", "the largest");
+        form.field("max", full.max.as_ref().map(each), "1.0", "the largest valid value");
         let posture = robot.default_position.clone().map(Each::Many);
         let offset = full
             .offset
@@ -218,7 +218,7 @@ fn term(form: &mut Form, said: &Term, robot: &Robot) {
 fn action(form: &mut Form, edges: &Edges, robot: &Robot) {
     let said = &robot.action;
     form.line(
-        "\n# What the policy's output means: clip(raw) * scale + offset, which the robot gets.",
+        "\n# Meaning of the policy's output: clip(raw) * scale + offset, which the robot gets.",
     );
     form.line("[action]");
     let example = edges
@@ -230,7 +230,7 @@ fn action(form: &mut Form, edges: &Edges, robot: &Robot) {
             "output",
             said.output.as_deref().map(text),
             &text(&example),
-            "which output it is",
+            "which output is the action",
         );
     }
     if let Some(names) = &said.elements {
@@ -240,7 +240,7 @@ fn action(form: &mut Form, edges: &Edges, robot: &Robot) {
         "unit",
         said.unit.as_deref().map(text),
         "\"rad\"",
-        "of what the robot gets",
+        "unit of the robot's command",
     );
     form.field(
         "interface",
@@ -252,7 +252,7 @@ fn action(form: &mut Form, edges: &Edges, robot: &Robot) {
         "scale",
         said.scale.as_ref().map(each),
         "0.25",
-        "1 for nothing",
+        "factor of the policy's number; 1 for none",
     );
     let posture = robot.default_position.clone().map(Each::Many);
     let example = posture.as_ref().map_or("0".into(), each);
@@ -260,7 +260,7 @@ fn action(form: &mut Form, edges: &Edges, robot: &Robot) {
         "offset",
         said.offset.as_ref().map(each),
         &example,
-        "for example the default posture; 0 for nothing",
+        "added after scaling, for example the default posture; 0 for none",
     );
     form.field(
         "min",
@@ -268,7 +268,7 @@ fn action(form: &mut Form, edges: &Edges, robot: &Robot) {
         "-1.0",
         "the smallest value that the robot may get",
     );
-    form.field("max", said.max.as_ref().map(each), "1.0", "the largest");
+    form.field("max", said.max.as_ref().map(each), "1.0", "the largest value that the robot may get");
     match &said.clip {
         Some(bounds) => form.line(format_args!("clip = {}", clip(bounds))),
         None => form.line("# clip = [-100, 100]   # of the raw output, if training had one"),

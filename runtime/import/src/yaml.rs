@@ -95,7 +95,7 @@ enum Open {
 pub(crate) fn read(text: &str) -> Result<Value, String> {
     let mut reader = Reader::default();
     for event in Parser::new_from_str(text) {
-        let (event, _) = event.map_err(|error| format!("is no YAML: {error}"))?;
+        let (event, _) = event.map_err(|error| format!("is not YAML: {error}"))?;
         match event {
             Event::Scalar(text, style, anchor, _) => reader.value(scalar(&text, style), anchor)?,
             Event::SequenceStart(anchor, _) => reader.open(Open::List(vec![]), anchor)?,

@@ -63,11 +63,11 @@ fn contradictions_are_told_with_both_sides() {
         ),
         (
             format!("{HEAD}[[term]]\nname = \"a\"\nclip = [2, 1]\n{SENSOR}{action}"),
-            "is 2 to 1, which is no range",
+            "is 2 to 1, which is not a range",
         ),
         (
             format!("{HEAD}[[term]]\nname = \"a\"\nscale = nan\n{SENSOR}{action}"),
-            "no finite number",
+            "not a finite number",
         ),
         // The default posture of positions is never guessed.
         (
@@ -103,7 +103,7 @@ fn contradictions_are_told_with_both_sides() {
             format!(
                 "{HEAD}[[term]]\nname = \"a\"\n{SENSOR}{action}[[state]]\ninput = \"h\"\noutput = \"h\"\n"
             ),
-            "\"h\" is none of them; there are obs",
+            "\"h\" is not one of them; there are obs",
         ),
         (
             format!("{HEAD}[[term]]\nname = \"last_action\"\n{action}"),
@@ -310,8 +310,8 @@ fn weights_beside_the_model_are_brought_in_and_never_from_elsewhere() {
             &[("offset", "18446744073709551615")],
             "needs bytes 18446744073709551615",
         ),
-        ("policy.onnx.data", &[("offset", "-1")], "no number"),
-        (".", &[], "is no file"),
+        ("policy.onnx.data", &[("offset", "-1")], "not a number"),
+        (".", &[], "is not a file"),
     ] {
         let case = Case::new(&external(location, extra), &robot);
         case.put("policy.onnx.data", &weights);
@@ -362,7 +362,7 @@ fn broken_graphs_are_refused_by_name() {
         ),
         (
             policy(scaled.clone(), vec![weight("w", &[1], &[f32::NAN])]),
-            "weight `w`: holds a value that is no finite number",
+            "weight `w`: holds a value that is not a finite number",
         ),
         (
             policy(

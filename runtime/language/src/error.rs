@@ -68,10 +68,10 @@ pub enum LanguageError {
         has: String,
     },
     /// The sentence has no words.
-    #[error("'{0}': an empty sentence; say what is to be done")]
+    #[error("'{0}': an empty sentence; give an instruction")]
     Empty(String),
     /// The sentence is longer than the policy or the encoder takes.
-    #[error("'{text}': {got} word pieces, {who} hears at most {most}; say it in fewer words")]
+    #[error("'{text}': {got} word pieces, {who} takes at most {most}; use fewer words")]
     TooLong {
         /// The sentence, or its beginning.
         text: String,

@@ -180,7 +180,7 @@ fn environment(reference: &Reference, replayed: &[Replayed]) -> Physics {
         let otherwise = if ours != theirs {
             format!("the environment ended after {ours} states, the reference's after {theirs}")
         } else if !ended {
-            format!("the environment goes on after {ours} states, the reference's ended")
+            format!("the environment continues after {ours} states, the reference's ended")
         } else {
             continue;
         };

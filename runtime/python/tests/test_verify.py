@@ -197,7 +197,7 @@ def test_certificates_are_written(tmp_path):
         found.write(tmp_path / "nowhere/a.html")
 
 
-@pytest.mark.parametrize(("more", "text"), [(-10, "the environment ended after 31 states, the reference's after 41"), (10, "the environment goes on after 41 states, the reference's ended")])
+@pytest.mark.parametrize(("more", "text"), [(-10, "the environment ended after 31 states, the reference's after 41"), (10, "the environment continues after 41 states, the reference's ended")])
 def test_an_environment_that_ends_otherwise(tmp_path, more, text):
     policy, opened, _ = exported("recurrent", tmp_path)
 

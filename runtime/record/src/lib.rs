@@ -106,10 +106,10 @@ pub enum LogError {
     #[error("it cannot be read ({0})")]
     Io(#[from] std::io::Error),
     /// The file is not an MCAP file, or truncated, or damaged.
-    #[error("it is no whole MCAP file ({0}); record it again")]
+    #[error("it is not a complete MCAP file ({0}); record it again")]
     Mcap(#[from] mcap::McapError),
     /// The file is MCAP, but not a log that [`write()`] makes.
-    #[error("it is no log of lads ({0}); record one with lads-run --log")]
+    #[error("it is not a log of lads ({0}); record one with lads-run --log")]
     Foreign(String),
 }
 

@@ -195,7 +195,7 @@ fn take(topic: usize, data: &[u8], flights: &mut Vec<Flight>) -> Result<(), LogE
 fn begun(start: EpisodeMessage) -> Result<Flight, LogError> {
     let seed = |seed: Option<String>| {
         let seed = seed.as_deref().map(str::parse).transpose();
-        seed.map_err(|_| foreign("a seed is no number"))
+        seed.map_err(|_| foreign("a seed is not a number"))
     };
     let (sampling_seed, noise_seed) = (seed(start.sampling_seed)?, seed(start.noise_seed)?);
     Ok(Flight {

@@ -70,7 +70,7 @@ impl Display for Foreign<'_> {
         let opset = survey.opset.map(|set| format!(", operator set {set}"));
         writeln!(
             f,
-            "{}: an ONNX model that is no policy yet{}, {} nodes",
+            "{}: an ONNX model that is not a policy yet{}, {} nodes",
             self.path.display(),
             opset.unwrap_or_default(),
             survey.nodes

@@ -182,11 +182,11 @@ impl Report<'_> {
         let controller = Self::controller_bytes();
         writeln!(
             f,
-            "  workspace  {workspace:>9}: arena {arena}, state {state}, guard {guard}, the rest what C keeps beside them"
+            "  workspace  {workspace:>9}: arena {arena}, state {state}, guard {guard}, the rest bookkeeping of the C interface"
         )?;
         writeln!(
             f,
-            "  controller {controller:>9}, beside arena and state, in Rust"
+            "  controller {controller:>9}, besides arena and state, in Rust"
         )?;
         writeln!(
             f,

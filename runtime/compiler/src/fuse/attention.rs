@@ -259,7 +259,7 @@ fn causal(g: &Graph, scores: &Scores, k: Id) -> Result<(), String> {
         data,
         square || (n == 1 && shape.iter().all(|&dim| dim == 1)),
     ) else {
-        return Err(format!("the mask {shape:?} is no constant [{n}, {n}]"));
+        return Err(format!("the mask {shape:?} is not a constant [{n}, {n}]"));
     };
     let triangular = (0..n).all(|i| {
         (0..n).all(|j| {
@@ -304,7 +304,7 @@ fn scores(g: &mut Graph, mut at: Id) -> Result<Scores, String> {
     }
     expect(
         *g.op(at) == Op::MatMul,
-        "the scores are no scaled product of queries and keys",
+        "the scores are not a scaled product of queries and keys",
     )?;
     let &[mut q, keys] = &g.node(at).inputs[..] else {
         return Err("a product has two operands".into());

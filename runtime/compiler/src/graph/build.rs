@@ -261,7 +261,7 @@ impl Graph {
         sorted.sort_unstable();
         if !sorted.into_iter().eq(0..rank) {
             return Err(format!(
-                "{perm:?} is no permutation of the axes of {}",
+                "{perm:?} is not a permutation of the axes of {}",
                 show(self.shape(x))
             ));
         }
@@ -425,7 +425,7 @@ impl Graph {
     pub fn linear(&mut self, op: Op, inputs: Vec<Id>) -> Built {
         let mut shape = self.shape(inputs[0]).to_vec();
         let n = self.axis_len(inputs[1], 1)?;
-        *shape.last_mut().ok_or("a scalar is no row")? = n;
+        *shape.last_mut().ok_or("a scalar is not a row")? = n;
         Ok(self.add(op, inputs, shape, Type::F32))
     }
 

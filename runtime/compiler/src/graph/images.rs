@@ -112,7 +112,7 @@ impl Graph {
         let n = *self
             .shape(inputs[2])
             .first()
-            .ok_or("has a bias that is no vector")?;
+            .ok_or("has a bias that is not a vector")?;
         let shape = self.windowed(inputs[0], conv.windows.out, n)?;
         self.fold(Op::Conv(conv), inputs, shape, Type::F32)
     }
@@ -120,7 +120,7 @@ impl Graph {
     /// Adds a pooling, [`Op::Pool`].
     pub fn pool(&mut self, kind: PoolKind, windows: Windows, x: Id) -> Result<Id, String> {
         self.floats(&[x])?;
-        let channels = *self.shape(x).last().ok_or("a scalar is no image")?;
+        let channels = *self.shape(x).last().ok_or("a scalar is not an image")?;
         let shape = self.windowed(x, windows.out, channels)?;
         self.fold(Op::Pool(Kind(kind), windows), vec![x], shape, Type::F32)
     }
@@ -133,7 +133,7 @@ impl Graph {
                 .and_then(|shape| shape.first().copied())
         };
         let out = [len(rows), len(cols)].map(|len| len.unwrap_or(0));
-        let channels = *self.shape(x).last().ok_or("a scalar is no image")?;
+        let channels = *self.shape(x).last().ok_or("a scalar is not an image")?;
         let shape = self.windowed(x, out, channels)?;
         self.fold(Op::Resize, vec![x, rows, cols], shape, Type::F32)
     }

@@ -50,7 +50,7 @@ pub(crate) fn trial(graph: &GraphProto, opset: i64, declared: &Declared) -> Vec<
             }
             if attempt.builder.graph.ids().len() > MAX_NODES {
                 let problem =
-                    format!("ends what is tried: there are more than {MAX_NODES} operations");
+                    format!("ends the trial: there are more than {MAX_NODES} operations");
                 refused.push((usize::MAX, attempt.refused(node, problem)));
                 break;
             }

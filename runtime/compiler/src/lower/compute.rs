@@ -74,7 +74,7 @@ impl Lowering<'_, '_> {
             Op::FromIndex => self.number_of(id, x[0]),
             Op::ArgMin => self.arg(id, x[0], |x, out| ArgMin { x, out }.into()),
             Op::ArgMax => self.arg(id, x[0], |x, out| ArgMax { x, out }.into()),
-            Op::Shift(_) => Err("adds to an integer that is none".into()),
+            Op::Shift(_) => Err("adds to a value that is not an integer".into()),
         }
     }
 

@@ -78,7 +78,7 @@ impl<'s> Weights<'s> {
     pub fn packed(&mut self, tensor: &Arc<Tensor>, node: &str) -> Result<Packed, String> {
         let data = tensor.as_f32().ok_or("reads integers as numbers")?;
         let &[k, n] = &tensor.shape[..] else {
-            return Err("has weights that are no matrix".into());
+            return Err("has weights that are not a matrix".into());
         };
         // One step for inputs of any size would be too coarse for the small ones.
         let asked = self.storage.of(self.entry, node);
@@ -157,7 +157,7 @@ impl<'s> Weights<'s> {
     pub fn windows(&mut self, tensor: &Arc<Tensor>, groups: usize) -> Result<WeightSpan, String> {
         let data = tensor.as_f32().ok_or("reads integers as numbers")?;
         let &[k, all] = &tensor.shape[..] else {
-            return Err("has weights that are no matrix".into());
+            return Err("has weights that are not a matrix".into());
         };
         self.once(tensor, Form::Windows(groups), |this| {
             let n = all / groups;
@@ -179,7 +179,7 @@ impl<'s> Weights<'s> {
     pub fn channels(&mut self, tensor: &Arc<Tensor>) -> Result<WeightSpan, String> {
         let data = tensor.as_f32().ok_or("reads integers as numbers")?;
         let &[kernel, c] = &tensor.shape[..] else {
-            return Err("has weights that are no matrix".into());
+            return Err("has weights that are not a matrix".into());
         };
         self.once(tensor, Form::Channels, |this| {
             let mut packed = vec![0.0; depthwise_packed_len([kernel, c])];

@@ -38,7 +38,7 @@ pub(crate) fn fields(bytes: &[u8]) -> Result<Vec<Field<'_>>, BundleError> {
         // A file that fails in its first field never was a model; later, it was cut off.
         let Some(key) = varint(bytes, &mut at) else {
             return Err(if fields.is_empty() {
-                not_onnx("its first bytes are no field")
+                not_onnx("its first bytes are not a field")
             } else {
                 cut(bytes.len() as u64 + 1)
             });

@@ -72,8 +72,8 @@ impl fmt::Display for ScheduleError {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         match self {
             Self::TooMany => f.write_str("there are more states or steps than an image may have"),
-            Self::State { state } => write!(f, "state {state} makes no sense"),
-            Self::Entry { entry } => write!(f, "entry {entry} makes no sense"),
+            Self::State { state } => write!(f, "state {state} is invalid"),
+            Self::Entry { entry } => write!(f, "entry {entry} is invalid"),
             Self::Program { entry, error } => write!(f, "entry {entry}, {error}"),
             Self::Port {
                 entry,
@@ -86,7 +86,7 @@ impl fmt::Display for ScheduleError {
                     "entry {entry}, {side} {port} is bound to nothing that fits"
                 )
             }
-            Self::Call { call } => write!(f, "call {call} of the schedule makes no sense"),
+            Self::Call { call } => write!(f, "call {call} of the schedule is invalid"),
             Self::NothingSelected => f.write_str("an index is read before one is selected"),
             Self::NoAction { timestep } => {
                 write!(f, "the step at timestep {timestep} writes no action")

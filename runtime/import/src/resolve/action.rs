@@ -39,7 +39,7 @@ pub(crate) fn resolve(
     if said.unit.is_none() {
         problems.add(
             "action.unit",
-            "is not said: of what the robot gets, for example \"rad\"",
+            "is not given: the unit of the robot's command, for example \"rad\"",
         );
     }
     let limits = limits(
@@ -53,16 +53,16 @@ pub(crate) fn resolve(
         (
             "action.scale",
             said.scale.is_none(),
-            "what the policy's number is multiplied with; 1 for nothing",
+            "the factor of the policy's number; 1 for none",
         ),
         (
             "action.offset",
             said.offset.is_none(),
-            "what is added to it then, for example the default posture; 0 for nothing",
+            "the number that is added after scaling, for example the default posture; 0 for none",
         ),
     ] {
         if missing {
-            problems.add(field, format!("is not said: {what}"));
+            problems.add(field, format!("is not given: {what}"));
         }
     }
     let scale = spread(said.scale.as_ref(), width, "action.scale", problems);
@@ -117,7 +117,7 @@ fn output<'e>(edges: &'e Edges, robot: &Robot, problems: &mut Problems) -> Optio
             let names: Vec<String> = outputs.iter().map(|edge| edges.name(edge)).collect();
             problems.add(
                 "action.output",
-                format!("is not said: which of {} is the action", names.join(", ")),
+                format!("is not given: which of {} is the action", names.join(", ")),
             );
             None
         }

@@ -32,7 +32,7 @@ impl Joints {
         } else if policy.is_empty() && robot.joint_ids_map.is_some() {
             problems.add(
                 "robot_joints",
-                "is not said: the names of all of the robot's joints in its own order, in which `joint_ids_map` numbers them",
+                "is not given: the names of all of the robot's joints in its own order, in which `joint_ids_map` numbers them",
             );
         }
         for (field, names) in [
@@ -92,7 +92,7 @@ pub(crate) fn spread(
         .iter()
         .find(|value| !value.is_finite() || value.abs() > 1e30)
     {
-        problems.add(about, format!("holds {value}, which is no finite number"));
+        problems.add(about, format!("holds {value}, which is not a finite number"));
         return None;
     }
     Some(values)
@@ -112,7 +112,7 @@ pub(crate) fn bounds(
     let low = spread(Some(&low), width, about, problems)?;
     let high = spread(Some(&high), width, about, problems)?;
     if let Some((low, high)) = low.iter().zip(&high).find(|(low, high)| low >= high) {
-        problems.add(about, format!("is {low} to {high}, which is no range"));
+        problems.add(about, format!("is {low} to {high}, which is not a range"));
         return None;
     }
     Some((low, high))
@@ -132,7 +132,7 @@ pub(crate) fn limits(
         if each.is_none() {
             problems.add(
                 &about,
-                format!("is not said: the {what} value of each of {width} elements, or one for all{unit}"),
+                format!("is not given: the {what} value of each of {width} elements, or one for all{unit}"),
             );
         }
         spread(each, width, &about, problems)

@@ -50,7 +50,7 @@ fn phase(context: &mut Context, term: &robot::Term, about: &str) -> Option<Sourc
     let Some(phase) = &term.phase else {
         context.problems.add(
             format!("{about}.phase"),
-            "is not said: `{ period_s = 0.8, elements = [{ of = \"sin\" }, { of = \"cos\" }] }`",
+            "is not given: `{ period_s = 0.8, elements = [{ of = \"sin\" }, { of = \"cos\" }] }`",
         );
         return None;
     };
@@ -92,7 +92,7 @@ fn sensor(context: &mut Context, term: &robot::Term, width: usize, about: &str) 
         if !context.joints.robot.contains(joint) {
             context.problems.add(
                 format!("{about}.joints"),
-                format!("names \"{joint}\", which is none of the robot's joints"),
+                format!("names \"{joint}\", which is not one of the robot's joints"),
             );
         }
     }
@@ -125,7 +125,7 @@ fn sensor(context: &mut Context, term: &robot::Term, width: usize, about: &str) 
             if term.unit.is_none() {
                 context.problems.add(
                     format!("{about}.unit"),
-                    "is not said: of what the sensor gives, for example \"rad/s\"; \"1\" for none",
+                    "is not given: the unit of the sensor's values, for example \"rad/s\"; \"1\" for none",
                 );
             }
             let limits = limits(
@@ -160,7 +160,7 @@ fn gravity(context: &mut Context, term: &robot::Term, about: &str) -> Option<Sou
     let Some(order) = context.robot.quaternion_order else {
         context.problems.add(
             "quaternion_order",
-            "is not said: \"wxyz\" or \"xyzw\", how the orientation is given from which gravity follows",
+            "is not given: \"wxyz\" or \"xyzw\", how the orientation is given from which gravity follows",
         );
         return None;
     };
@@ -300,7 +300,7 @@ pub(super) fn check_channels(channels: &[Channel], problems: &mut Problems) {
     if channels.is_empty() && problems.is_empty() {
         problems.add(
             "term",
-            "no term comes from the caller; a policy observes something",
+            "no term comes from the caller; a policy needs an observation",
         );
     }
     for channel in channels {

@@ -145,7 +145,7 @@ fn stack(
         if missing {
             context.problems.add(
                 format!("history.{field}"),
-                format!("is not said, and {about} reads {longest} steps: {what}"),
+                format!("is not given, and {about} reads {longest} steps: {what}"),
             );
         }
     }
@@ -207,7 +207,7 @@ fn resolved(
     if positions && offset.is_none() {
         context.problems.add(
             format!("{about}.offset"),
-            "is not said: the joint positions that the policy sees as 0, in its own order (its default posture), or 0 if it sees positions as they are",
+            "is not given: the joint positions that the policy sees as 0, in its own order (its default posture), or 0 if it sees positions as they are",
         );
     }
     let number =

@@ -31,7 +31,7 @@ pub(super) fn widths(
     }
     let open: Vec<usize> = (0..widths.len()).filter(|&i| widths[i].is_none()).collect();
     for &i in &open {
-        let wanted = "how many elements it has is not said: `width`, `elements` (their names) or `per_joint = true`";
+        let wanted = "how many elements it has is not given: `width`, `elements` (their names) or `per_joint = true`";
         context
             .problems
             .add(format!("term.{}", terms[i].0.name), wanted);
