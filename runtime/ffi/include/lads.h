@@ -9,7 +9,7 @@
 #include <stddef.h>
 #include <stdint.h>
 /**
- * What came of a call; 0 is good. The numbers are stable: none ever changes its meaning.
+ * Result of a call; 0 means success. The numbers are stable: no number ever changes its meaning.
  */
 enum lads_status
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
@@ -25,11 +25,11 @@ enum lads_status
      */
     LADS_STATUS_NULL = 1,
     /**
-     * A pointer is not aligned as its type or the documentation asks.
+     * A pointer does not have the alignment that its type or the documentation requires.
      */
     LADS_STATUS_MISALIGNED = 2,
     /**
-     * A length is larger than memory can be.
+     * A length exceeds the address space.
      */
     LADS_STATUS_TOO_LONG = 3,
     /**
@@ -41,7 +41,7 @@ enum lads_status
      */
     LADS_STATUS_NOT_SET_UP = 6,
     /**
-     * A struct's struct_bytes is not set, or not a size that it can have.
+     * A struct's struct_bytes is not set, or not a valid size.
      */
     LADS_STATUS_STRUCT_BYTES = 7,
     /**
@@ -85,7 +85,7 @@ enum lads_status
      */
     LADS_STATUS_UNKNOWN_INSTRUCTION = 30,
     /**
-     * The words are none, too many, or no whole number of word embeddings.
+     * There are no words, too many, or not a whole number of word embeddings.
      */
     LADS_STATUS_WORDS_LENGTH = 31,
     /**
@@ -93,15 +93,15 @@ enum lads_status
      */
     LADS_STATUS_WORDS_NOT_FINITE = 32,
     /**
-     * The instruction could not be taken in; there is no instruction now.
+     * The instruction could not be processed; no instruction is set now.
      */
     LADS_STATUS_INSTRUCT_FAILED = 33,
     /**
-     * The channel has no element of this number.
+     * The channel has no element with this number.
      */
     LADS_STATUS_NO_ELEMENT = 34,
     /**
-     * The policy has no channel of this number or name.
+     * The policy has no channel with this number or name.
      */
     LADS_STATUS_NO_CHANNEL = 35,
     /**
@@ -181,15 +181,15 @@ enum lads_status
      */
     LADS_STATUS_LATE = 64,
     /**
-     * The timestamp lies farther behind the last one than can be.
+     * The timestamp is further ahead of the last one than max_jump allows.
      */
     LADS_STATUS_JUMP = 65,
     /**
-     * A flag, a rule or a fallback has no meaning to this library.
+     * A flag, a rule or a fallback is unknown to this library.
      */
     LADS_STATUS_UNKNOWN_OPTION = 70,
     /**
-     * The limits of an action element leave nothing of the contract's range.
+     * The limits of an action element do not overlap the contract's range.
      */
     LADS_STATUS_GUARD_LIMITS = 71,
     /**
@@ -205,11 +205,11 @@ enum lads_status
      */
     LADS_STATUS_GUARD_TIME_CONSTANT = 74,
     /**
-     * A channel of the observation is not given, or the policy has more than one.
+     * A channel of the observation is missing, or the policy has more than one.
      */
     LADS_STATUS_CHANNEL_MISSING = 80,
     /**
-     * A channel is given that is none of the observation, or is given twice.
+     * A channel is given that is not an observation channel, or is given twice.
      */
     LADS_STATUS_CHANNEL_UNKNOWN = 81,
     /**
@@ -217,7 +217,7 @@ enum lads_status
      */
     LADS_STATUS_CHANNEL_TYPE = 82,
     /**
-     * The rows of a channel do not lie one behind the other.
+     * The rows of a channel are not contiguous.
      */
     LADS_STATUS_CHANNEL_ROWS = 83,
     /**
@@ -253,128 +253,133 @@ typedef int32_t lads_status;
 #define LADS_WORKSPACE_ALIGN 64
 
 /**
- * Stack that a call of the library takes at most, in bytes: measured on x86-64 with all functions of the archive.
+ * Largest stack, in bytes, that a call of the library takes: measured on x86-64 with all functions
+ * of the archive.
  */
 #define LADS_STACK_BYTES 7896
 
 /**
- * No channel, element or other number: stands where there is none.
+ * Number that stands for no channel, element or other index.
  */
 #define LADS_NONE UINT32_MAX
 
 /**
- * Words of a `lads_policy`.
+ * Number of 64-bit words of a `lads_policy`.
  */
 #define LADS_POLICY_WORDS 96
 
 /**
- * At a full context: it starts again behind the instruction, at timestep 0, and the policy goes on.
+ * Behaviour at a full context: it restarts after the instruction, at timestep 0, and the policy
+ * continues.
  */
 #define LADS_BEYOND_RESTART 0
 
 /**
- * At a full context: the step is refused (`LADS_STATUS_CONTEXT_FULL`) until `lads_reset` or an instruction.
+ * Behaviour at a full context: the step is refused (`LADS_STATUS_CONTEXT_FULL`) until `lads_reset`
+ * or an instruction.
  */
 #define LADS_BEYOND_REFUSE 1
 
 /**
- * Role: given by the caller in every control step.
+ * Role of a channel that the caller gives in every control step.
  */
 #define LADS_ROLE_OBSERVATION 0
 
 /**
- * Role: written by every control step.
+ * Role of a channel that every control step writes.
  */
 #define LADS_ROLE_ACTION 1
 
 /**
- * Role: word embeddings, `[words, elements]`.
+ * Role of a channel of word embeddings, `[words, elements]`.
  */
 #define LADS_ROLE_INSTRUCTION 2
 
 /**
- * Role: random numbers, drawn by the library unless `lads_step_channels` is given them.
+ * Role of a channel of random numbers, drawn by the library unless `lads_step_channels` is given
+ * them.
  */
 #define LADS_ROLE_NOISE 3
 
 /**
- * Role: a piece of a demonstration.
+ * Role of a channel that holds a piece of a demonstration.
  */
 #define LADS_ROLE_DEMONSTRATION 4
 
 /**
- * Type: 32-bit floats.
+ * Type of 32-bit floats.
  */
 #define LADS_F32 0
 
 /**
- * Type: bytes, such as the pixels of a camera.
+ * Type of bytes, such as the pixels of a camera.
  */
 #define LADS_U8 1
 
 /**
- * Type: signed 32-bit integers.
+ * Type of signed 32-bit integers.
  */
 #define LADS_I32 2
 
 /**
- * Quaternions: there are none in the channel.
+ * Order of quaternions for a channel without any.
  */
 #define LADS_QUATERNIONS_NONE 0
 
 /**
- * Quaternions: scalar first.
+ * Order of quaternions with the scalar first.
  */
 #define LADS_QUATERNIONS_WXYZ 1
 
 /**
- * Quaternions: scalar last.
+ * Order of quaternions with the scalar last.
  */
 #define LADS_QUATERNIONS_XYZW 2
 
 /**
- * The most axes of a channel.
+ * Largest number of axes of a channel.
  */
 #define LADS_MAX_RANK 4
 
 /**
- * Flag: arm when the controller is set up, without a self-test. Whoever sets it vouches for the policy on this machine.
+ * Flag that arms the controller when it is set up, without a self-test. The caller who sets it
+ * vouches for the policy on this machine.
  */
 #define LADS_ARM_WITHOUT_SELF_TEST 1
 
 /**
- * Flag: run the same machine code on every processor of the target instead of the widest instructions that this one has.
- * The results have the same bits.
+ * Flag that runs the same machine code on every processor of the target instead of the widest
+ * instruction set of this one. The results have the same bits.
  */
 #define LADS_PORTABLE_INSTRUCTIONS 2
 
 /**
- * Fallback: to the safe action, and stay there until `lads_resume`.
+ * Fallback that moves to the safe action and stays there until `lads_resume`.
  */
 #define LADS_FALLBACK_STOP 0
 
 /**
- * Fallback: the last action again.
+ * Fallback that repeats the last action.
  */
 #define LADS_FALLBACK_HOLD 1
 
 /**
- * Fallback: towards the safe action with the time constant `decay_s`.
+ * Fallback that moves towards the safe action with the time constant `decay_s`.
  */
 #define LADS_FALLBACK_DECAY 2
 
 /**
- * Noise: zeros, the mean of what would be drawn.
+ * Noise of zeros, the mean of the standard normal distribution.
  */
 #define LADS_NOISE_ZERO 0
 
 /**
- * Noise: standard normals; the same seed gives the same values on every target.
+ * Noise of standard normal numbers; the same seed gives the same values on every target.
  */
 #define LADS_NOISE_SEEDED 1
 
 /**
- * A controller with its guard, at the start of its workspace. Private.
+ * A controller with its guard, at the start of its workspace; its content is private. Private.
  */
 typedef struct lads_controller lads_controller;
 
@@ -384,47 +389,47 @@ typedef struct lads_controller lads_controller;
  */
 typedef struct lads_policy {
     /**
-     * Private.
+     * Private content of the policy.
      */
     uint64_t private_words[LADS_POLICY_WORDS];
 } lads_policy;
 
 /**
- * Characters in UTF-8, without a zero at the end: print them with "%.*s", (int)text.len, text.data.
+ * Text in UTF-8, without a zero at the end: print it with "%.*s", (int)text.len, text.data.
  */
 typedef struct lads_text {
     /**
-     * The first character; never null in what a call has written.
+     * Pointer to the first character; never null after a call wrote it.
      */
     const char *data;
     /**
-     * Bytes.
+     * Number of bytes.
      */
     size_t len;
 } lads_text;
 
 /**
- * What a policy expects and promises.
+ * Contract of a policy: its sizes, numbers of channels and texts.
  */
 typedef struct lads_contract {
     /**
-     * Set to `sizeof(lads_contract)` before the call.
+     * Size of the struct: set it to `sizeof(lads_contract)` before the call.
      */
     uint32_t struct_bytes;
     /**
-     * Time from one control step to the next, in seconds.
+     * Control period, the time from one control step to the next, in seconds.
      */
     float control_period_s;
     /**
-     * Family of policies, for example "lads": to be shown, nothing depends on it.
+     * Name of the family of policies, for example "lads"; informational, nothing depends on it.
      */
     struct lads_text family;
     /**
-     * Environment, for example "franka-kitchen".
+     * Name of the environment, for example "franka-kitchen".
      */
     struct lads_text environment;
     /**
-     * The environment's version.
+     * Version of the environment.
      */
     struct lads_text environment_version;
     /**
@@ -436,19 +441,20 @@ typedef struct lads_contract {
      */
     struct lads_text encoder;
     /**
-     * SHA-256 of its weights, hexadecimal.
+     * SHA-256 of the language encoder's weights, hexadecimal.
      */
     struct lads_text encoder_sha256;
     /**
-     * Channels, see `lads_channel`.
+     * Number of channels, see `lads_channel`.
      */
     uint32_t channel_count;
     /**
-     * Channels that are given in every control step; `lads_step` takes a single one, `lads_step_channels` any number.
+     * Number of channels that are given in every control step; `lads_step` takes a single one,
+     * `lads_step_channels` any number.
      */
     uint32_t observation_count;
     /**
-     * Number of the first of them.
+     * Number of the first observation channel.
      */
     uint32_t observation;
     /**
@@ -460,90 +466,94 @@ typedef struct lads_contract {
      */
     uint32_t instruction;
     /**
-     * Instructions that the policy knows by number.
+     * Number of instructions that the policy knows.
      */
     uint32_t instruction_count;
     /**
-     * Elements of the first observation channel.
+     * Number of elements of the first observation channel.
      */
     size_t observation_len;
     /**
-     * Elements of an action.
+     * Number of elements of an action.
      */
     size_t action_len;
     /**
-     * The most words of an instruction; 0 for a policy that takes none.
+     * Largest number of words of an instruction; 0 for a policy that takes none.
      */
     size_t words_len;
     /**
-     * Elements of a word embedding.
+     * Number of elements of a word embedding.
      */
     size_t word_dim;
     /**
-     * Similarity to a known instruction from which other sentences may be followed, see `lads_instruction_similarity`; above 1
-     * when none may be.
+     * Smallest similarity to a known instruction at which another sentence may be followed, see
+     * `lads_instruction_similarity`; above 1 if none may be.
      */
     float acceptance;
     /**
-     * Control steps that a context holds; 0 for no such bound.
+     * Number of control steps that a context holds; 0 if it is unbounded.
      */
     uint32_t context_steps;
     /**
-     * What happens after them: `LADS_BEYOND_RESTART` or `LADS_BEYOND_REFUSE`.
+     * Behaviour after that many control steps: `LADS_BEYOND_RESTART` or `LADS_BEYOND_REFUSE`.
      */
     uint32_t beyond;
     /**
-     * Indices, such as those of latent plans, that the policy selects from; 0 for one that selects nothing.
+     * Number of indices, such as those of latent plans, that the policy selects from; 0 for one
+     * that selects nothing.
      */
     uint32_t index_count;
     /**
-     * Divides the scores when an index is picked at random, unless `lads_set_decision` says otherwise; 0 for argmax.
+     * Divisor of the scores when an index is picked at random, unless `lads_set_decision` sets
+     * another one; 0 for argmax.
      */
     float temperature;
     /**
-     * `LADS_NOISE_ZERO` or `LADS_NOISE_SEEDED`, unless `lads_set_noise` says otherwise.
+     * Source of noise, `LADS_NOISE_ZERO` or `LADS_NOISE_SEEDED`, unless `lads_set_noise` sets
+     * another one.
      */
     uint32_t noise;
     /**
-     * Of the picks at random.
+     * Seed of the random picks.
      */
     uint64_t decision_seed;
     /**
-     * Of the noise.
+     * Seed of the noise.
      */
     uint64_t noise_seed;
     /**
-     * Values of noise that a control step takes at most; 0 for a policy without noise.
+     * Largest number of values of noise that a control step takes; 0 for a policy without noise.
      */
     size_t noise_len;
     /**
-     * Bytes of the image; what lies behind them is not read.
+     * Size of the image in bytes; bytes after it are not read.
      */
     size_t image_bytes;
     /**
-     * Multiply-adds of the most expensive control step.
+     * Number of multiply-adds of the most expensive control step.
      */
     uint64_t worst_work;
 } lads_contract;
 
 /**
- * A channel: a value at the policy's edge.
+ * One channel: an input or output of the policy.
  */
 typedef struct lads_channel_t {
     /**
-     * Set to `sizeof(lads_channel_t)` before the call.
+     * Size of the struct: set it to `sizeof(lads_channel_t)` before the call.
      */
     uint32_t struct_bytes;
     /**
-     * `LADS_ROLE_OBSERVATION`, `_ACTION`, `_INSTRUCTION`, `_NOISE` or `_DEMONSTRATION`.
+     * Role of the channel: `LADS_ROLE_OBSERVATION`, `_ACTION`, `_INSTRUCTION`, `_NOISE` or
+     * `_DEMONSTRATION`.
      */
     uint32_t role;
     /**
-     * Type of its elements: `LADS_F32`, `LADS_U8` or `LADS_I32`.
+     * Type of the channel's elements: `LADS_F32`, `LADS_U8` or `LADS_I32`.
      */
     uint32_t dtype;
     /**
-     * Axes, 1 to 4.
+     * Number of axes, 1 to 4.
      */
     uint32_t rank;
     /**
@@ -551,34 +561,36 @@ typedef struct lads_channel_t {
      */
     uint32_t dims[LADS_MAX_RANK];
     /**
-     * Elements, in the order of the axes.
+     * Number of elements, which are in the order of the axes.
      */
     size_t len;
     /**
-     * Name.
+     * Name of the channel.
      */
     struct lads_text name;
     /**
-     * What its values are relative to, in words, such as "the observed joint position"; empty where the bundle does not say.
+     * Description of the reference that the values are relative to, such as "the observed joint
+     * position"; empty where the bundle does not say.
      */
     struct lads_text reference;
     /**
-     * `LADS_QUATERNIONS_NONE`, `_WXYZ` or `_XYZW`: order of the components of the quaternions in it.
+     * Order of the components of the channel's quaternions: `LADS_QUATERNIONS_NONE`, `_WXYZ` or
+     * `_XYZW`.
      */
     uint32_t quaternions;
     /**
-     * 1 when its elements have names and units, 0 for images and the like, whose elements are alike.
+     * 1 if the elements have names and units, 0 for images and the like, whose elements are alike.
      */
     uint32_t described;
 } lads_channel_t;
 
 /**
- * One element of a channel. Its physical value is reference + offset + scale * value, in the unit, where the reference is what
- * the channel's is for this joint.
+ * One element of a channel. Its physical value is reference + offset + scale * value, where the
+ * reference is the channel's for this joint.
  */
 typedef struct lads_element {
     /**
-     * Set to `sizeof(lads_element)` before the call.
+     * Size of the struct: set it to `sizeof(lads_element)` before the call.
      */
     uint32_t struct_bytes;
     /**
@@ -594,23 +606,24 @@ typedef struct lads_element {
      */
     float scale;
     /**
-     * Physical value of zero, on top of the channel's reference.
+     * Physical value for an element of zero, without the channel's reference.
      */
     float offset;
     /**
-     * Name; empty for an element of a channel without descriptions.
+     * Name of the element; empty for an element of a channel without descriptions.
      */
     struct lads_text name;
     /**
-     * Unit, "1" for none.
+     * Unit of the element; "1" for a dimensionless one.
      */
     struct lads_text unit;
     /**
-     * Joint that it belongs to; empty for none.
+     * Joint that the element belongs to; empty for none.
      */
     struct lads_text joint;
     /**
-     * What of the joint: "position", "velocity", "effort"; empty where the bundle does not say.
+     * Quantity of the joint: "position", "velocity", "effort"; empty where the bundle does not
+     * say.
      */
     struct lads_text interface;
 } lads_element;
@@ -620,38 +633,41 @@ typedef struct lads_element {
  */
 typedef struct lads_instruction {
     /**
-     * Set to `sizeof(lads_instruction)` before the call.
+     * Size of the struct: set it to `sizeof(lads_instruction)` before the call.
      */
     uint32_t struct_bytes;
     /**
-     * Short name.
+     * Short name of the instruction.
      */
     struct lads_text id;
     /**
-     * What the person says.
+     * The instruction as a person says it.
      */
     struct lads_text text;
     /**
-     * Words.
+     * Number of words.
      */
     size_t words_len;
 } lads_instruction;
 
 /**
- * How the guard works. All zero but the size (`lads_options options = {sizeof options};`) is a guard with the contract's limits and
- * no rate that stops at the first fault. The lists have `action_len` elements and are copied; null stands for the default.
+ * Options of a controller and its guard. All zero but the size
+ * (`lads_options options = {sizeof options};`) means a guard with the contract's limits and no
+ * rate limit that stops at the first fault. The lists have `action_len` elements and are copied;
+ * null means the default.
  */
 typedef struct lads_options {
     /**
-     * Set to `sizeof(lads_options)`.
+     * Size of the struct: set it to `sizeof(lads_options)`.
      */
     uint32_t struct_bytes;
     /**
-     * `LADS_ARM_WITHOUT_SELF_TEST`, `LADS_PORTABLE_INSTRUCTIONS`, or both.
+     * Flags: `LADS_ARM_WITHOUT_SELF_TEST`, `LADS_PORTABLE_INSTRUCTIONS`, or both.
      */
     uint32_t flags;
     /**
-     * What to do when the policy's action cannot be used: `LADS_FALLBACK_STOP`, `_HOLD` or `_DECAY`.
+     * Action to write when the policy's action cannot be used: `LADS_FALLBACK_STOP`, `_HOLD` or
+     * `_DECAY`.
      */
     uint32_t fallback;
     /**
@@ -659,63 +675,65 @@ typedef struct lads_options {
      */
     float decay_s;
     /**
-     * Missed control periods that are still tolerated between two steps.
+     * Number of missed control periods between two steps that is still tolerated.
      */
     uint32_t late_after;
     /**
-     * Periods in a row whose observation is missing, stale or refused, in which the last action is repeated and the policy's state is
-     * kept before the fallback takes over.
+     * Number of periods in a row whose observation is missing, stale or refused, in which the last
+     * action is repeated and the policy's state is kept before the fallback takes over.
      */
     uint32_t coast;
     /**
-     * Stops after so many interventions in a row; 0 for never.
+     * Number of interventions in a row after which the guard stops; 0 for never.
      */
     uint32_t stop_after;
     /**
-     * The farthest that a timestamp may lie behind the last one, in its unit; 0 for any distance. One beyond it is taken for damaged:
-     * it is refused, and does not count as the last one.
+     * Largest step from the last timestamp to the next, in its unit; 0 for any. A timestamp
+     * further ahead is considered corrupt: it is refused, and does not become the last one.
      */
     uint64_t max_jump;
     /**
-     * Smallest actions, where the contract's are not narrower.
+     * Smallest actions; the contract's apply where they are narrower.
      */
     const float *min;
     /**
-     * Largest actions, where the contract's are not narrower.
+     * Largest actions; the contract's apply where they are narrower.
      */
     const float *max;
     /**
-     * Largest change, in units of the action per second.
+     * Largest change, in units of the action per second; unlimited if null.
      */
     const float *max_rate;
     /**
-     * Where the stop and the decay lead, and where the first action starts from; zero, or the limit nearest to it, unless given.
+     * Action to which the stop and the decay lead, and from which the first action starts; if
+     * null, zero or the limit nearest to it.
      */
     const float *safe_action;
 } lads_options;
 
 /**
- * What happened in a call: in a control period, or when something was refused.
+ * Report of a call: the result of a control period, or the cause of a refusal.
  */
 typedef struct lads_report {
     /**
-     * Set to `sizeof(lads_report)` before the call.
+     * Size of the struct: set it to `sizeof(lads_report)` before the call.
      */
     uint32_t struct_bytes;
     /**
-     * What the call returned.
+     * Status that the call returned.
      */
     int32_t status;
     /**
-     * 1 when the policy took a step; the next five are 0 otherwise.
+     * 1 if the policy took a step; the next five fields are 0 otherwise.
      */
     uint32_t stepped;
     /**
-     * Control steps since the context began.
+     * Number of control steps since the context began.
      */
     uint32_t timestep;
     /**
-     * 1 when an index is in force; the next three are 0 otherwise, as for a policy that selects none.
+     * 1 if an index is in force; the next three fields are 0 otherwise, as for a policy that
+     * selects none.
      */
     uint32_t has_selected;
     /**
@@ -727,31 +745,32 @@ typedef struct lads_report {
      */
     float margin;
     /**
-     * 1 when this step selected the index, else 0.
+     * 1 if this step selected the index, else 0.
      */
     uint32_t fresh;
     /**
-     * 1 when the action is the last one again, because the options let so many observations be missed.
+     * 1 if the last action is repeated because the options tolerate this many missed observations.
      */
     uint32_t coasting;
     /**
-     * 1 when an element of the action was at a limit or beyond and is now at the limit.
+     * 1 if an element of the action was at a limit or beyond and is now at the limit.
      */
     uint32_t saturated;
     /**
-     * 1 when an element of the action moves as fast as it may, less far than it should.
+     * 1 if an element of the action moves as fast as it may, less far than it should.
      */
     uint32_t rate_limited;
     /**
-     * The channel that was refused; `LADS_NONE` when it was none.
+     * Number of the channel that was refused; `LADS_NONE` if none was.
      */
     uint32_t channel;
     /**
-     * The first of its elements that was refused, or the word element; `LADS_NONE` when it was none.
+     * Index of the first element of the channel that was refused, or of the word element;
+     * `LADS_NONE` if none was.
      */
     uint32_t element;
     /**
-     * That element's value, for `LADS_STATUS_OUT_OF_LIMITS`; 0 otherwise.
+     * Value of the refused element, for `LADS_STATUS_OUT_OF_LIMITS`; 0 otherwise.
      */
     float value;
     /**
@@ -765,15 +784,15 @@ typedef struct lads_report {
 } lads_report;
 
 /**
- * What a self-test has measured, or where it failed.
+ * Measurements of a self-test, or the place of its failure.
  */
 typedef struct lads_self_test_t {
     /**
-     * Set to `sizeof(lads_self_test_t)` before the call.
+     * Size of the struct: set it to `sizeof(lads_self_test_t)` before the call.
      */
     uint32_t struct_bytes;
     /**
-     * Control steps replayed; 0 when it failed, as are the next two.
+     * Number of control steps replayed; this and the next two fields are 0 if the test failed.
      */
     uint32_t steps;
     /**
@@ -786,19 +805,21 @@ typedef struct lads_self_test_t {
      */
     float largest_error;
     /**
-     * The first step that failed, counted from 0; `LADS_NONE` when none did.
+     * Number of the first step that failed, counted from 0; `LADS_NONE` if none did.
      */
     uint32_t failed_step;
     /**
-     * The element of the action that was off, for `LADS_STATUS_SELF_TEST_ACTION`; `LADS_NONE` otherwise.
+     * Index of the action's element that differed, for `LADS_STATUS_SELF_TEST_ACTION`; `LADS_NONE`
+     * otherwise.
      */
     uint32_t element;
     /**
-     * What is recorded there: the element's value, or the index for `LADS_STATUS_SELF_TEST_SELECTED`.
+     * Recorded value at the failure: the element's value, or the index for
+     * `LADS_STATUS_SELF_TEST_SELECTED`.
      */
     float expected;
     /**
-     * What this target computed there.
+     * Value that this target computed at the failure.
      */
     float got;
 } lads_self_test_t;
@@ -808,15 +829,16 @@ typedef struct lads_self_test_t {
  */
 typedef struct lads_tick {
     /**
-     * Set to `sizeof(lads_tick)`.
+     * Size of the struct: set it to `sizeof(lads_tick)`.
      */
     uint32_t struct_bytes;
     /**
-     * Control periods that have passed without a step since the last one.
+     * Number of control periods that have passed without a step since the last one.
      */
     uint32_t missed;
     /**
-     * When the observation was taken, in any unit. One that is not later than the last one is stale.
+     * Time at which the observation was taken, in any unit. An observation that is not later than
+     * the last one is stale.
      */
     uint64_t timestamp;
 } lads_tick;
@@ -830,87 +852,90 @@ typedef struct lads_input {
      */
     uint32_t channel;
     /**
-     * Type of the values, the channel's: `LADS_F32`, `LADS_U8` or `LADS_I32`.
+     * Type of the values, which is the channel's: `LADS_F32`, `LADS_U8` or `LADS_I32`.
      */
     uint32_t dtype;
     /**
-     * The values, one behind the other in the order of the channel's axes. Null says that there is no observation.
+     * Pointer to the values, contiguous and in the order of the channel's axes. Null means that
+     * there is no observation.
      */
     const void *data;
     /**
-     * How many values there are.
+     * Number of values.
      */
     size_t len;
     /**
-     * Bytes from one row to the next, a row being what the first axis counts, such as a line of an image: whoever takes pictures
-     * knows it. A line that is longer than its pixels is refused (`LADS_STATUS_CHANNEL_ROWS`), as the library has no memory to
-     * bring lines together in: copy them first. 0 says that there is no gap.
+     * Bytes from one row to the next, where the first axis counts rows, such as the lines of an
+     * image. A line that is longer than its pixels is refused (`LADS_STATUS_CHANNEL_ROWS`), as the
+     * library has no memory to pack lines into: copy them first. 0 means that there is no gap.
      */
     size_t row_bytes;
 } lads_input;
 
 /**
- * What a guard has done since the controller was set up, in control periods. `policy` to `refused` add up to `periods`.
+ * Counts of the guard since the controller was set up, in control periods. `policy` to `refused`
+ * add up to `periods`.
  */
 typedef struct lads_counters_t {
     /**
-     * Set to `sizeof(lads_counters_t)` before the call.
+     * Size of the struct: set it to `sizeof(lads_counters_t)` before the call.
      */
     uint32_t struct_bytes;
     /**
-     * All.
+     * Number of control periods.
      */
     uint64_t periods;
     /**
-     * With the policy's action.
+     * Number of periods with the policy's action.
      */
     uint64_t policy;
     /**
-     * Before arming.
+     * Number of periods before arming.
      */
     uint64_t not_armed;
     /**
-     * While stopped.
+     * Number of periods while stopped.
      */
     uint64_t stopped;
     /**
-     * Without an observation.
+     * Number of periods without an observation.
      */
     uint64_t no_observation;
     /**
-     * With a stale observation, or one whose timestamp jumps.
+     * Number of periods with a stale observation, or one whose timestamp jumps.
      */
     uint64_t stale;
     /**
-     * In which too many periods had been missed.
+     * Number of periods in which too many periods had been missed.
      */
     uint64_t late;
     /**
-     * With an observation that was not finite.
+     * Number of periods with an observation that was not finite.
      */
     uint64_t not_finite;
     /**
-     * With an observation outside the contract's limits.
+     * Number of periods with an observation outside the contract's limits.
      */
     uint64_t out_of_limits;
     /**
-     * That the controller refused for another reason: no instruction, a full context, a wrong length.
+     * Number of periods in which the controller refused for another reason: no instruction, a full
+     * context, a wrong length.
      */
     uint64_t refused;
     /**
-     * In which the last action was repeated; counted above as well.
+     * Number of periods in which the last action was repeated; also counted above.
      */
     uint64_t coasted;
     /**
-     * Missed periods.
+     * Number of missed periods.
      */
     uint64_t missed;
     /**
-     * With an action at a limit.
+     * Number of periods with an action at a limit.
      */
     uint64_t saturated;
     /**
-     * With an action that the rate held back.
+     * Number of periods with an action that the rate limit reduced.
      */
     uint64_t rate_limited;
 } lads_counters_t;
@@ -920,18 +945,19 @@ extern "C" {
 #endif // __cplusplus
 
 /**
- * `LADS_ABI_VERSION` of the archive: compare it with the header's.
+ * Returns the `LADS_ABI_VERSION` of the archive: compare it with the header's.
  */
 uint32_t lads_abi_version(void);
 
 /**
- * One line in English for a status; never null. The text is static and ends with a zero.
+ * Returns one line in English for a status; never null. The text is static and ends with a zero.
  */
 const char *lads_status_text(int32_t status);
 
 /**
- * Opens a program image: checks all of it, its checksum included, and copies nothing. The image is aligned to 4 bytes (64 is
- * better); bytes behind its own length are ignored. After a failure `policy` holds no policy.
+ * Opens a program image: checks all of it, its checksum included, and copies nothing. The image is
+ * aligned to 4 bytes (64 is better); bytes after its own length are ignored. After a failure
+ * `policy` holds no policy.
  *
  * # Safety
  * `image` points to `image_bytes` readable bytes that do not change as long as the policy or a controller of it is used;
@@ -942,11 +968,12 @@ lads_status lads_policy_open(const uint8_t *image,
                              struct lads_policy *policy);
 
 /**
- * As `lads_policy_open`, but refuses an image whose most expensive control step takes more than so many multiply-adds;
- * `lads_policy_open` refuses those that take some seconds on a fast core.
+ * Opens a program image, like `lads_policy_open`, but refuses one whose most expensive control
+ * step takes more than `work_limit` multiply-adds; `lads_policy_open` refuses images that take
+ * some seconds on a fast core.
  *
  * # Safety
- * As `lads_policy_open`.
+ * The conditions of `lads_policy_open` hold.
  */
 lads_status lads_policy_open_within(const uint8_t *image,
                                     size_t image_bytes,
@@ -954,7 +981,8 @@ lads_status lads_policy_open_within(const uint8_t *image,
                                     struct lads_policy *policy);
 
 /**
- * Tells what a policy expects and promises. The texts live as long as the image.
+ * Writes the contract of a policy: its sizes, numbers of channels and texts. The texts live as
+ * long as the image.
  *
  * # Safety
  * `policy` is null or a `lads_policy`, zeroed or opened; `contract` may be read and written.
@@ -962,7 +990,7 @@ lads_status lads_policy_open_within(const uint8_t *image,
 lads_status lads_policy_contract(const struct lads_policy *policy, struct lads_contract *contract);
 
 /**
- * How many channels a policy has; 0 when it was not opened.
+ * Returns the number of channels of a policy; 0 if it was not opened.
  *
  * # Safety
  * `policy` is null or a `lads_policy`, zeroed or opened.
@@ -970,10 +998,10 @@ lads_status lads_policy_contract(const struct lads_policy *policy, struct lads_c
 uint32_t lads_channel_count(const struct lads_policy *policy);
 
 /**
- * Tells about a channel by its number, from 0.
+ * Writes the description of a channel, by its number from 0.
  *
  * # Safety
- * As `lads_policy_contract`.
+ * The conditions of `lads_policy_contract` hold.
  */
 lads_status lads_channel(const struct lads_policy *policy, uint32_t number, struct lads_channel_t *channel);
 
@@ -981,15 +1009,19 @@ lads_status lads_channel(const struct lads_policy *policy, uint32_t number, stru
  * Finds the number of a channel by its name, byte for byte.
  *
  * # Safety
- * As `lads_policy_contract`; `name` points to `name_len` bytes, no zero needed; `number` may be written.
+ * The conditions of `lads_policy_contract` hold; `name` points to `name_len` bytes, no zero needed; `number` may be written.
  */
-lads_status lads_channel_find(const struct lads_policy *policy, const char *name, size_t name_len, uint32_t *number);
+lads_status lads_channel_find(const struct lads_policy *policy,
+                              const char *name,
+                              size_t name_len,
+                              uint32_t *number);
 
 /**
- * Tells about an element of a channel: name, unit, limits, joint, interface, and what its values mean.
+ * Writes the description of an element of a channel: name, unit, limits, joint, interface, and the
+ * meaning of its values.
  *
  * # Safety
- * As `lads_policy_contract`.
+ * The conditions of `lads_policy_contract` hold.
  */
 lads_status lads_channel_element(const struct lads_policy *policy,
                                  uint32_t channel,
@@ -997,10 +1029,10 @@ lads_status lads_channel_element(const struct lads_policy *policy,
                                  struct lads_element *element);
 
 /**
- * Tells about an instruction that the policy knows, by its number.
+ * Writes an instruction that the policy knows, by its number.
  *
  * # Safety
- * As `lads_policy_contract`.
+ * The conditions of `lads_policy_contract` hold.
  */
 lads_status lads_policy_instruction(const struct lads_policy *policy,
                                     uint32_t number,
@@ -1010,7 +1042,7 @@ lads_status lads_policy_instruction(const struct lads_policy *policy,
  * Finds the number of the instruction with this id, or of the first with this text, up to the case of ASCII letters and white space.
  *
  * # Safety
- * As `lads_policy_contract`; `name` points to `name_len` bytes, no zero needed; `number` may be written.
+ * The conditions of `lads_policy_contract` hold; `name` points to `name_len` bytes, no zero needed; `number` may be written.
  */
 lads_status lads_policy_find_instruction(const struct lads_policy *policy,
                                          const char *name,
@@ -1018,7 +1050,8 @@ lads_status lads_policy_find_instruction(const struct lads_policy *policy,
                                          uint32_t *number);
 
 /**
- * Bytes of workspace for one controller of a policy; 0 when the policy was not opened.
+ * Returns the number of bytes of workspace for one controller of a policy; 0 if the policy was not
+ * opened.
  *
  * # Safety
  * `policy` is null or a `lads_policy`, zeroed or opened.
@@ -1026,11 +1059,12 @@ lads_status lads_policy_find_instruction(const struct lads_policy *policy,
 size_t lads_workspace_bytes(const struct lads_policy *policy);
 
 /**
- * Sets up a controller with its guard in `workspace`, aligned to `LADS_WORKSPACE_ALIGN`, which need not be initialised.
- * `options` may be null; so may `controller`, the handle for the other functions, which is the address of the workspace; so may
- * `report`, which names the element of the action whose limits, rate or safe action were refused. The controller is not armed unless
- * `LADS_ARM_WITHOUT_SELF_TEST` is set. A refusal touches nothing of the workspace: a controller that runs there goes on. To end
- * a controller, stop using it: nothing has to be undone.
+ * Sets up a controller with its guard in `workspace`, aligned to `LADS_WORKSPACE_ALIGN`, which
+ * need not be initialised. `options` may be null; so may `controller`, the handle for the other
+ * functions, which is the address of the workspace; so may `report`, which names the element of
+ * the action whose limits, rate or safe action were refused. The controller is not armed unless
+ * `LADS_ARM_WITHOUT_SELF_TEST` is set. A refusal leaves the workspace untouched: a controller that
+ * runs there continues. To end a controller, stop using it: nothing has to be undone.
  *
  * # Safety
  * `policy` is null or a `lads_policy`, zeroed or opened; `workspace` points to `workspace_bytes` writable bytes that nobody
@@ -1045,70 +1079,72 @@ lads_status lads_controller_init(const struct lads_policy *policy,
                                  struct lads_report *report);
 
 /**
- * Replays the recorded episode, compares indices and actions, and arms the controller if it passes, disarms it if not. Afterwards
- * there is no instruction. `result`, which may be null, gets what a test has measured, or where it failed.
+ * Replays the recorded episode, compares indices and actions, and arms the controller if it
+ * passes, disarms it if not. Afterwards there is no instruction. `result`, which may be null, gets
+ * the test's measurements, or the place of its failure.
  *
  * # Safety
  * `controller` is null or a workspace, zeroed or set up by `lads_controller_init`, and no other call uses it now;
  * `result` is null or may be read and written.
  */
-lads_status lads_self_test(struct lads_controller *controller,
-                           struct lads_self_test_t *result);
+lads_status lads_self_test(struct lads_controller *controller, struct lads_self_test_t *result);
 
 /**
- * Puts another policy in the place of the one that runs, between two steps. `next` is a controller that was set up beside it, in a
- * workspace of its own, tested and given its instruction, which another thread may have done while this one ran.
+ * Replaces the running policy by another one, between two steps. `next` is a controller that was
+ * set up in a workspace of its own, tested and given its instruction, which another thread may
+ * have done while `controller` ran.
  *
- * Afterwards `next` is the one to step: it goes on with the limits, rates, fallback, counters and clock of `controller`, whose options
- * stay in force, and its first action is no further from the last executed one than the rate allows. It is armed if both
- * were. `controller` is ended, and its workspace is yours again, for the policy after that.
+ * Afterwards `next` is the one to step: it continues with the limits, rates, fallback, counters
+ * and clock of `controller`, whose options stay in force, and its first action is no further from
+ * the last executed one than the rate allows. It is armed if both were. `controller` is ended, and
+ * its workspace is yours again, for the policy after that.
  *
- * Refused, `controller` goes on as if nothing had been asked, and `next` stays as it was: another control period
- * (`LADS_STATUS_SWAP_CONTROL_PERIOD`), a channel that differs, which the report names (`LADS_STATUS_SWAP_CHANNELS`), no instruction
- * where `controller` has one (`LADS_STATUS_SWAP_INSTRUCTION`). `report` may be null.
+ * If the swap is refused, neither controller changes. The reasons are another control period
+ * (`LADS_STATUS_SWAP_CONTROL_PERIOD`), a channel that differs, which the report names
+ * (`LADS_STATUS_SWAP_CHANNELS`), no instruction where `controller` has one
+ * (`LADS_STATUS_SWAP_INSTRUCTION`). `report` may be null.
  *
  * # Safety
- * As `lads_self_test`, for both controllers; `report` is null or may be read and written.
+ * The conditions of `lads_self_test` hold for both controllers; `report` is null or may be read and written.
  */
-lads_status lads_swap(struct lads_controller *controller,
-                      struct lads_controller *next,
-                      struct lads_report *report);
+lads_status lads_swap(struct lads_controller *controller, struct lads_controller *next, struct lads_report *report);
 
 /**
  * Starts a new episode with the same instruction; timestamps may start anew. A stop stays a stop.
  *
  * # Safety
- * As `lads_self_test`.
+ * The conditions of `lads_self_test` hold.
  */
 lads_status lads_reset(struct lads_controller *controller);
 
 /**
- * Brings code, weights and KV caches into the processor's caches, so that the next step is as fast as the ones after it: for right
- * before the first step, or after a pause. Costs two to three control steps and changes nothing.
+ * Brings code, weights and KV caches into the processor's caches, so that the next step is as fast
+ * as the ones after it; call it right before the first step, or after a pause. It costs two to
+ * three control steps and changes nothing.
  *
  * # Safety
- * As `lads_self_test`.
+ * The conditions of `lads_self_test` hold.
  */
 lads_status lads_warm(struct lads_controller *controller);
 
 /**
- * Follows a known instruction, by its number, from the next step on: a new episode. `LADS_STATUS_INSTRUCT_FAILED`, which a sound
- * image never causes, leaves the controller without an instruction. A policy whose contract has no instruction channel needs
- * none.
+ * Sets a known instruction, by its number, to follow from the next step on: a new episode.
+ * `LADS_STATUS_INSTRUCT_FAILED`, which never occurs with a sound image, leaves the controller
+ * without an instruction. A policy whose contract has no instruction channel needs none.
  *
  * # Safety
- * As `lads_self_test`.
+ * The conditions of `lads_self_test` hold.
  */
-lads_status lads_set_instruction(struct lads_controller *controller,
-                                 uint32_t number);
+lads_status lads_set_instruction(struct lads_controller *controller, uint32_t number);
 
 /**
- * Follows an instruction given as word embeddings, `len = n * word_dim` elements, as `lads_set_instruction` does. A policy follows
- * any words, whatever they say: ask `lads_instruction_similarity` first. `report`, which may be null, names the word element that was
- * refused.
+ * Sets an instruction given as word embeddings, `len = n * word_dim` elements, like
+ * `lads_set_instruction`. A policy follows any words, whatever they say: ask
+ * `lads_instruction_similarity` first. `report`, which may be null, names the word element that
+ * was refused.
  *
  * # Safety
- * As `lads_self_test`; `words` points to `len` readable elements; `report` is null or may be read and written.
+ * The conditions of `lads_self_test` hold; `words` points to `len` readable elements; `report` is null or may be read and written.
  */
 lads_status lads_set_words(struct lads_controller *controller,
                            const float *words,
@@ -1116,9 +1152,10 @@ lads_status lads_set_words(struct lads_controller *controller,
                            struct lads_report *report);
 
 /**
- * Says which known instruction a sentence, given as word embeddings, is most like, and how much, from -1 to 1. Whoever lets people
- * say what they like compares it with the contract's `acceptance` and refuses what is below: the policy follows any words.
- * Words are compared, not meanings. `number` may be null.
+ * Finds the known instruction that a sentence, given as word embeddings, is most similar to, and
+ * its similarity, from -1 to 1. A program that accepts free sentences compares the similarity with
+ * the contract's `acceptance` and refuses sentences below: the policy follows any words. Words are
+ * compared, not meanings. `number` may be null.
  *
  * # Safety
  * `policy` is null or a `lads_policy`, zeroed or opened; `words` points to `len` readable elements; `number` is null or may be
@@ -1131,36 +1168,39 @@ lads_status lads_instruction_similarity(const struct lads_policy *policy,
                                         float *similarity);
 
 /**
- * Picks indices by argmax (`temperature` not above 0) or at random with the softmax of the scores over the temperature.
+ * Sets how indices are picked: by argmax (`temperature` not above 0) or at random with the softmax
+ * of the scores over the temperature.
  *
  * # Safety
- * As `lads_self_test`.
+ * The conditions of `lads_self_test` hold.
  */
 lads_status lads_set_decision(struct lads_controller *controller, float temperature, uint64_t seed);
 
 /**
- * Says where the noise of a policy comes from: `LADS_NOISE_ZERO`, or `LADS_NOISE_SEEDED` with a seed, whose generator starts again.
+ * Sets the source of a policy's noise: `LADS_NOISE_ZERO`, or `LADS_NOISE_SEEDED` with a seed,
+ * whose generator starts again.
  *
  * # Safety
- * As `lads_self_test`.
+ * The conditions of `lads_self_test` hold.
  */
-lads_status lads_set_noise(struct lads_controller *controller,
-                           uint32_t rule,
-                           uint64_t seed);
+lads_status lads_set_noise(struct lads_controller *controller, uint32_t rule, uint64_t seed);
 
 /**
- * One control period of a policy with one observation channel of floats: writes an action that is finite and inside limits and rates,
- * whatever the observation is. `LADS_STATUS_OK` says that it is the policy's; any other status why it is the fallback's. A null
- * `observation` says that there is none. `tick` may be null, then nothing is stale or late; so may `report`, which names the
- * channel and the element that was refused.
+ * Runs one control period of a policy with one observation channel of floats: writes an action
+ * that is finite and inside limits and rates, whatever the observation is. `LADS_STATUS_OK` means
+ * that it is the policy's action; any other status states why it is the fallback's. A null
+ * `observation` means that there is none. `tick` may be null, then nothing is stale or late; so
+ * may `report`, which names the channel and the element that was refused.
  *
- * Nothing is written, and no period is counted, only where there is no room for an action: `controller` is null, misaligned or
- * not set up; `action` is null, misaligned, of another length than the contract's, or overlaps the workspace or the image. All
- * else that is wrong with the call, such as a `tick` or a `report` that is misaligned, has no size or overlaps, is a period without an
- * observation: the fallback's action is written, the status says what was wrong, and so does the report unless it is what is wrong.
+ * Nothing is written, and no period is counted, only where there is no room for an action:
+ * `controller` is null, misaligned or not set up; `action` is null, misaligned, of another length
+ * than the contract's, or overlaps the workspace or the image. Any other fault of the call, such
+ * as a `tick` or a `report` that is misaligned, has no size or overlaps, makes it a period without
+ * an observation: the fallback's action is written, the status states the fault, and so does the
+ * report unless it is at fault.
  *
  * # Safety
- * As `lads_self_test`; `observation` and `action` point to as many elements as they say; `tick` and `report` are null or may
+ * The conditions of `lads_self_test` hold; `observation` and `action` point to as many elements as they say; `tick` and `report` are null or may
  * be read, and the report written.
  */
 lads_status lads_step(struct lads_controller *controller,
@@ -1172,12 +1212,13 @@ lads_status lads_step(struct lads_controller *controller,
                       struct lads_report *report);
 
 /**
- * One control period of any policy, as `lads_step`: `inputs` are the values of all observation channels, in any order; a null pointer
- * says that there is no observation. Values for a noise channel, as many as the contract's `noise_len` in the order in which they
- * are used, take the place of the library's.
+ * Runs one control period of any policy, like `lads_step`: `inputs` are the values of all
+ * observation channels, in any order; a null pointer means that there is no observation. Values
+ * for a noise channel, as many as the contract's `noise_len` in the order in which they are used,
+ * take the place of the library's.
  *
  * # Safety
- * As `lads_step`; `inputs` points to `count` inputs, whose data are as many values of their type as they say.
+ * The conditions of `lads_step` hold; `inputs` points to `count` inputs, whose data are as many values of their type as they say.
  */
 lads_status lads_step_channels(struct lads_controller *controller,
                                const struct lads_input *inputs,
@@ -1188,11 +1229,12 @@ lads_status lads_step_channels(struct lads_controller *controller,
                                struct lads_report *report);
 
 /**
- * Tells what was really executed since the last step, where that is not the action that `lads_step` wrote; the next step
- * continues from there. `report`, which may be null, names the element that was refused.
+ * Tells which action was executed since the last step, if it is not the one that `lads_step`
+ * wrote; the next step continues from there. `report`, which may be null, names the element that
+ * was refused.
  *
  * # Safety
- * As `lads_self_test`; `action` points to `action_len` readable elements; `report` is null or may be read and written.
+ * The conditions of `lads_self_test` hold; `action` points to `action_len` readable elements; `report` is null or may be read and written.
  */
 lads_status lads_executed(struct lads_controller *controller,
                           const float *action,
@@ -1200,26 +1242,26 @@ lads_status lads_executed(struct lads_controller *controller,
                           struct lads_report *report);
 
 /**
- * Stops as `LADS_FALLBACK_STOP` does, from the next step on.
+ * Stops the controller as `LADS_FALLBACK_STOP` does, from the next step on.
  *
  * # Safety
- * As `lads_self_test`.
+ * The conditions of `lads_self_test` hold.
  */
 lads_status lads_stop(struct lads_controller *controller);
 
 /**
- * Ends a stop. The episode goes on where it was; `lads_reset` starts a new one.
+ * Ends a stop. The episode continues where it was; `lads_reset` starts a new one.
  *
  * # Safety
- * As `lads_self_test`.
+ * The conditions of `lads_self_test` hold.
  */
 lads_status lads_resume(struct lads_controller *controller);
 
 /**
- * Tells what the guard has done since the controller was set up.
+ * Writes the counts of the guard's actions and interventions since the controller was set up.
  *
  * # Safety
- * As `lads_self_test`; `counters` may be read and written.
+ * The conditions of `lads_self_test` hold; `counters` may be read and written.
  */
 lads_status lads_counters(struct lads_controller *controller, struct lads_counters_t *counters);
 

@@ -2,7 +2,7 @@
  * lads.hpp: the C interface of lads.h for C++17. Header only; throws nothing, needs neither exceptions nor RTTI.
  *
  * A Policy is a checked view on an image; a Controller owns its workspace, or works in memory that it is lent. Nothing allocates
- * but Controller::allocate, which is called once, before the loop. Both stay where they are: they cannot be copied or moved.
+ * except Controller::allocate, which is called once, before the loop. Neither can be copied or moved.
  *
  *     lads::Policy policy;
  *     if (auto status = policy.open(image); !status) return fail(status.text());
@@ -30,7 +30,7 @@
 
 namespace lads {
 
-/** A view on elements of somebody else; made from anything with data() and size(), or from an array. */
+/** A view on elements that another object owns; made from anything with data() and size(), or from an array. */
 template <typename T>
 class Span {
 public:
@@ -53,7 +53,7 @@ private:
     std::size_t size_ = 0;
 };
 
-/** What came of a call: true for good. */
+/** Result of a call, which converts to true for success. */
 class [[nodiscard]] Status {
 public:
     constexpr Status(lads_status code = LADS_STATUS_OK) noexcept : code_(code) {}
@@ -67,7 +67,7 @@ private:
     lads_status code_;
 };
 
-/** A struct of lads.h, all zero but its size. */
+/** Makes a struct of lads.h, all zero but its size. */
 template <typename T>
 constexpr T made() noexcept {
     T value{};
@@ -75,7 +75,7 @@ constexpr T made() noexcept {
     return value;
 }
 
-/** The clock of a control period. */
+/** Makes the clock of a control period. */
 inline lads_tick tick(std::uint64_t timestamp, std::uint32_t missed = 0) noexcept {
     auto tick = made<lads_tick>();
     tick.timestamp = timestamp;
@@ -83,7 +83,7 @@ inline lads_tick tick(std::uint64_t timestamp, std::uint32_t missed = 0) noexcep
     return tick;
 }
 
-/** The values of a channel, one behind the other; row_bytes as in lads_input. */
+/** Makes the input of a channel from contiguous values; row_bytes as in lads_input. */
 inline lads_input input(std::uint32_t channel, Span<const float> values, std::size_t row_bytes = 0) noexcept {
     return {channel, LADS_F32, values.data(), values.size(), row_bytes};
 }
@@ -94,7 +94,7 @@ inline lads_input input(std::uint32_t channel, Span<const std::int32_t> values, 
     return {channel, LADS_I32, values.data(), values.size(), row_bytes};
 }
 
-/** A text inside the image. */
+/** Returns a text inside the image as a string view. */
 inline std::string_view view(lads_text text) noexcept { return {text.data, text.len}; }
 
 /** A checked view on an image, which has to outlive it. */
@@ -119,7 +119,7 @@ public:
         channel = made<lads_channel_t>();
         return lads_channel(&policy_, number, &channel);
     }
-    /** By name, byte for byte. */
+    /** Finds the number of a channel by its name, byte for byte. */
     Status find_channel(std::string_view name, std::uint32_t &number) const noexcept {
         return lads_channel_find(&policy_, name.data(), name.size(), &number);
     }
@@ -127,7 +127,7 @@ public:
         element = made<lads_element>();
         return lads_channel_element(&policy_, channel, index, &element);
     }
-    /** Of the first observation channel, the only one of most policies. */
+    /** Describes element `index` of the first observation channel, the only one of most policies. */
     Status observation(std::size_t index, lads_element &element) const noexcept {
         return this->element(contract_.observation, index, element);
     }
@@ -138,11 +138,11 @@ public:
         known = made<lads_instruction>();
         return lads_policy_instruction(&policy_, number, &known);
     }
-    /** By id, or by text up to the case of ASCII letters and white space. */
+    /** Finds the number of an instruction by id, or by text up to the case of ASCII letters and white space. */
     Status find_instruction(std::string_view name, std::uint32_t &number) const noexcept {
         return lads_policy_find_instruction(&policy_, name.data(), name.size(), &number);
     }
-    /** Which known instruction words are most like, and how much: compare it with contract().acceptance. */
+    /** Finds the known instruction that words are most similar to, and the similarity: compare it with contract().acceptance. */
     Status similarity(Span<const float> words, std::uint32_t &number, float &similarity) const noexcept {
         return lads_instruction_similarity(&policy_, words.data(), words.size(), &number, &similarity);
     }
@@ -199,24 +199,24 @@ public:
     }
     Status set_noise(std::uint32_t rule, std::uint64_t seed) noexcept { return lads_set_noise(controller_, rule, seed); }
 
-    /** One control period; see lads_step. */
+    /** Runs one control period; see lads_step. */
     Status step(Span<const float> observation, Span<float> action, const lads_tick &tick,
                 lads_report *report = nullptr) noexcept {
         return lads_step(controller_, observation.data(), observation.size(), &tick, action.data(), action.size(), report);
     }
-    /** The same without a clock: nothing is stale or late. */
+    /** Runs one control period without a clock: nothing is stale or late. */
     Status step(Span<const float> observation, Span<float> action, lads_report *report = nullptr) noexcept {
         return lads_step(controller_, observation.data(), observation.size(), nullptr, action.data(), action.size(), report);
     }
-    /** One control period of any policy; see lads_step_channels. */
+    /** Runs one control period of any policy; see lads_step_channels. */
     Status step_channels(Span<const lads_input> inputs, Span<float> action, const lads_tick *tick = nullptr,
                          lads_report *report = nullptr) noexcept {
         return lads_step_channels(controller_, inputs.data(), inputs.size(), tick, action.data(), action.size(), report);
     }
 
     /**
-     * Lets `next`, which was set up, tested and instructed beside this one, take its place between two steps; see lads_swap.
-     * Afterwards this one is the new policy, and `next` has the old one's memory, to be set up again.
+     * Replaces this controller's policy by that of `next`, which was set up, tested and instructed, between two steps; see
+     * lads_swap. Afterwards this object is the new controller, and `next` has the old one's memory, to be set up again.
      */
     Status swap(Controller &next, lads_report *report = nullptr) noexcept {
         const Status status = lads_swap(controller_, next.controller_, report);

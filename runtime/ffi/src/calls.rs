@@ -1,7 +1,7 @@
-//! The functions of the interface.
+//! Functions of the C interface.
 //!
-//! Each checks all its pointers before it does anything: that they are what they can be, and that what is written overlaps nothing
-//! ([`apart`](crate::memory::apart)).
+//! Each function first checks all its pointers: that they are plausible, and that written memory
+//! overlaps nothing ([`apart`](crate::memory::apart)).
 
 // In the order in which they are called, which is the header's.
 pub mod describe;
@@ -19,12 +19,12 @@ use crate::status::Status;
 use crate::types::{LadsReport, Refusal};
 use crate::versioned;
 
-/// Turns a result into the number that C gets.
+/// Converts a result to the number that C gets.
 fn status(result: Result<(), Status>) -> Status {
     result.err().unwrap_or(Status::Ok)
 }
 
-/// The area of a report that may be null, apart from what else the call uses.
+/// Returns the area of a report that may be null, apart from all other areas that the call uses.
 ///
 /// # Safety
 /// `report` is null or may be read and written.
@@ -35,10 +35,11 @@ unsafe fn report_area(report: *mut LadsReport, others: &[Area]) -> Result<Area, 
     Ok(area)
 }
 
-/// Writes what came of a call into a report that may be null and that [`report_area`] has approved of, and returns its number.
+/// Writes the result of a call into a report that may be null and that [`report_area`] has approved
+/// of, and returns its number.
 ///
 /// # Safety
-/// As [`report_area`].
+/// The conditions of [`report_area`] hold.
 unsafe fn told(result: Result<(), Refusal>, report: *mut LadsReport) -> Status {
     let refusal = result.err().unwrap_or(Status::Ok.into());
     if !report.is_null() {

@@ -1,7 +1,7 @@
-//! What lies in the caller's memory: an open policy, and a controller at the start of its workspace.
+//! Objects in the caller's memory: an open policy, and a controller at the start of its workspace.
 //!
-//! Each begins with a seal that depends on its address, so that memory that was never set up, or was copied elsewhere, is refused
-//! instead of used.
+//! Each object begins with a seal that depends on its address, so that memory that was never set
+//! up, or was copied elsewhere, is refused instead of used.
 
 use core::ffi::c_void;
 use core::ptr;
@@ -19,14 +19,15 @@ use crate::types::{
 };
 use crate::versioned;
 
-/// A policy in a [`LadsPolicy`]. It borrows the image for as long as it is used, which C promises and Rust calls `'static`.
+/// An open policy inside a [`LadsPolicy`]. It borrows the image for as long as it is used, which C
+/// promises and Rust calls `'static`.
 #[repr(C)]
 struct Opened {
     seal: usize,
     policy: Policy<'static>,
 }
 
-/// A controller at the start of its workspace.
+/// A controller with its guard, at the start of its workspace.
 #[repr(C)]
 pub struct Handle {
     seal: usize,
@@ -38,7 +39,8 @@ const _: () = assert!(size_of::<Opened>() <= size_of::<LadsPolicy>());
 const _: () = assert!(align_of::<Opened>() <= align_of::<LadsPolicy>());
 const _: () = assert!(align_of::<Handle>() <= LADS_WORKSPACE_ALIGN);
 
-/// `lads-core` in ASCII, as far as it fits, combined with an address.
+/// Returns the seal of an address: `lads-core` in ASCII, as far as it fits, combined with the
+/// address.
 fn seal(address: usize) -> usize {
     (u64::from_le_bytes(*b"lads-cor") as usize) ^ address
 }
@@ -75,7 +77,7 @@ pub unsafe fn open(
     Ok(())
 }
 
-/// The policy in the caller's memory.
+/// Returns the policy in the caller's memory.
 ///
 /// # Safety
 /// If the pointer is not null, a `LadsPolicy` is there, and if [`open`] succeeded its image is still the same.
@@ -90,7 +92,7 @@ pub unsafe fn policy<'a>(from: *const LadsPolicy) -> Result<&'a Policy<'static>,
     Ok(unsafe { &(*from).policy })
 }
 
-/// The areas of an open policy: itself, and its image.
+/// Returns the areas of an open policy: itself, and its image.
 pub fn areas_of(policy_at: *const LadsPolicy, policy: &Policy) -> [Area; 2] {
     let image = policy.image();
     [
@@ -99,12 +101,12 @@ pub fn areas_of(policy_at: *const LadsPolicy, policy: &Policy) -> [Area; 2] {
     ]
 }
 
-/// How the workspace of a policy is divided.
+/// Returns the layout of a policy's workspace.
 pub fn layout(policy: &Policy) -> Result<Layout, Status> {
     Layout::of(policy, size_of::<Handle>()).ok_or(Status::TooLong)
 }
 
-/// Where a controller is to be set up, and what for.
+/// Place and parameters of a controller to be set up.
 #[derive(Clone, Copy)]
 pub struct Setup {
     pub policy: *const LadsPolicy,
@@ -113,7 +115,7 @@ pub struct Setup {
     pub options: *const LadsOptions,
 }
 
-/// Everything about a controller to be, checked.
+/// Checked parameters of a controller to be set up.
 struct Checked<'o> {
     policy: &'static Policy<'static>,
     layout: Layout,
@@ -121,8 +123,8 @@ struct Checked<'o> {
     flags: u32,
 }
 
-/// Sets a controller up in a workspace. Nothing of the workspace is touched before everything has been checked; `others` are what else the
-/// call writes.
+/// Sets a controller up in a workspace. The workspace is untouched until everything has been
+/// checked; `others` are the other areas that the call writes.
 ///
 /// # Safety
 /// `workspace` points to `workspace_bytes` writable bytes that nobody else uses as long as the controller is used; `options` is null
@@ -170,7 +172,7 @@ pub unsafe fn set_up(setup: Setup, others: &[Area; 2]) -> Result<*mut LadsContro
         workspace_bytes: layout.total,
         guarded,
     };
-    // SAFETY: as above; the arena and the others lie behind the handle.
+    // SAFETY: as above; the arena and the other parts follow the handle.
     unsafe { handle.write(made) };
     Ok(handle.cast())
 }
@@ -178,7 +180,7 @@ pub unsafe fn set_up(setup: Setup, others: &[Area; 2]) -> Result<*mut LadsContro
 /// Checks pointers, sizes, options and areas.
 ///
 /// # Safety
-/// As [`set_up`].
+/// The conditions of [`set_up`] hold.
 unsafe fn checked<'o>(setup: Setup, others: &[Area; 2]) -> Result<Checked<'o>, Status> {
     let Setup {
         policy: policy_at,
@@ -230,6 +232,8 @@ unsafe fn checked<'o>(setup: Setup, others: &[Area; 2]) -> Result<Checked<'o>, S
     })
 }
 
+/// Converts options to the guard's configuration.
+///
 /// # Safety
 /// The lists of the options are null or have `len` elements.
 unsafe fn config<'o>(options: &LadsOptions, len: usize) -> Result<GuardConfig<'o>, Status> {
@@ -263,7 +267,7 @@ unsafe fn config<'o>(options: &LadsOptions, len: usize) -> Result<GuardConfig<'o
     })
 }
 
-/// The controller behind a pointer.
+/// Returns the controller behind a pointer.
 ///
 /// # Safety
 /// The pointer is null or that of a workspace of at least [`LADS_WORKSPACE_ALIGN`] bytes, which nobody else uses during `'c`.
@@ -284,7 +288,7 @@ pub unsafe fn handle<'c>(controller: *mut LadsController) -> Result<&'c mut Hand
 }
 
 impl Handle {
-    /// The areas that a controller uses: its workspace and the image.
+    /// Returns the areas that a controller uses: its workspace and the image.
     pub fn areas(&self) -> [Area; 2] {
         let image = self.guarded.controller().policy().image();
         let workspace = ptr::from_ref(self).cast_mut().cast::<u8>();

@@ -1,4 +1,5 @@
-//! How a workspace is divided: the controller's own memory, then arena, state and the guard's memory, each on a cache line.
+//! Layout of a workspace: the controller's own memory, then arena, state and the guard's memory,
+//! each on a cache line.
 
 use core::ffi::c_void;
 
@@ -7,10 +8,11 @@ use lads_core::{GuardedController, Policy};
 /// Alignment of a workspace, in bytes: a cache line, which is also the widest vector.
 pub const LADS_WORKSPACE_ALIGN: usize = 64;
 
-/// Stack that a call of the library takes at most, in bytes: measured on x86-64 with all functions of the archive.
+/// Largest stack, in bytes, that a call of the library takes: measured on x86-64 with all functions
+/// of the archive.
 pub const LADS_STACK_BYTES: usize = 7896;
 
-/// Offsets in bytes.
+/// Offsets of the parts of a workspace, in bytes.
 #[derive(Debug, Clone, Copy)]
 pub struct Layout {
     pub arena: usize,
@@ -20,7 +22,7 @@ pub struct Layout {
 }
 
 impl Layout {
-    /// The division for a policy; `None` when it needs more than there are addresses.
+    /// Computes the layout for a policy; `None` if it exceeds the address space.
     pub fn of(policy: &Policy, handle: usize) -> Option<Self> {
         let after = |start: usize, elements: usize| {
             start
@@ -41,7 +43,7 @@ impl Layout {
     }
 }
 
-/// The elements at an offset of a workspace.
+/// Returns the elements at an offset of a workspace.
 pub fn at(workspace: *mut c_void, offset: usize) -> *mut f32 {
     workspace.wrapping_byte_add(offset).cast()
 }

@@ -19,20 +19,24 @@
 //! ```
 //!
 //! Rules for every function:
-//! - It returns a [`Status`], an `int32_t`. What is refused changes nothing, unless the function says so.
+//! - It returns a [`Status`], an `int32_t`. A refused call changes nothing, unless the function
+//!   states otherwise.
 //! - It allocates nothing, never blocks, never unwinds, has no global state, and calls nothing but `memcpy` and `memset`.
 //! - Null and misaligned pointers, policies and controllers that were never set up, and areas that overlap where one of them is written
 //!   are refused, the workspace and the image among them.
-//! - Options and reports begin with `struct_bytes`, their size as the caller knows it. The library reads and writes no more than both
-//!   know, so both can get newer on their own; options that it does not know are refused unless they are zero.
-//! - It cannot check that memory is what a pointer says; that is the caller's part, and each safety section says which.
+//! - Options and reports begin with `struct_bytes`, their size as the caller knows it. The library
+//!   reads and writes only the fields that both know, so both can be updated independently; options
+//!   that it does not know are refused unless they are zero.
+//! - It cannot check that a pointer leads to valid memory; that is the caller's duty, which each
+//!   safety section states.
 //! - One controller is used by one thread at a time. Different controllers, even of one policy, are independent.
 //!
-//! Under an operating system with virtual memory, put image and workspace where pages are large (on Linux: aligned to 2 MiB, with
-//! `madvise(MADV_HUGEPAGE)`), and lock them. At a robot's pace the caches are cold, and walks through page tables show.
+//! Under an operating system with virtual memory, put image and workspace where pages are large (on
+//! Linux: aligned to 2 MiB, with `madvise(MADV_HUGEPAGE)`), and lock them. At a robot's rate the
+//! caches are cold, and page-table walks take noticeable time.
 //!
-//! The cargo features of this crate are groups of operations that policies are made of, all on by default; `runtime/ffi/archive.sh` says
-//! how to leave out what a policy does not need.
+//! The cargo features of this crate are groups of operations of policies, all on by default;
+//! `runtime/ffi/archive.sh` explains how to leave out those that a policy does not need.
 #![no_std]
 #![cfg_attr(
     not(test),
@@ -68,18 +72,18 @@ pub use types::*;
 /// Version of this interface; it grows when a program compiled for an older header would no longer work.
 pub const LADS_ABI_VERSION: u32 = 2;
 
-/// `LADS_ABI_VERSION` of the archive: compare it with the header's.
+/// Returns the `LADS_ABI_VERSION` of the archive: compare it with the header's.
 #[unsafe(no_mangle)]
 pub extern "C" fn lads_abi_version() -> u32 {
     LADS_ABI_VERSION
 }
 
-/// What `lads_workspace_bytes` says about a policy, for tools written in Rust.
+/// Returns the same number as `lads_workspace_bytes`, for tools written in Rust.
 pub fn workspace_bytes(policy: &Policy) -> usize {
     handle::layout(policy).map_or(0, |layout| layout.total)
 }
 
-/// One line in English for a status; never null. The text is static and ends with a zero.
+/// Returns one line in English for a status; never null. The text is static and ends with a zero.
 #[unsafe(no_mangle)]
 pub extern "C" fn lads_status_text(status: i32) -> *const c_char {
     let known = Status::ALL

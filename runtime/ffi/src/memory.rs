@@ -1,11 +1,12 @@
-//! From C's pointer and length to a slice, and from memory areas that overlap to a refusal: what can be checked is checked here, what
-//! cannot is the caller's promise.
+//! Converts C's pointer and length to a slice, and refuses memory areas that overlap: checks
+//! everything that can be checked; the rest is the caller's promise.
 
 use core::slice;
 
 use crate::status::Status;
 
-/// Checks that a pointer may be that of `len` elements: not null, aligned, no longer than memory can be.
+/// Checks that a pointer may be that of `len` elements: not null, aligned, no longer than memory
+/// can be.
 pub fn check<T>(pointer: *const T, len: usize) -> Result<(), Status> {
     if pointer.is_null() {
         return Err(Status::Null);
@@ -20,7 +21,7 @@ pub fn check<T>(pointer: *const T, len: usize) -> Result<(), Status> {
     end.map(|_| ()).ok_or(Status::TooLong)
 }
 
-/// `len` elements to read; a length of zero may come with a null pointer.
+/// Returns `len` elements to read; a length of zero may come with a null pointer.
 ///
 /// # Safety
 /// If the pointer is not null, `len` initialised elements are readable there, and nobody writes them during `'a`.
@@ -33,10 +34,10 @@ pub unsafe fn read<'a, T>(pointer: *const T, len: usize) -> Result<&'a [T], Stat
     Ok(unsafe { slice::from_raw_parts(pointer, len) })
 }
 
-/// `len` elements to read, or `None` for a null pointer.
+/// Returns `len` elements to read, or `None` for a null pointer.
 ///
 /// # Safety
-/// As [`read`].
+/// The conditions of [`read`] hold.
 pub unsafe fn read_optional<'a, T>(
     pointer: *const T,
     len: usize,
@@ -48,7 +49,7 @@ pub unsafe fn read_optional<'a, T>(
     unsafe { read(pointer, len) }.map(Some)
 }
 
-/// `len` elements of memory that need not be initialised; they become zero.
+/// Zeroes `len` elements of memory, which need not be initialised, and returns them.
 ///
 /// # Safety
 /// If the pointer is not null, `len` writable elements are there, and nobody else uses them during `'a`.
@@ -58,14 +59,14 @@ pub unsafe fn zeroed<'a>(pointer: *mut f32, len: usize) -> Result<&'a mut [f32],
     }
     check(pointer, len)?;
     // SAFETY: checked above to be non-null, aligned and of a possible length; the caller guarantees that the memory is writable
-    // and nobody else's. All bits zero is the number zero.
+    // and only theirs. All bits zero is the number zero.
     unsafe {
         pointer.write_bytes(0, len);
         Ok(slice::from_raw_parts_mut(pointer, len))
     }
 }
 
-/// The addresses of one thing that a call reads or writes. That of a null pointer is empty.
+/// Address range of one object that a call reads or writes. The range of a null pointer is empty.
 #[derive(Debug, Clone, Copy)]
 pub struct Area {
     start: usize,
@@ -74,7 +75,7 @@ pub struct Area {
 }
 
 impl Area {
-    /// Elements that are read.
+    /// Makes the area of elements that are read.
     pub fn read<T>(pointer: *const T, len: usize) -> Self {
         let start = pointer.addr();
         let bytes = if pointer.is_null() {
@@ -89,7 +90,7 @@ impl Area {
         }
     }
 
-    /// Elements that are written, or read and written.
+    /// Makes the area of elements that are written, or read and written.
     pub fn written<T>(pointer: *mut T, len: usize) -> Self {
         Self {
             written: true,
@@ -97,7 +98,7 @@ impl Area {
         }
     }
 
-    /// Whether both hold an address, and one of them is written.
+    /// Returns whether both hold an address, and one of them is written.
     pub fn clashes(&self, other: &Self) -> bool {
         let apart = self.end <= other.start || other.end <= self.start;
         let empty = self.start == self.end || other.start == other.end;
@@ -113,7 +114,7 @@ pub fn apart_from(area: &Area, others: &[Area]) -> Result<(), Status> {
     Ok(())
 }
 
-/// Refuses the areas of a call of which two clash: one rule for every pointer of every function.
+/// Refuses a call two of whose areas clash: one rule for every pointer of every function.
 pub fn apart(areas: &[Area]) -> Result<(), Status> {
     let mut rest = areas;
     while let [first, others @ ..] = rest {

@@ -1,13 +1,14 @@
-//! The panic handler of the static library, which nothing reaches.
+//! Panic handler of the static library, which is unreachable.
 //!
-//! Core, kernels and this crate have no panic that the optimised build keeps. The handler that Rust asks for all the same refers
-//! to a symbol that nobody defines: where a panic could be reached, linking the archive would fail, and building it does
-//! (`runtime/ffi/archive.sh` drops what is not reachable and then looks for the symbol).
+//! Core, kernels and this crate have no panic that the optimised build keeps. The handler, which
+//! Rust requires nevertheless, refers to an undefined symbol: if a panic were reachable, linking
+//! the archive would fail, and building it does (`runtime/ffi/archive.sh` drops unreachable code
+//! and then looks for the symbol).
 
 use core::panic::PanicInfo;
 
 unsafe extern "C" {
-    /// Does not exist.
+    /// Undefined symbol, so that a reachable panic fails to link.
     fn lads_a_panic_is_reachable() -> !;
 }
 
@@ -17,7 +18,8 @@ fn panic(_: &PanicInfo) -> ! {
     unsafe { lads_a_panic_is_reachable() }
 }
 
-/// The precompiled `core` refers to this symbol on hosted targets, where it was built to unwind. Nothing calls it: panics abort.
+/// Symbol to which the precompiled `core` refers on hosted targets, where it was built to unwind.
+/// It is never called: panics abort.
 #[cfg(not(target_os = "none"))]
 #[unsafe(no_mangle)]
 pub extern "C" fn rust_eh_personality() {}

@@ -1,4 +1,5 @@
-//! The numbers that calls return, each with its one line of English: written once, in the table at the end.
+//! Status numbers that calls return, each with its one line of English: written once, in the table
+//! at the end.
 
 use core::ffi::CStr;
 
@@ -10,7 +11,7 @@ use lads_image::Fault;
 use lads_image::format::FormatError;
 use lads_image::tables::TablesError;
 
-/// A text as C has it; the table's texts hold no zero but the last.
+/// Converts a text to C's form; the table's texts hold no zero but the last.
 const fn zero_ended(text: &'static str) -> &'static CStr {
     match CStr::from_bytes_with_nul(text.as_bytes()) {
         Ok(text) => text,
@@ -20,7 +21,8 @@ const fn zero_ended(text: &'static str) -> &'static CStr {
 
 macro_rules! statuses {
     ($($name:ident = $number:literal, $text:literal;)*) => {
-        /// What came of a call; 0 is good. The numbers are stable: none ever changes its meaning.
+        /// Result of a call; 0 means success. The numbers are stable: no number ever changes its
+        /// meaning.
         #[derive(Debug, Clone, Copy, PartialEq, Eq)]
         #[repr(i32)]
         pub enum Status { $(#[doc = concat!("In words: ", $text, ".")] $name = $number,)* }
@@ -36,11 +38,11 @@ macro_rules! statuses {
 statuses! {
     Ok = 0, "ok";
     Null = 1, "a pointer is null";
-    Misaligned = 2, "a pointer is not aligned as its type or the documentation asks";
-    TooLong = 3, "a length is larger than memory can be";
+    Misaligned = 2, "a pointer does not have the alignment that its type or the documentation requires";
+    TooLong = 3, "a length exceeds the address space";
     Overlap = 5, "two of the memory areas overlap";
     NotSetUp = 6, "the policy was not opened or the controller was not set up, or it was moved or replaced since";
-    StructBytes = 7, "a struct's struct_bytes is not set, or not a size that it can have";
+    StructBytes = 7, "a struct's struct_bytes is not set, or not a valid size";
     NotAnImage = 10, "not a program image";
     ImageVersion = 11, "program image of another version: compile the bundle again";
     ImageTruncated = 12, "the program image is truncated";
@@ -51,11 +53,11 @@ statuses! {
     ImageOperation = 17, "the program image needs an operation that this library was built without";
     WorkspaceTooSmall = 20, "the workspace is smaller than the policy needs";
     UnknownInstruction = 30, "the policy does not know this instruction";
-    WordsLength = 31, "the words are none, too many, or no whole number of word embeddings";
+    WordsLength = 31, "there are no words, too many, or not a whole number of word embeddings";
     WordsNotFinite = 32, "a word element is not finite";
-    InstructFailed = 33, "the instruction could not be taken in; there is no instruction now";
-    NoElement = 34, "the channel has no element of this number";
-    NoChannel = 35, "the policy has no channel of this number or name";
+    InstructFailed = 33, "the instruction could not be processed; no instruction is set now";
+    NoElement = 34, "the channel has no element with this number";
+    NoChannel = 35, "the policy has no channel with this number or name";
     NoInstructionTaken = 36, "the policy takes no instruction";
     NoInstruction = 40, "no instruction has been set";
     ObservationLength = 41, "a channel of the observation has another length than the contract's";
@@ -75,16 +77,16 @@ statuses! {
     NoObservation = 62, "there is no observation in this period";
     Stale = 63, "the observation is no later than the last one";
     Late = 64, "more control periods were missed than tolerated";
-    Jump = 65, "the timestamp lies farther behind the last one than can be";
-    UnknownOption = 70, "a flag, a rule or a fallback has no meaning to this library";
-    GuardLimits = 71, "the limits of an action element leave nothing of the contract's range";
+    Jump = 65, "the timestamp is further ahead of the last one than max_jump allows";
+    UnknownOption = 70, "a flag, a rule or a fallback is unknown to this library";
+    GuardLimits = 71, "the limits of an action element do not overlap the contract's range";
     GuardRate = 72, "a rate is not a finite number above zero";
     GuardSafeAction = 73, "the safe action is outside the limits";
     GuardTimeConstant = 74, "the time constant of the decay is not a finite number above zero";
-    ChannelMissing = 80, "a channel of the observation is not given, or the policy has more than one";
-    ChannelUnknown = 81, "a channel is given that is none of the observation, or is given twice";
+    ChannelMissing = 80, "a channel of the observation is missing, or the policy has more than one";
+    ChannelUnknown = 81, "a channel is given that is not an observation channel, or is given twice";
     ChannelType = 82, "a channel is given with elements of another type";
-    ChannelRows = 83, "the rows of a channel do not lie one behind the other";
+    ChannelRows = 83, "the rows of a channel are not contiguous";
     SwapControlPeriod = 90, "the other policy has another control period";
     SwapChannels = 91, "a channel of the other policy differs";
     SwapInstruction = 92, "the other policy has no instruction yet";

@@ -1,4 +1,5 @@
-//! What C sees: structs of plain numbers and pointers. Those that may grow begin with `struct_bytes`.
+//! Types of the C interface: structs of plain numbers and pointers. Structs that may grow begin
+//! with `struct_bytes`.
 
 mod describe;
 mod options;
@@ -8,5 +9,5 @@ pub use describe::*;
 pub use options::*;
 pub use reports::*;
 
-/// No channel, element or other number: stands where there is none.
+/// Number that stands for no channel, element or other index.
 pub const LADS_NONE: u32 = u32::MAX;

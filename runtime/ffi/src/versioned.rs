@@ -1,8 +1,9 @@
 //! Structs that can grow without breaking programs: each begins with its own size as the caller knows it.
 //!
-//! A newer library with an older caller reads and writes only what the caller has; an older library with a newer caller only what it
-//! knows itself, and refuses options that it does not know unless they are zero. What can fail: a size that is smaller than the
-//! struct ever was, or no size at all ([`Status::StructBytes`]).
+//! A newer library with an older caller reads and writes only the caller's fields; an older library
+//! with a newer caller only the fields that it knows itself, and refuses options that it does not
+//! know unless they are zero. What can fail: a size that is smaller than the struct ever was, or no
+//! size at all ([`Status::StructBytes`]).
 
 use core::ptr;
 use core::slice;
@@ -10,10 +11,11 @@ use core::slice;
 use crate::memory::{Area, check};
 use crate::status::Status;
 
-/// Bytes that no struct of this interface will ever reach: a larger size is taken for memory that was never set.
+/// Upper bound of the size of all structs of this interface: a larger size is taken for
+/// uninitialised memory.
 const MOST: usize = 4096;
 
-/// Bytes of the size at the head.
+/// Number of bytes of the size at the head.
 const HEAD: usize = size_of::<u32>();
 
 /// A struct of C whose first field is `struct_bytes`.
@@ -21,11 +23,12 @@ const HEAD: usize = size_of::<u32>();
 /// # Safety
 /// The type is `repr(C)`, its first field is a `u32`, and any bits make a value.
 pub unsafe trait Versioned: Copy + Default {
-    /// Its size when it first appeared. Fields that are added later come behind, and `Default` is what they mean when absent.
+    /// Size of the struct when it first appeared. Fields that are added later follow, and `Default`
+    /// is their value when absent.
     const FIRST_BYTES: usize;
 }
 
-/// What the caller says about the size, once it is plausible.
+/// Returns the size that the caller states, once it is plausible.
 ///
 /// # Safety
 /// If the pointer is not null, a `u32` is readable there.
@@ -40,10 +43,10 @@ unsafe fn stated<T: Versioned>(pointer: *const T) -> Result<usize, Status> {
     }
 }
 
-/// The area of options: all that the caller has.
+/// Returns the area of options: all of the caller's bytes.
 ///
 /// # Safety
-/// As [`read`]; a null pointer has an empty area.
+/// The conditions of [`read`] hold; a null pointer has an empty area.
 pub unsafe fn read_area<T: Versioned>(pointer: *const T) -> Result<Area, Status> {
     if pointer.is_null() {
         return Ok(Area::read(pointer, 0));
@@ -53,10 +56,10 @@ pub unsafe fn read_area<T: Versioned>(pointer: *const T) -> Result<Area, Status>
     Ok(Area::read(pointer.cast::<u8>(), bytes))
 }
 
-/// The area of a report: what both know.
+/// Returns the area of a report: the bytes that both sides know.
 ///
 /// # Safety
-/// As [`write`]; a null pointer has an empty area.
+/// The conditions of [`write`] hold; a null pointer has an empty area.
 pub unsafe fn write_area<T: Versioned>(pointer: *mut T) -> Result<Area, Status> {
     if pointer.is_null() {
         return Ok(Area::written(pointer, 0));

@@ -1,4 +1,5 @@
-//! The C functions, called from Rust as C would call them: the same results as the controller's.
+//! Tests of the C functions, called from Rust as C would call them: their results equal the
+//! controller's.
 
 mod host;
 

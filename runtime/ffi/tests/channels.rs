@@ -1,4 +1,5 @@
-//! Policies of any channels through C: images, integers, noise, none of an instruction, chunks without a selection.
+//! Tests of policies with any channels through C: images, integers, noise, no instruction, chunks
+//! without a selection.
 
 mod host;
 

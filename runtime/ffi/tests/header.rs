@@ -1,4 +1,4 @@
-//! The header that is checked in is the one that cbindgen makes of the crate.
+//! Tests that the checked-in header is the one that cbindgen makes of the crate.
 
 use std::fmt::Write;
 use std::fs;
@@ -6,14 +6,15 @@ use std::path::{Path, PathBuf};
 
 use lads_ffi::Status;
 
-/// To write the header anew: `LADS_WRITE_HEADER=1 cargo test -p lads-ffi --test header`
+/// Environment variable to write the header anew:
+/// `LADS_WRITE_HEADER=1 cargo test -p lads-ffi --test header`
 const WRITE: &str = "LADS_WRITE_HEADER";
 
 fn crate_path(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
 }
 
-/// `NotSetUp` as `NOT_SET_UP`.
+/// Converts `NotSetUp` to `NOT_SET_UP`.
 fn screaming(name: &str) -> String {
     let mut out = String::new();
     for (i, letter) in name.chars().enumerate() {
@@ -25,11 +26,11 @@ fn screaming(name: &str) -> String {
     out
 }
 
-/// The statuses in C. They come out of a macro, which cbindgen does not look into.
+/// Formats the statuses in C. They come out of a macro, which cbindgen does not expand.
 fn statuses() -> String {
     let sized = "defined(__cplusplus) || __STDC_VERSION__ >= 202311L";
     let mut out = format!(
-        "/**\n * What came of a call; 0 is good. The numbers are stable: none ever changes its meaning.\n */\n\
+        "/**\n * Result of a call; 0 means success. The numbers are stable: no number ever changes its meaning.\n */\n\
          enum lads_status\n#if {sized}\n  : int32_t\n#endif // {sized}\n {{\n"
     );
     for &(status, text) in Status::ALL {
@@ -72,7 +73,7 @@ fn the_header_is_not_stale() {
     );
 }
 
-/// What the archive is made of is not what it offers.
+/// Internal items of the archive are not declared in the header.
 #[test]
 fn nothing_internal_is_declared() {
     let header = fs::read_to_string(crate_path("include/lads.h")).expect("it is there");

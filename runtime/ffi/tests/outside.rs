@@ -1,5 +1,6 @@
-//! What a user of the installed library gets: the archive's symbols and size, and programs in C and C++ that are built outside
-//! the tree, through pkg-config and `CMake`, as strictly as compilers can, and that pass the shipped policy's self-test.
+//! Tests of the installed library as a user gets it: the archive's symbols and size, and programs
+//! in C and C++ that are built outside the tree, through pkg-config and `CMake`, as strictly as
+//! compilers can, and that pass the shipped policy's self-test.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -10,15 +11,19 @@ use std::sync::OnceLock;
 use lads_compiler::{Bundle, Image, compile};
 use lads_ffi::LADS_STACK_BYTES;
 
-/// What an archive may ask of its environment: the functions that compilers call on their own.
+/// Functions that an archive may require from its environment: those that compilers call on their
+/// own.
 const ENVIRONMENT: [&str; 2] = ["memcpy", "memset"];
 
 const STRICT: [&str; 4] = ["-Wall", "-Wextra", "-Werror", "-pedantic"];
 
-/// Bytes of machine code and constants in a stripped program with what one family of policies needs, at most.
+/// Largest size, in bytes, of machine code and constants of a stripped program with the operations
+/// of one family of policies.
 const MOST_TEXT: usize = 200 * 1024;
 
-/// The same with all operations. Those of images are 80 KB of it, most of that convolutions and pools for three instruction sets.
+/// Largest size, in bytes, of machine code and constants of a stripped program with all operations.
+/// The operations on images are 80 KB of it, most of that convolutions and pools for three
+/// instruction sets.
 const MOST_TEXT_OF_ALL: usize = 360 * 1024;
 
 fn crate_path(path: &str) -> PathBuf {
@@ -29,7 +34,7 @@ fn scratch(path: &str) -> PathBuf {
     Path::new(env!("CARGO_TARGET_TMPDIR")).join(path)
 }
 
-/// The installed library.
+/// Returns the installed library.
 fn prefix() -> &'static Path {
     static PREFIX: OnceLock<PathBuf> = OnceLock::new();
     PREFIX.get_or_init(|| {
@@ -40,7 +45,7 @@ fn prefix() -> &'static Path {
     })
 }
 
-/// The shipped policy's image, in a file.
+/// Returns the shipped policy's image, in a file.
 fn kitchen() -> &'static Path {
     static IMAGE: OnceLock<PathBuf> = OnceLock::new();
     IMAGE.get_or_init(|| {
@@ -70,7 +75,7 @@ fn run(command: &mut Command) -> String {
     stdout
 }
 
-/// Whether a program is there; says that the test is skipped if not.
+/// Returns whether a program exists; prints that the test is skipped if not.
 fn have(program: &str) -> bool {
     let there = Command::new(program).arg("--version").output().is_ok();
     if !there {
@@ -79,7 +84,7 @@ fn have(program: &str) -> bool {
     there
 }
 
-/// `nm`'s lines: kind and name.
+/// Returns the lines of `nm`: kind and name.
 fn symbols(path: &Path, options: &[&str]) -> Vec<(char, String)> {
     let listing = run(Command::new("nm").args(options).arg(path));
     let lines = listing.lines().filter_map(|line| {
@@ -143,8 +148,9 @@ fn the_archive_exports_lads_functions_and_asks_for_nothing_else() {
     }
 }
 
-/// The archive is optimised on its own, so its loops could fall back to one element at a time unseen. What the C program executes
-/// under `callgrind`, opening, self-test and 100 control steps, is counted: 270 million instructions with AVX2, 348 million
+/// Checks that the archive is vectorised: it is optimised on its own, so its loops could fall back
+/// to one element at a time unseen. The instructions of the C program under `callgrind`, opening,
+/// self-test and 100 control steps, are counted: 270 million instructions with AVX2, 348 million
 /// where the softmax was not vectorised.
 #[cfg(target_arch = "x86_64")]
 #[test]
@@ -193,7 +199,7 @@ fn a_c_program_links_without_panics_and_stays_small() {
     assert!(text <= MOST_TEXT_OF_ALL, "{text} bytes of text");
 }
 
-/// Bytes of machine code and constants of a program, which is stripped.
+/// Returns the number of bytes of machine code and constants of a program, which it strips.
 fn text_of(program: &Path) -> usize {
     run(Command::new("strip").arg(program));
     let sizes = run(Command::new("size").arg(program));
@@ -206,7 +212,7 @@ fn text_of(program: &Path) -> usize {
     text
 }
 
-/// The C program with an archive that holds these groups of operations.
+/// Builds the C program with an archive that holds these groups of operations.
 fn with_operations(operations: &str, name: &str) -> PathBuf {
     let (archive, program) = (scratch(&format!("{name}.a")), scratch(name));
     run(Command::new(crate_path("archive.sh"))
@@ -360,7 +366,7 @@ fn the_stack_is_what_the_header_says() {
     let printed = run(Command::new(&program).arg(kitchen()));
     let bytes: usize = printed.trim().parse().expect("it prints a number");
     println!("stack: {bytes} bytes");
-    // Three per cent of growth are tolerated before somebody has to look.
+    // Three per cent of growth are tolerated; more needs a decision.
     assert!(
         bytes * 100 <= LADS_STACK_BYTES * 103,
         "{bytes} bytes of stack, LADS_STACK_BYTES is {LADS_STACK_BYTES}"

@@ -1,5 +1,5 @@
-//! Memory areas of a call that overlap where one of them is written: refused, whichever two they are. And where there is room for an
-//! action, one is written, whatever else is wrong.
+//! Tests that memory areas of a call that overlap where one of them is written are refused,
+//! whichever two they are. If there is room for an action, one is written, whatever else is wrong.
 
 #![allow(
     clippy::cast_ptr_alignment,
@@ -15,7 +15,7 @@ use lads_ffi::*;
 
 const OBSERVATION: [f32; 3] = [0.3, -0.2, 0.7];
 
-/// A controller that has taken a step, and its action.
+/// Returns a controller that has taken a step, and its action.
 fn started(host: &mut Host) -> (*mut LadsController, [f32; 2]) {
     let c = host.controller();
     instruct(c, 0);
@@ -24,7 +24,7 @@ fn started(host: &mut Host) -> (*mut LadsController, [f32; 2]) {
     (c, action)
 }
 
-/// Memory for two structs that may lie over each other.
+/// Memory for two structs that may overlap.
 #[repr(C, align(8))]
 struct Shared([u8; 512]);
 

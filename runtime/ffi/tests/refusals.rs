@@ -1,4 +1,4 @@
-//! Every wrong pointer, length, image or order of calls is refused with its number.
+//! Tests that every wrong pointer, length, image or order of calls is refused with its number.
 
 mod host;
 

@@ -1,4 +1,4 @@
-//! Another image takes the place of the one that runs, through C.
+//! Tests that another image takes the place of the running one, through C.
 
 mod host;
 
@@ -9,7 +9,7 @@ use host::support::{Image, Random, shapes};
 use host::*;
 use lads_ffi::*;
 
-/// Change per second, and per control period of 0.08 s.
+/// Largest change per second; a control period takes 0.08 s.
 const RATE: [f32; 2] = [0.5, 0.25];
 
 fn set_up(host: &mut Host, tests: bool, instructs: bool) -> *mut LadsController {
@@ -37,7 +37,7 @@ fn swap(running: *mut LadsController, next: *mut LadsController) -> (Status, u32
     (status, report.channel)
 }
 
-/// Actions of some steps, after what `between` does.
+/// Returns the actions of some steps, each taken after `between` runs.
 fn run(image: &Image, between: impl Fn(*mut LadsController, usize)) -> Vec<[f32; 2]> {
     let mut host = Host::new(image.clone());
     let c = set_up(&mut host, true, true);
@@ -104,7 +104,7 @@ fn the_new_policy_goes_on_from_the_last_action_and_the_old_workspace_is_free() {
     let mut held_back = 0;
     for t in 0..60 {
         if t % 10 == 5 {
-            // The idle one is set up anew beside the one that runs, and takes over.
+            // The idle controller is set up anew while the other runs, and takes over.
             let idle = if running.cast() == one.memory() {
                 &mut *two
             } else {
@@ -132,7 +132,7 @@ fn the_new_policy_goes_on_from_the_last_action_and_the_old_workspace_is_free() {
         last = action;
     }
     assert!(held_back > 0, "a swap that asks for no jump proves nothing");
-    // The account goes on over all of them.
+    // The counters continue over all of them.
     assert_eq!(
         (counters(running).periods, counters(running).policy),
         (60, 60)

@@ -1,4 +1,4 @@
-//! Structs that begin with their size: older and newer callers, and sizes that are none.
+//! Tests of structs that begin with their size: older and newer callers, and invalid sizes.
 
 mod host;
 

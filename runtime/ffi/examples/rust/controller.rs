@@ -3,7 +3,7 @@
 //!
 //! `cargo run --release -p lads-ffi --example controller -- models/kitchen.onnx kbls 100`
 //!
-//! The hardware is a stand-in: joints follow their velocity commands exactly.
+//! The hardware is simulated: joints follow their velocity commands exactly.
 
 use std::error::Error;
 use std::process::ExitCode;

@@ -1,4 +1,4 @@
-//! What is said around the steps: what was executed, stop and go, and the account.
+//! Calls around the steps: the executed action, stop and resume, and the counters.
 
 use super::{report_area, status, told};
 use crate::handle;
@@ -7,11 +7,12 @@ use crate::status::Status;
 use crate::types::{LadsController, LadsCounters, LadsReport, Refusal};
 use crate::versioned;
 
-/// Tells what was really executed since the last step, where that is not the action that `lads_step` wrote; the next step
-/// continues from there. `report`, which may be null, names the element that was refused.
+/// Tells which action was executed since the last step, if it is not the one that `lads_step`
+/// wrote; the next step continues from there. `report`, which may be null, names the element that
+/// was refused.
 ///
 /// # Safety
-/// As `lads_self_test`; `action` points to `action_len` readable elements; `report` is null or may be read and written.
+/// The conditions of `lads_self_test` hold; `action` points to `action_len` readable elements; `report` is null or may be read and written.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_executed(
     controller: *mut LadsController,
@@ -42,30 +43,30 @@ pub unsafe extern "C" fn lads_executed(
     unsafe { told(result, report) }
 }
 
-/// Stops as `LADS_FALLBACK_STOP` does, from the next step on.
+/// Stops the controller as `LADS_FALLBACK_STOP` does, from the next step on.
 ///
 /// # Safety
-/// As `lads_self_test`.
+/// The conditions of `lads_self_test` hold.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_stop(controller: *mut LadsController) -> Status {
     // SAFETY: the caller guarantees the controller.
     status(unsafe { handle::handle(controller) }.map(|handle| handle.guarded.stop()))
 }
 
-/// Ends a stop. The episode goes on where it was; `lads_reset` starts a new one.
+/// Ends a stop. The episode continues where it was; `lads_reset` starts a new one.
 ///
 /// # Safety
-/// As `lads_self_test`.
+/// The conditions of `lads_self_test` hold.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_resume(controller: *mut LadsController) -> Status {
     // SAFETY: the caller guarantees the controller.
     status(unsafe { handle::handle(controller) }.map(|handle| handle.guarded.resume()))
 }
 
-/// Tells what the guard has done since the controller was set up.
+/// Writes the counts of the guard's actions and interventions since the controller was set up.
 ///
 /// # Safety
-/// As `lads_self_test`; `counters` may be read and written.
+/// The conditions of `lads_self_test` hold; `counters` may be read and written.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_counters(
     controller: *mut LadsController,

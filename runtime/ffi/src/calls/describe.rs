@@ -1,4 +1,4 @@
-//! Opening a policy and asking what it is.
+//! Opens a policy and describes it.
 
 use core::ffi::c_char;
 
@@ -11,8 +11,9 @@ use crate::status::Status;
 use crate::types::{LadsChannel, LadsContract, LadsElement, LadsInstruction, LadsPolicy};
 use crate::versioned::{self, Versioned};
 
-/// Opens a program image: checks all of it, its checksum included, and copies nothing. The image is aligned to 4 bytes (64 is
-/// better); bytes behind its own length are ignored. After a failure `policy` holds no policy.
+/// Opens a program image: checks all of it, its checksum included, and copies nothing. The image is
+/// aligned to 4 bytes (64 is better); bytes after its own length are ignored. After a failure
+/// `policy` holds no policy.
 ///
 /// # Safety
 /// `image` points to `image_bytes` readable bytes that do not change as long as the policy or a controller of it is used;
@@ -27,11 +28,12 @@ pub unsafe extern "C" fn lads_policy_open(
     unsafe { lads_policy_open_within(image, image_bytes, Policy::WORK_LIMIT, policy) }
 }
 
-/// As `lads_policy_open`, but refuses an image whose most expensive control step takes more than so many multiply-adds;
-/// `lads_policy_open` refuses those that take some seconds on a fast core.
+/// Opens a program image, like `lads_policy_open`, but refuses one whose most expensive control
+/// step takes more than `work_limit` multiply-adds; `lads_policy_open` refuses images that take
+/// some seconds on a fast core.
 ///
 /// # Safety
-/// As `lads_policy_open`.
+/// The conditions of `lads_policy_open` hold.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_policy_open_within(
     image: *const u8,
@@ -43,10 +45,10 @@ pub unsafe extern "C" fn lads_policy_open_within(
     status(unsafe { handle::open(image, image_bytes, work_limit, policy) })
 }
 
-/// Tells what `find` finds in the contract.
+/// Writes the record that `find` finds in the contract.
 ///
 /// # Safety
-/// As `lads_policy_contract`.
+/// The conditions of `lads_policy_contract` hold.
 unsafe fn tell<T: Versioned>(
     policy_at: *const LadsPolicy,
     to: *mut T,
@@ -66,10 +68,10 @@ unsafe fn tell<T: Versioned>(
     unsafe { versioned::write(to, &found) }
 }
 
-/// Writes a number for a name.
+/// Writes the number that belongs to a name.
 ///
 /// # Safety
-/// `name` points to `name_len` bytes, `number` may be written, and the policy is as in `lads_policy_contract`.
+/// `name` points to `name_len` bytes, `number` may be written, and the policy meets the conditions of `lads_policy_contract`.
 unsafe fn find(
     policy_at: *const LadsPolicy,
     name: *const c_char,
@@ -96,7 +98,7 @@ unsafe fn find(
     Ok(())
 }
 
-/// Byte by byte: comparing slices would call `bcmp`, which not every C library has.
+/// Compares byte by byte: comparing slices would call `bcmp`, which not every C library has.
 fn same(text: &str, name: &[u8]) -> bool {
     text.bytes().eq(name.iter().copied())
 }
@@ -105,7 +107,8 @@ fn channel_of<'a>(contract: &Contract<'a>, number: u32) -> Result<Channel<'a>, S
     contract.channel(ChannelId(number)).ok_or(Status::NoChannel)
 }
 
-/// Tells what a policy expects and promises. The texts live as long as the image.
+/// Writes the contract of a policy: its sizes, numbers of channels and texts. The texts live as
+/// long as the image.
 ///
 /// # Safety
 /// `policy` is null or a `lads_policy`, zeroed or opened; `contract` may be read and written.
@@ -118,7 +121,7 @@ pub unsafe extern "C" fn lads_policy_contract(
     status(unsafe { tell(policy, contract, |policy| Ok(LadsContract::of(policy))) })
 }
 
-/// How many channels a policy has; 0 when it was not opened.
+/// Returns the number of channels of a policy; 0 if it was not opened.
 ///
 /// # Safety
 /// `policy` is null or a `lads_policy`, zeroed or opened.
@@ -129,10 +132,10 @@ pub unsafe extern "C" fn lads_channel_count(policy: *const LadsPolicy) -> u32 {
         .map_or(0, |policy| policy.contract().channels().count() as u32)
 }
 
-/// Tells about a channel by its number, from 0.
+/// Writes the description of a channel, by its number from 0.
 ///
 /// # Safety
-/// As `lads_policy_contract`.
+/// The conditions of `lads_policy_contract` hold.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_channel(
     policy: *const LadsPolicy,
@@ -151,7 +154,7 @@ pub unsafe extern "C" fn lads_channel(
 /// Finds the number of a channel by its name, byte for byte.
 ///
 /// # Safety
-/// As `lads_policy_contract`; `name` points to `name_len` bytes, no zero needed; `number` may be written.
+/// The conditions of `lads_policy_contract` hold; `name` points to `name_len` bytes, no zero needed; `number` may be written.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_channel_find(
     policy: *const LadsPolicy,
@@ -170,10 +173,11 @@ pub unsafe extern "C" fn lads_channel_find(
     })
 }
 
-/// Tells about an element of a channel: name, unit, limits, joint, interface, and what its values mean.
+/// Writes the description of an element of a channel: name, unit, limits, joint, interface, and the
+/// meaning of its values.
 ///
 /// # Safety
-/// As `lads_policy_contract`.
+/// The conditions of `lads_policy_contract` hold.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_channel_element(
     policy: *const LadsPolicy,
@@ -195,10 +199,10 @@ pub unsafe extern "C" fn lads_channel_element(
     })
 }
 
-/// Tells about an instruction that the policy knows, by its number.
+/// Writes an instruction that the policy knows, by its number.
 ///
 /// # Safety
-/// As `lads_policy_contract`.
+/// The conditions of `lads_policy_contract` hold.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_policy_instruction(
     policy: *const LadsPolicy,
@@ -219,7 +223,7 @@ pub unsafe extern "C" fn lads_policy_instruction(
 /// Finds the number of the instruction with this id, or of the first with this text, up to the case of ASCII letters and white space.
 ///
 /// # Safety
-/// As `lads_policy_contract`; `name` points to `name_len` bytes, no zero needed; `number` may be written.
+/// The conditions of `lads_policy_contract` hold; `name` points to `name_len` bytes, no zero needed; `number` may be written.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_policy_find_instruction(
     policy: *const LadsPolicy,

@@ -1,4 +1,4 @@
-//! What the policy is told: instructions, and the rules for what is left to chance.
+//! Sets the instruction, and the rules for random choices.
 
 use lads_core::{Decision, Instruction, Noise, similarity};
 
@@ -10,12 +10,12 @@ use crate::types::{
     LADS_NOISE_SEEDED, LADS_NOISE_ZERO, LadsController, LadsPolicy, LadsReport, Refusal,
 };
 
-/// Follows a known instruction, by its number, from the next step on: a new episode. `LADS_STATUS_INSTRUCT_FAILED`, which a sound
-/// image never causes, leaves the controller without an instruction. A policy whose contract has no instruction channel needs
-/// none.
+/// Sets a known instruction, by its number, to follow from the next step on: a new episode.
+/// `LADS_STATUS_INSTRUCT_FAILED`, which never occurs with a sound image, leaves the controller
+/// without an instruction. A policy whose contract has no instruction channel needs none.
 ///
 /// # Safety
-/// As `lads_self_test`.
+/// The conditions of `lads_self_test` hold.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_set_instruction(
     controller: *mut LadsController,
@@ -28,12 +28,13 @@ pub unsafe extern "C" fn lads_set_instruction(
     }))
 }
 
-/// Follows an instruction given as word embeddings, `len = n * word_dim` elements, as `lads_set_instruction` does. A policy follows
-/// any words, whatever they say: ask `lads_instruction_similarity` first. `report`, which may be null, names the word element that was
-/// refused.
+/// Sets an instruction given as word embeddings, `len = n * word_dim` elements, like
+/// `lads_set_instruction`. A policy follows any words, whatever they say: ask
+/// `lads_instruction_similarity` first. `report`, which may be null, names the word element that
+/// was refused.
 ///
 /// # Safety
-/// As `lads_self_test`; `words` points to `len` readable elements; `report` is null or may be read and written.
+/// The conditions of `lads_self_test` hold; `words` points to `len` readable elements; `report` is null or may be read and written.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_set_words(
     controller: *mut LadsController,
@@ -64,9 +65,10 @@ pub unsafe extern "C" fn lads_set_words(
     unsafe { told(result, report) }
 }
 
-/// Says which known instruction a sentence, given as word embeddings, is most like, and how much, from -1 to 1. Whoever lets people
-/// say what they like compares it with the contract's `acceptance` and refuses what is below: the policy follows any words.
-/// Words are compared, not meanings. `number` may be null.
+/// Finds the known instruction that a sentence, given as word embeddings, is most similar to, and
+/// its similarity, from -1 to 1. A program that accepts free sentences compares the similarity with
+/// the contract's `acceptance` and refuses sentences below: the policy follows any words. Words are
+/// compared, not meanings. `number` may be null.
 ///
 /// # Safety
 /// `policy` is null or a `lads_policy`, zeroed or opened; `words` points to `len` readable elements; `number` is null or may be
@@ -83,8 +85,10 @@ pub unsafe extern "C" fn lads_instruction_similarity(
     status(unsafe { nearest(policy, words, len, number, similarity) })
 }
 
+/// Finds the known instruction that words are most similar to.
+///
 /// # Safety
-/// As [`lads_instruction_similarity`].
+/// The conditions of [`lads_instruction_similarity`] hold.
 unsafe fn nearest(
     policy_at: *const LadsPolicy,
     words: *const f32,
@@ -132,10 +136,11 @@ unsafe fn nearest(
     Ok(())
 }
 
-/// Picks indices by argmax (`temperature` not above 0) or at random with the softmax of the scores over the temperature.
+/// Sets how indices are picked: by argmax (`temperature` not above 0) or at random with the softmax
+/// of the scores over the temperature.
 ///
 /// # Safety
-/// As `lads_self_test`.
+/// The conditions of `lads_self_test` hold.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_set_decision(
     controller: *mut LadsController,
@@ -151,10 +156,11 @@ pub unsafe extern "C" fn lads_set_decision(
     status(unsafe { handle::handle(controller) }.map(|handle| handle.guarded.set_decision(rule)))
 }
 
-/// Says where the noise of a policy comes from: `LADS_NOISE_ZERO`, or `LADS_NOISE_SEEDED` with a seed, whose generator starts again.
+/// Sets the source of a policy's noise: `LADS_NOISE_ZERO`, or `LADS_NOISE_SEEDED` with a seed,
+/// whose generator starts again.
 ///
 /// # Safety
-/// As `lads_self_test`.
+/// The conditions of `lads_self_test` hold.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_set_noise(
     controller: *mut LadsController,

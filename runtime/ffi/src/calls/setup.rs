@@ -1,4 +1,4 @@
-//! Setting a controller up, testing it, and putting one in the place of another.
+//! Sets a controller up, tests it, and replaces a running one by another.
 
 use core::ffi::c_void;
 
@@ -9,7 +9,8 @@ use crate::status::Status;
 use crate::types::{LadsController, LadsOptions, LadsPolicy, LadsReport, LadsSelfTest, Refusal};
 use crate::versioned;
 
-/// Bytes of workspace for one controller of a policy; 0 when the policy was not opened.
+/// Returns the number of bytes of workspace for one controller of a policy; 0 if the policy was not
+/// opened.
 ///
 /// # Safety
 /// `policy` is null or a `lads_policy`, zeroed or opened.
@@ -19,11 +20,12 @@ pub unsafe extern "C" fn lads_workspace_bytes(policy: *const LadsPolicy) -> usiz
     unsafe { handle::policy(policy) }.map_or(0, crate::workspace_bytes)
 }
 
-/// Sets up a controller with its guard in `workspace`, aligned to `LADS_WORKSPACE_ALIGN`, which need not be initialised.
-/// `options` may be null; so may `controller`, the handle for the other functions, which is the address of the workspace; so may
-/// `report`, which names the element of the action whose limits, rate or safe action were refused. The controller is not armed unless
-/// `LADS_ARM_WITHOUT_SELF_TEST` is set. A refusal touches nothing of the workspace: a controller that runs there goes on. To end
-/// a controller, stop using it: nothing has to be undone.
+/// Sets up a controller with its guard in `workspace`, aligned to `LADS_WORKSPACE_ALIGN`, which
+/// need not be initialised. `options` may be null; so may `controller`, the handle for the other
+/// functions, which is the address of the workspace; so may `report`, which names the element of
+/// the action whose limits, rate or safe action were refused. The controller is not armed unless
+/// `LADS_ARM_WITHOUT_SELF_TEST` is set. A refusal leaves the workspace untouched: a controller that
+/// runs there continues. To end a controller, stop using it: nothing has to be undone.
 ///
 /// # Safety
 /// `policy` is null or a `lads_policy`, zeroed or opened; `workspace` points to `workspace_bytes` writable bytes that nobody
@@ -73,8 +75,9 @@ pub unsafe extern "C" fn lads_controller_init(
     unsafe { told(result, report) }
 }
 
-/// Replays the recorded episode, compares indices and actions, and arms the controller if it passes, disarms it if not. Afterwards
-/// there is no instruction. `result`, which may be null, gets what a test has measured, or where it failed.
+/// Replays the recorded episode, compares indices and actions, and arms the controller if it
+/// passes, disarms it if not. Afterwards there is no instruction. `result`, which may be null, gets
+/// the test's measurements, or the place of its failure.
 ///
 /// # Safety
 /// `controller` is null or a workspace, zeroed or set up by `lads_controller_init`, and no other call uses it now;
@@ -106,19 +109,22 @@ pub unsafe extern "C" fn lads_self_test(
     outcome.map_or_else(Status::from, |_| Status::Ok)
 }
 
-/// Puts another policy in the place of the one that runs, between two steps. `next` is a controller that was set up beside it, in a
-/// workspace of its own, tested and given its instruction, which another thread may have done while this one ran.
+/// Replaces the running policy by another one, between two steps. `next` is a controller that was
+/// set up in a workspace of its own, tested and given its instruction, which another thread may
+/// have done while `controller` ran.
 ///
-/// Afterwards `next` is the one to step: it goes on with the limits, rates, fallback, counters and clock of `controller`, whose options
-/// stay in force, and its first action is no further from the last executed one than the rate allows. It is armed if both
-/// were. `controller` is ended, and its workspace is yours again, for the policy after that.
+/// Afterwards `next` is the one to step: it continues with the limits, rates, fallback, counters
+/// and clock of `controller`, whose options stay in force, and its first action is no further from
+/// the last executed one than the rate allows. It is armed if both were. `controller` is ended, and
+/// its workspace is yours again, for the policy after that.
 ///
-/// Refused, `controller` goes on as if nothing had been asked, and `next` stays as it was: another control period
-/// (`LADS_STATUS_SWAP_CONTROL_PERIOD`), a channel that differs, which the report names (`LADS_STATUS_SWAP_CHANNELS`), no instruction
-/// where `controller` has one (`LADS_STATUS_SWAP_INSTRUCTION`). `report` may be null.
+/// If the swap is refused, neither controller changes. The reasons are another control period
+/// (`LADS_STATUS_SWAP_CONTROL_PERIOD`), a channel that differs, which the report names
+/// (`LADS_STATUS_SWAP_CHANNELS`), no instruction where `controller` has one
+/// (`LADS_STATUS_SWAP_INSTRUCTION`). `report` may be null.
 ///
 /// # Safety
-/// As `lads_self_test`, for both controllers; `report` is null or may be read and written.
+/// The conditions of `lads_self_test` hold for both controllers; `report` is null or may be read and written.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_swap(
     controller: *mut LadsController,
@@ -156,18 +162,19 @@ pub unsafe extern "C" fn lads_swap(
 /// Starts a new episode with the same instruction; timestamps may start anew. A stop stays a stop.
 ///
 /// # Safety
-/// As `lads_self_test`.
+/// The conditions of `lads_self_test` hold.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_reset(controller: *mut LadsController) -> Status {
     // SAFETY: the caller guarantees the controller.
     status(unsafe { handle::handle(controller) }.map(|handle| handle.guarded.reset()))
 }
 
-/// Brings code, weights and KV caches into the processor's caches, so that the next step is as fast as the ones after it: for right
-/// before the first step, or after a pause. Costs two to three control steps and changes nothing.
+/// Brings code, weights and KV caches into the processor's caches, so that the next step is as fast
+/// as the ones after it; call it right before the first step, or after a pause. It costs two to
+/// three control steps and changes nothing.
 ///
 /// # Safety
-/// As `lads_self_test`.
+/// The conditions of `lads_self_test` hold.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_warm(controller: *mut LadsController) -> Status {
     // SAFETY: the caller guarantees the controller.

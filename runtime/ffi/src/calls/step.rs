@@ -1,4 +1,5 @@
-//! One control period: an action that may be executed is written wherever there is room for one, whatever else is wrong.
+//! Steps the controller: one control period writes an action that may be executed wherever there is
+//! room for one, whatever else is wrong.
 
 use lads_core::{ChannelId, Data, GuardReport, InputError, MAX_OBSERVATIONS, Policy, Tick};
 
@@ -10,21 +11,24 @@ use crate::types::{
 };
 use crate::versioned;
 
-/// The most channels that a control step can take: all observations and the noise.
+/// Largest number of channels that a control step can take: all observations and the noise.
 const MOST: usize = MAX_OBSERVATIONS + 1;
 
-/// One control period of a policy with one observation channel of floats: writes an action that is finite and inside limits and rates,
-/// whatever the observation is. `LADS_STATUS_OK` says that it is the policy's; any other status why it is the fallback's. A null
-/// `observation` says that there is none. `tick` may be null, then nothing is stale or late; so may `report`, which names the
-/// channel and the element that was refused.
+/// Runs one control period of a policy with one observation channel of floats: writes an action
+/// that is finite and inside limits and rates, whatever the observation is. `LADS_STATUS_OK` means
+/// that it is the policy's action; any other status states why it is the fallback's. A null
+/// `observation` means that there is none. `tick` may be null, then nothing is stale or late; so
+/// may `report`, which names the channel and the element that was refused.
 ///
-/// Nothing is written, and no period is counted, only where there is no room for an action: `controller` is null, misaligned or
-/// not set up; `action` is null, misaligned, of another length than the contract's, or overlaps the workspace or the image. All
-/// else that is wrong with the call, such as a `tick` or a `report` that is misaligned, has no size or overlaps, is a period without an
-/// observation: the fallback's action is written, the status says what was wrong, and so does the report unless it is what is wrong.
+/// Nothing is written, and no period is counted, only where there is no room for an action:
+/// `controller` is null, misaligned or not set up; `action` is null, misaligned, of another length
+/// than the contract's, or overlaps the workspace or the image. Any other fault of the call, such
+/// as a `tick` or a `report` that is misaligned, has no size or overlaps, makes it a period without
+/// an observation: the fallback's action is written, the status states the fault, and so does the
+/// report unless it is at fault.
 ///
 /// # Safety
-/// As `lads_self_test`; `observation` and `action` point to as many elements as they say; `tick` and `report` are null or may
+/// The conditions of `lads_self_test` hold; `observation` and `action` point to as many elements as they say; `tick` and `report` are null or may
 /// be read, and the report written.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_step(
@@ -51,12 +55,13 @@ pub unsafe extern "C" fn lads_step(
     unsafe { frame.period(&given) }
 }
 
-/// One control period of any policy, as `lads_step`: `inputs` are the values of all observation channels, in any order; a null pointer
-/// says that there is no observation. Values for a noise channel, as many as the contract's `noise_len` in the order in which they
-/// are used, take the place of the library's.
+/// Runs one control period of any policy, like `lads_step`: `inputs` are the values of all
+/// observation channels, in any order; a null pointer means that there is no observation. Values
+/// for a noise channel, as many as the contract's `noise_len` in the order in which they are used,
+/// take the place of the library's.
 ///
 /// # Safety
-/// As `lads_step`; `inputs` points to `count` inputs, whose data are as many values of their type as they say.
+/// The conditions of `lads_step` hold; `inputs` points to `count` inputs, whose data are as many values of their type as they say.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn lads_step_channels(
     controller: *mut LadsController,
@@ -79,7 +84,7 @@ pub unsafe extern "C" fn lads_step_channels(
     unsafe { frame.period(&given) }
 }
 
-/// What every step has besides the observation.
+/// Arguments of every step besides the observation.
 struct Frame {
     controller: *mut LadsController,
     tick: *const LadsTick,
@@ -88,18 +93,18 @@ struct Frame {
     report: *mut LadsReport,
 }
 
-/// What was observed, as C gives it.
+/// An observation in C's form.
 trait Observation {
-    /// Refuses values that lie where the call writes.
+    /// Refuses values that overlap memory that the call writes.
     ///
     /// # Safety
     /// The observation is as [`lads_step`] or [`lads_step_channels`] asks.
     unsafe fn apart_from(&self, written: &[Area]) -> Result<(), Status>;
 
-    /// Takes a step with it.
+    /// Takes a step with the observation.
     ///
     /// # Safety
-    /// As [`apart_from`](Self::apart_from), which has to have agreed.
+    /// The conditions of [`apart_from`](Self::apart_from) hold, and it has returned `Ok`.
     unsafe fn step(
         &self,
         handle: &mut Handle,
@@ -109,8 +114,10 @@ trait Observation {
 }
 
 impl Frame {
+    /// Runs one control period with an observation.
+    ///
     /// # Safety
-    /// As [`lads_step`].
+    /// The conditions of [`lads_step`] hold.
     unsafe fn period(&self, given: &impl Observation) -> Status {
         // SAFETY: the caller guarantees the controller.
         let handle = match unsafe { handle::handle(self.controller) } {
@@ -161,7 +168,7 @@ impl Frame {
         refusal.status
     }
 
-    /// Whether an action can be written.
+    /// Checks whether an action can be written.
     fn room(&self, handle: &Handle) -> Result<(), Status> {
         check(self.action, self.action_len)?;
         if self.action_len != handle.guarded.controller().policy().contract().action_len() {
@@ -173,10 +180,11 @@ impl Frame {
         )
     }
 
-    /// Whether a report can be written: it lies over nothing that the call reads or writes.
+    /// Checks whether a report can be written, without overlap with anything that the call reads or
+    /// writes.
     ///
     /// # Safety
-    /// As [`lads_step`].
+    /// The conditions of [`lads_step`] hold.
     unsafe fn reported(&self, others: &[Area], given: &impl Observation) -> Result<(), Status> {
         // SAFETY: the caller guarantees all of it.
         unsafe {
@@ -191,10 +199,10 @@ impl Frame {
         }
     }
 
-    /// The clock of the period.
+    /// Reads the clock of the period.
     ///
     /// # Safety
-    /// As [`lads_step`].
+    /// The conditions of [`lads_step`] hold.
     unsafe fn clock(&self, written: &[Area]) -> Result<Option<Tick>, Status> {
         if self.tick.is_null() {
             return Ok(None);
@@ -210,7 +218,7 @@ impl Frame {
     }
 }
 
-/// The values of the only channel.
+/// Values of the only observation channel.
 struct Vector {
     data: *const f32,
     len: usize,
@@ -240,15 +248,17 @@ impl Observation for Vector {
     }
 }
 
-/// The values of any channels.
+/// Values of any channels.
 struct Channels {
     inputs: *const LadsInput,
     count: usize,
 }
 
 impl Channels {
+    /// Returns the inputs of the call.
+    ///
     /// # Safety
-    /// As [`lads_step_channels`].
+    /// The conditions of [`lads_step_channels`] hold.
     unsafe fn all<'a>(&self) -> Result<&'a [LadsInput], Status> {
         if self.inputs.is_null() {
             return Err(Status::NoObservation);
@@ -279,7 +289,7 @@ impl Observation for Channels {
         // SAFETY: the caller guarantees the list.
         let inputs = unsafe { self.all() }?;
         if let Some(beyond) = inputs.get(MOST) {
-            // More than there can be: one is given twice, or is none.
+            // More than there can be: one is given twice, or is not a channel of a step.
             let channel = beyond.channel;
             return Err(InputError::Unknown { channel }.into());
         }
@@ -296,12 +306,12 @@ impl Observation for Channels {
     }
 }
 
-/// Bytes of one value.
+/// Returns the size of one value in bytes.
 fn bytes_of(dtype: u32) -> usize {
     if dtype == LADS_U8 { 1 } else { 4 }
 }
 
-/// The values of one channel, which have to lie one behind the other.
+/// Returns the values of one channel, which have to be contiguous.
 ///
 /// # Safety
 /// The input's data are as many values of its type as it says.

@@ -1,4 +1,4 @@
-//! What a policy says of itself.
+//! Descriptions of a policy: contract, channels, elements and instructions.
 
 use core::ffi::c_char;
 use core::slice;
@@ -11,29 +11,29 @@ use lads_core::{
 use super::{LADS_NOISE_SEEDED, LADS_NOISE_ZERO, LADS_NONE};
 use crate::versioned::versioned;
 
-/// Words of a `lads_policy`.
+/// Number of 64-bit words of a `lads_policy`.
 pub const LADS_POLICY_WORDS: usize = 96;
 
 /// An open policy: a checked view on a program image, in memory of the caller. Its content is private; it may not be moved or
 /// copied after it was opened, and the image has to stay where it is, unchanged, as long as the policy is used.
 #[repr(C)]
 pub struct LadsPolicy {
-    /// Private.
+    /// Private content of the policy.
     pub private_words: [u64; LADS_POLICY_WORDS],
 }
 
-/// A controller with its guard, at the start of its workspace. Private.
+/// A controller with its guard, at the start of its workspace; its content is private. Private.
 pub struct LadsController {
     _private: [u8; 0],
 }
 
-/// Characters in UTF-8, without a zero at the end: print them with "%.*s", (int)text.len, text.data.
+/// Text in UTF-8, without a zero at the end: print it with "%.*s", (int)text.len, text.data.
 #[derive(Clone, Copy)]
 #[repr(C)]
 pub struct LadsText {
-    /// The first character; never null in what a call has written.
+    /// Pointer to the first character; never null after a call wrote it.
     pub data: *const c_char,
-    /// Bytes.
+    /// Number of bytes.
     pub len: usize,
 }
 
@@ -45,7 +45,7 @@ impl LadsText {
         }
     }
 
-    /// The text, as long as what it points into lives.
+    /// Returns the text, which lives as long as the memory that it points into.
     ///
     /// # Safety
     /// The data are those of a text that lives during `'a`.
@@ -62,74 +62,80 @@ impl Default for LadsText {
     }
 }
 
-/// At a full context: it starts again behind the instruction, at timestep 0, and the policy goes on.
+/// Behaviour at a full context: it restarts after the instruction, at timestep 0, and the policy
+/// continues.
 pub const LADS_BEYOND_RESTART: u32 = 0;
 
-/// At a full context: the step is refused (`LADS_STATUS_CONTEXT_FULL`) until `lads_reset` or an instruction.
+/// Behaviour at a full context: the step is refused (`LADS_STATUS_CONTEXT_FULL`) until `lads_reset`
+/// or an instruction.
 pub const LADS_BEYOND_REFUSE: u32 = 1;
 
-/// What a policy expects and promises.
+/// Contract of a policy: its sizes, numbers of channels and texts.
 #[derive(Clone, Copy)]
 #[repr(C)]
 pub struct LadsContract {
-    /// Set to `sizeof(lads_contract)` before the call.
+    /// Size of the struct: set it to `sizeof(lads_contract)` before the call.
     pub struct_bytes: u32,
-    /// Time from one control step to the next, in seconds.
+    /// Control period, the time from one control step to the next, in seconds.
     pub control_period_s: f32,
-    /// Family of policies, for example "lads": to be shown, nothing depends on it.
+    /// Name of the family of policies, for example "lads"; informational, nothing depends on it.
     pub family: LadsText,
-    /// Environment, for example "franka-kitchen".
+    /// Name of the environment, for example "franka-kitchen".
     pub environment: LadsText,
-    /// The environment's version.
+    /// Version of the environment.
     pub environment_version: LadsText,
     /// SHA-256 of the bundle that the image was compiled from, hexadecimal.
     pub bundle_sha256: LadsText,
     /// Language encoder that made the word embeddings; empty without instructions.
     pub encoder: LadsText,
-    /// SHA-256 of its weights, hexadecimal.
+    /// SHA-256 of the language encoder's weights, hexadecimal.
     pub encoder_sha256: LadsText,
-    /// Channels, see `lads_channel`.
+    /// Number of channels, see `lads_channel`.
     pub channel_count: u32,
-    /// Channels that are given in every control step; `lads_step` takes a single one, `lads_step_channels` any number.
+    /// Number of channels that are given in every control step; `lads_step` takes a single one,
+    /// `lads_step_channels` any number.
     pub observation_count: u32,
-    /// Number of the first of them.
+    /// Number of the first observation channel.
     pub observation: u32,
     /// Number of the action's channel.
     pub action: u32,
     /// Number of the channel of word embeddings; `LADS_NONE` for a policy that takes no instruction and needs none.
     pub instruction: u32,
-    /// Instructions that the policy knows by number.
+    /// Number of instructions that the policy knows.
     pub instruction_count: u32,
-    /// Elements of the first observation channel.
+    /// Number of elements of the first observation channel.
     pub observation_len: usize,
-    /// Elements of an action.
+    /// Number of elements of an action.
     pub action_len: usize,
-    /// The most words of an instruction; 0 for a policy that takes none.
+    /// Largest number of words of an instruction; 0 for a policy that takes none.
     pub words_len: usize,
-    /// Elements of a word embedding.
+    /// Number of elements of a word embedding.
     pub word_dim: usize,
-    /// Similarity to a known instruction from which other sentences may be followed, see `lads_instruction_similarity`; above 1
-    /// when none may be.
+    /// Smallest similarity to a known instruction at which another sentence may be followed, see
+    /// `lads_instruction_similarity`; above 1 if none may be.
     pub acceptance: f32,
-    /// Control steps that a context holds; 0 for no such bound.
+    /// Number of control steps that a context holds; 0 if it is unbounded.
     pub context_steps: u32,
-    /// What happens after them: `LADS_BEYOND_RESTART` or `LADS_BEYOND_REFUSE`.
+    /// Behaviour after that many control steps: `LADS_BEYOND_RESTART` or `LADS_BEYOND_REFUSE`.
     pub beyond: u32,
-    /// Indices, such as those of latent plans, that the policy selects from; 0 for one that selects nothing.
+    /// Number of indices, such as those of latent plans, that the policy selects from; 0 for one
+    /// that selects nothing.
     pub index_count: u32,
-    /// Divides the scores when an index is picked at random, unless `lads_set_decision` says otherwise; 0 for argmax.
+    /// Divisor of the scores when an index is picked at random, unless `lads_set_decision` sets
+    /// another one; 0 for argmax.
     pub temperature: f32,
-    /// `LADS_NOISE_ZERO` or `LADS_NOISE_SEEDED`, unless `lads_set_noise` says otherwise.
+    /// Source of noise, `LADS_NOISE_ZERO` or `LADS_NOISE_SEEDED`, unless `lads_set_noise` sets
+    /// another one.
     pub noise: u32,
-    /// Of the picks at random.
+    /// Seed of the random picks.
     pub decision_seed: u64,
-    /// Of the noise.
+    /// Seed of the noise.
     pub noise_seed: u64,
-    /// Values of noise that a control step takes at most; 0 for a policy without noise.
+    /// Largest number of values of noise that a control step takes; 0 for a policy without noise.
     pub noise_len: usize,
-    /// Bytes of the image; what lies behind them is not read.
+    /// Size of the image in bytes; bytes after it are not read.
     pub image_bytes: usize,
-    /// Multiply-adds of the most expensive control step.
+    /// Number of multiply-adds of the most expensive control step.
     pub worst_work: u64,
 }
 
@@ -220,65 +226,69 @@ impl LadsContract {
     }
 }
 
-/// Role: given by the caller in every control step.
+/// Role of a channel that the caller gives in every control step.
 pub const LADS_ROLE_OBSERVATION: u32 = 0;
 
-/// Role: written by every control step.
+/// Role of a channel that every control step writes.
 pub const LADS_ROLE_ACTION: u32 = 1;
 
-/// Role: word embeddings, `[words, elements]`.
+/// Role of a channel of word embeddings, `[words, elements]`.
 pub const LADS_ROLE_INSTRUCTION: u32 = 2;
 
-/// Role: random numbers, drawn by the library unless `lads_step_channels` is given them.
+/// Role of a channel of random numbers, drawn by the library unless `lads_step_channels` is given
+/// them.
 pub const LADS_ROLE_NOISE: u32 = 3;
 
-/// Role: a piece of a demonstration.
+/// Role of a channel that holds a piece of a demonstration.
 pub const LADS_ROLE_DEMONSTRATION: u32 = 4;
 
-/// Type: 32-bit floats.
+/// Type of 32-bit floats.
 pub const LADS_F32: u32 = 0;
 
-/// Type: bytes, such as the pixels of a camera.
+/// Type of bytes, such as the pixels of a camera.
 pub const LADS_U8: u32 = 1;
 
-/// Type: signed 32-bit integers.
+/// Type of signed 32-bit integers.
 pub const LADS_I32: u32 = 2;
 
-/// Quaternions: there are none in the channel.
+/// Order of quaternions for a channel without any.
 pub const LADS_QUATERNIONS_NONE: u32 = 0;
 
-/// Quaternions: scalar first.
+/// Order of quaternions with the scalar first.
 pub const LADS_QUATERNIONS_WXYZ: u32 = 1;
 
-/// Quaternions: scalar last.
+/// Order of quaternions with the scalar last.
 pub const LADS_QUATERNIONS_XYZW: u32 = 2;
 
-/// The most axes of a channel.
+/// Largest number of axes of a channel.
 pub const LADS_MAX_RANK: usize = 4;
 
-/// A channel: a value at the policy's edge.
+/// One channel: an input or output of the policy.
 #[derive(Clone, Copy)]
 #[repr(C)]
 pub struct LadsChannel {
-    /// Set to `sizeof(lads_channel_t)` before the call.
+    /// Size of the struct: set it to `sizeof(lads_channel_t)` before the call.
     pub struct_bytes: u32,
-    /// `LADS_ROLE_OBSERVATION`, `_ACTION`, `_INSTRUCTION`, `_NOISE` or `_DEMONSTRATION`.
+    /// Role of the channel: `LADS_ROLE_OBSERVATION`, `_ACTION`, `_INSTRUCTION`, `_NOISE` or
+    /// `_DEMONSTRATION`.
     pub role: u32,
-    /// Type of its elements: `LADS_F32`, `LADS_U8` or `LADS_I32`.
+    /// Type of the channel's elements: `LADS_F32`, `LADS_U8` or `LADS_I32`.
     pub dtype: u32,
-    /// Axes, 1 to 4.
+    /// Number of axes, 1 to 4.
     pub rank: u32,
     /// Lengths of the axes; 1 beyond the rank.
     pub dims: [u32; LADS_MAX_RANK],
-    /// Elements, in the order of the axes.
+    /// Number of elements, which are in the order of the axes.
     pub len: usize,
-    /// Name.
+    /// Name of the channel.
     pub name: LadsText,
-    /// What its values are relative to, in words, such as "the observed joint position"; empty where the bundle does not say.
+    /// Description of the reference that the values are relative to, such as "the observed joint
+    /// position"; empty where the bundle does not say.
     pub reference: LadsText,
-    /// `LADS_QUATERNIONS_NONE`, `_WXYZ` or `_XYZW`: order of the components of the quaternions in it.
+    /// Order of the components of the channel's quaternions: `LADS_QUATERNIONS_NONE`, `_WXYZ` or
+    /// `_XYZW`.
     pub quaternions: u32,
-    /// 1 when its elements have names and units, 0 for images and the like, whose elements are alike.
+    /// 1 if the elements have names and units, 0 for images and the like, whose elements are alike.
     pub described: u32,
 }
 
@@ -299,7 +309,7 @@ impl Default for LadsChannel {
     }
 }
 
-/// The number by which C knows a type.
+/// Returns the number by which C knows a type.
 pub(crate) fn dtype(dtype: DType) -> u32 {
     match dtype {
         DType::F32 => LADS_F32,
@@ -339,12 +349,12 @@ impl LadsChannel {
     }
 }
 
-/// One element of a channel. Its physical value is reference + offset + scale * value, in the unit, where the reference is what
-/// the channel's is for this joint.
+/// One element of a channel. Its physical value is reference + offset + scale * value, where the
+/// reference is the channel's for this joint.
 #[derive(Clone, Copy)]
 #[repr(C)]
 pub struct LadsElement {
-    /// Set to `sizeof(lads_element)` before the call.
+    /// Size of the struct: set it to `sizeof(lads_element)` before the call.
     pub struct_bytes: u32,
     /// Smallest value, before scale and offset.
     pub min: f32,
@@ -352,15 +362,16 @@ pub struct LadsElement {
     pub max: f32,
     /// Physical value of one unit of the element.
     pub scale: f32,
-    /// Physical value of zero, on top of the channel's reference.
+    /// Physical value for an element of zero, without the channel's reference.
     pub offset: f32,
-    /// Name; empty for an element of a channel without descriptions.
+    /// Name of the element; empty for an element of a channel without descriptions.
     pub name: LadsText,
-    /// Unit, "1" for none.
+    /// Unit of the element; "1" for a dimensionless one.
     pub unit: LadsText,
-    /// Joint that it belongs to; empty for none.
+    /// Joint that the element belongs to; empty for none.
     pub joint: LadsText,
-    /// What of the joint: "position", "velocity", "effort"; empty where the bundle does not say.
+    /// Quantity of the joint: "position", "velocity", "effort"; empty where the bundle does not
+    /// say.
     pub interface: LadsText,
 }
 
@@ -395,7 +406,7 @@ impl LadsElement {
         }
     }
 
-    /// One of many that are alike.
+    /// Makes the description of one of many elements that are alike.
     pub(crate) fn alike(limits: Interval) -> Self {
         Self {
             min: limits.min,
@@ -409,13 +420,13 @@ impl LadsElement {
 #[derive(Clone, Copy)]
 #[repr(C)]
 pub struct LadsInstruction {
-    /// Set to `sizeof(lads_instruction)` before the call.
+    /// Size of the struct: set it to `sizeof(lads_instruction)` before the call.
     pub struct_bytes: u32,
-    /// Short name.
+    /// Short name of the instruction.
     pub id: LadsText,
-    /// What the person says.
+    /// The instruction as a person says it.
     pub text: LadsText,
-    /// Words.
+    /// Number of words.
     pub words_len: usize,
 }
 

@@ -1,62 +1,67 @@
-//! What a caller gives besides the policy: how the guard works, the clock, the values of channels.
+//! Inputs of a caller besides the policy: the guard's options, the clock, the values of channels.
 
 use core::ffi::c_void;
 use core::ptr;
 
 use crate::versioned::versioned;
 
-/// Flag: arm when the controller is set up, without a self-test. Whoever sets it vouches for the policy on this machine.
+/// Flag that arms the controller when it is set up, without a self-test. The caller who sets it
+/// vouches for the policy on this machine.
 pub const LADS_ARM_WITHOUT_SELF_TEST: u32 = 1;
 
-/// Flag: run the same machine code on every processor of the target instead of the widest instructions that this one has.
-/// The results have the same bits.
+/// Flag that runs the same machine code on every processor of the target instead of the widest
+/// instruction set of this one. The results have the same bits.
 pub const LADS_PORTABLE_INSTRUCTIONS: u32 = 2;
 
-/// Fallback: to the safe action, and stay there until `lads_resume`.
+/// Fallback that moves to the safe action and stays there until `lads_resume`.
 pub const LADS_FALLBACK_STOP: u32 = 0;
 
-/// Fallback: the last action again.
+/// Fallback that repeats the last action.
 pub const LADS_FALLBACK_HOLD: u32 = 1;
 
-/// Fallback: towards the safe action with the time constant `decay_s`.
+/// Fallback that moves towards the safe action with the time constant `decay_s`.
 pub const LADS_FALLBACK_DECAY: u32 = 2;
 
-/// Noise: zeros, the mean of what would be drawn.
+/// Noise of zeros, the mean of the standard normal distribution.
 pub const LADS_NOISE_ZERO: u32 = 0;
 
-/// Noise: standard normals; the same seed gives the same values on every target.
+/// Noise of standard normal numbers; the same seed gives the same values on every target.
 pub const LADS_NOISE_SEEDED: u32 = 1;
 
-/// How the guard works. All zero but the size (`lads_options options = {sizeof options};`) is a guard with the contract's limits and
-/// no rate that stops at the first fault. The lists have `action_len` elements and are copied; null stands for the default.
+/// Options of a controller and its guard. All zero but the size
+/// (`lads_options options = {sizeof options};`) means a guard with the contract's limits and no
+/// rate limit that stops at the first fault. The lists have `action_len` elements and are copied;
+/// null means the default.
 #[derive(Clone, Copy)]
 #[repr(C)]
 pub struct LadsOptions {
-    /// Set to `sizeof(lads_options)`.
+    /// Size of the struct: set it to `sizeof(lads_options)`.
     pub struct_bytes: u32,
-    /// `LADS_ARM_WITHOUT_SELF_TEST`, `LADS_PORTABLE_INSTRUCTIONS`, or both.
+    /// Flags: `LADS_ARM_WITHOUT_SELF_TEST`, `LADS_PORTABLE_INSTRUCTIONS`, or both.
     pub flags: u32,
-    /// What to do when the policy's action cannot be used: `LADS_FALLBACK_STOP`, `_HOLD` or `_DECAY`.
+    /// Action to write when the policy's action cannot be used: `LADS_FALLBACK_STOP`, `_HOLD` or
+    /// `_DECAY`.
     pub fallback: u32,
     /// Time constant of the decay, in seconds.
     pub decay_s: f32,
-    /// Missed control periods that are still tolerated between two steps.
+    /// Number of missed control periods between two steps that is still tolerated.
     pub late_after: u32,
-    /// Periods in a row whose observation is missing, stale or refused, in which the last action is repeated and the policy's state is
-    /// kept before the fallback takes over.
+    /// Number of periods in a row whose observation is missing, stale or refused, in which the last
+    /// action is repeated and the policy's state is kept before the fallback takes over.
     pub coast: u32,
-    /// Stops after so many interventions in a row; 0 for never.
+    /// Number of interventions in a row after which the guard stops; 0 for never.
     pub stop_after: u32,
-    /// The farthest that a timestamp may lie behind the last one, in its unit; 0 for any distance. One beyond it is taken for damaged:
-    /// it is refused, and does not count as the last one.
+    /// Largest step from the last timestamp to the next, in its unit; 0 for any. A timestamp
+    /// further ahead is considered corrupt: it is refused, and does not become the last one.
     pub max_jump: u64,
-    /// Smallest actions, where the contract's are not narrower.
+    /// Smallest actions; the contract's apply where they are narrower.
     pub min: *const f32,
-    /// Largest actions, where the contract's are not narrower.
+    /// Largest actions; the contract's apply where they are narrower.
     pub max: *const f32,
-    /// Largest change, in units of the action per second.
+    /// Largest change, in units of the action per second; unlimited if null.
     pub max_rate: *const f32,
-    /// Where the stop and the decay lead, and where the first action starts from; zero, or the limit nearest to it, unless given.
+    /// Action to which the stop and the decay lead, and from which the first action starts; if
+    /// null, zero or the limit nearest to it.
     pub safe_action: *const f32,
 }
 
@@ -83,11 +88,12 @@ impl Default for LadsOptions {
 #[derive(Debug, Clone, Copy)]
 #[repr(C)]
 pub struct LadsTick {
-    /// Set to `sizeof(lads_tick)`.
+    /// Size of the struct: set it to `sizeof(lads_tick)`.
     pub struct_bytes: u32,
-    /// Control periods that have passed without a step since the last one.
+    /// Number of control periods that have passed without a step since the last one.
     pub missed: u32,
-    /// When the observation was taken, in any unit. One that is not later than the last one is stale.
+    /// Time at which the observation was taken, in any unit. An observation that is not later than
+    /// the last one is stale.
     pub timestamp: u64,
 }
 
@@ -107,15 +113,16 @@ impl Default for LadsTick {
 pub struct LadsInput {
     /// Number of the channel.
     pub channel: u32,
-    /// Type of the values, the channel's: `LADS_F32`, `LADS_U8` or `LADS_I32`.
+    /// Type of the values, which is the channel's: `LADS_F32`, `LADS_U8` or `LADS_I32`.
     pub dtype: u32,
-    /// The values, one behind the other in the order of the channel's axes. Null says that there is no observation.
+    /// Pointer to the values, contiguous and in the order of the channel's axes. Null means that
+    /// there is no observation.
     pub data: *const c_void,
-    /// How many values there are.
+    /// Number of values.
     pub len: usize,
-    /// Bytes from one row to the next, a row being what the first axis counts, such as a line of an image: whoever takes pictures
-    /// knows it. A line that is longer than its pixels is refused (`LADS_STATUS_CHANNEL_ROWS`), as the library has no memory to
-    /// bring lines together in: copy them first. 0 says that there is no gap.
+    /// Bytes from one row to the next, where the first axis counts rows, such as the lines of an
+    /// image. A line that is longer than its pixels is refused (`LADS_STATUS_CHANNEL_ROWS`), as the
+    /// library has no memory to pack lines into: copy them first. 0 means that there is no gap.
     pub row_bytes: usize,
 }
 

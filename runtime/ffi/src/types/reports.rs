@@ -1,4 +1,4 @@
-//! What calls report back.
+//! Reports that calls write.
 
 use lads_core::{
     Counters, GuardError, GuardReport, InputError, InstructionError, Intervention, SelfTest,
@@ -9,37 +9,39 @@ use super::LADS_NONE;
 use crate::status::Status;
 use crate::versioned::versioned;
 
-/// What happened in a call: in a control period, or when something was refused.
+/// Report of a call: the result of a control period, or the cause of a refusal.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[repr(C)]
 pub struct LadsReport {
-    /// Set to `sizeof(lads_report)` before the call.
+    /// Size of the struct: set it to `sizeof(lads_report)` before the call.
     pub struct_bytes: u32,
-    /// What the call returned.
+    /// Status that the call returned.
     pub status: i32,
-    /// 1 when the policy took a step; the next five are 0 otherwise.
+    /// 1 if the policy took a step; the next five fields are 0 otherwise.
     pub stepped: u32,
-    /// Control steps since the context began.
+    /// Number of control steps since the context began.
     pub timestep: u32,
-    /// 1 when an index is in force; the next three are 0 otherwise, as for a policy that selects none.
+    /// 1 if an index is in force; the next three fields are 0 otherwise, as for a policy that
+    /// selects none.
     pub has_selected: u32,
     /// The index in force, such as that of a latent plan.
     pub selected: u32,
     /// The largest score of the last selection minus the second largest; infinite with a single one.
     pub margin: f32,
-    /// 1 when this step selected the index, else 0.
+    /// 1 if this step selected the index, else 0.
     pub fresh: u32,
-    /// 1 when the action is the last one again, because the options let so many observations be missed.
+    /// 1 if the last action is repeated because the options tolerate this many missed observations.
     pub coasting: u32,
-    /// 1 when an element of the action was at a limit or beyond and is now at the limit.
+    /// 1 if an element of the action was at a limit or beyond and is now at the limit.
     pub saturated: u32,
-    /// 1 when an element of the action moves as fast as it may, less far than it should.
+    /// 1 if an element of the action moves as fast as it may, less far than it should.
     pub rate_limited: u32,
-    /// The channel that was refused; `LADS_NONE` when it was none.
+    /// Number of the channel that was refused; `LADS_NONE` if none was.
     pub channel: u32,
-    /// The first of its elements that was refused, or the word element; `LADS_NONE` when it was none.
+    /// Index of the first element of the channel that was refused, or of the word element;
+    /// `LADS_NONE` if none was.
     pub element: u32,
-    /// That element's value, for `LADS_STATUS_OUT_OF_LIMITS`; 0 otherwise.
+    /// Value of the refused element, for `LADS_STATUS_OUT_OF_LIMITS`; 0 otherwise.
     pub value: f32,
     /// Smallest value allowed, for `LADS_STATUS_OUT_OF_LIMITS`; 0 otherwise.
     pub min: f32,
@@ -112,7 +114,7 @@ impl From<&Refusal> for LadsReport {
     }
 }
 
-/// A status and what exactly it is about.
+/// A status and the channel and element that it concerns.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Refusal {
     pub status: Status,
@@ -138,7 +140,7 @@ impl Refusal {
         }
     }
 
-    /// What is wrong with the configuration of a guard for this action channel.
+    /// Makes the refusal of a guard's configuration for this action channel.
     pub fn of_guard(error: GuardError, action: u32) -> Self {
         let status = error.into();
         match error {
@@ -223,26 +225,28 @@ impl From<SwapError> for Refusal {
     }
 }
 
-/// What a self-test has measured, or where it failed.
+/// Measurements of a self-test, or the place of its failure.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[repr(C)]
 pub struct LadsSelfTest {
-    /// Set to `sizeof(lads_self_test_t)` before the call.
+    /// Size of the struct: set it to `sizeof(lads_self_test_t)` before the call.
     pub struct_bytes: u32,
-    /// Control steps replayed; 0 when it failed, as are the next two.
+    /// Number of control steps replayed; this and the next two fields are 0 if the test failed.
     pub steps: u32,
     /// FNV-1a, of 32 bits, over the bits of all actions, as little-endian bytes: two targets with the same digest computed the same
     /// bits.
     pub digest: u32,
     /// Largest absolute difference of an action element from the recorded one.
     pub largest_error: f32,
-    /// The first step that failed, counted from 0; `LADS_NONE` when none did.
+    /// Number of the first step that failed, counted from 0; `LADS_NONE` if none did.
     pub failed_step: u32,
-    /// The element of the action that was off, for `LADS_STATUS_SELF_TEST_ACTION`; `LADS_NONE` otherwise.
+    /// Index of the action's element that differed, for `LADS_STATUS_SELF_TEST_ACTION`; `LADS_NONE`
+    /// otherwise.
     pub element: u32,
-    /// What is recorded there: the element's value, or the index for `LADS_STATUS_SELF_TEST_SELECTED`.
+    /// Recorded value at the failure: the element's value, or the index for
+    /// `LADS_STATUS_SELF_TEST_SELECTED`.
     pub expected: f32,
-    /// What this target computed there.
+    /// Value that this target computed at the failure.
     pub got: f32,
 }
 
@@ -312,39 +316,41 @@ impl From<SelfTestError> for LadsSelfTest {
     }
 }
 
-/// What a guard has done since the controller was set up, in control periods. `policy` to `refused` add up to `periods`.
+/// Counts of the guard since the controller was set up, in control periods. `policy` to `refused`
+/// add up to `periods`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(C)]
 pub struct LadsCounters {
-    /// Set to `sizeof(lads_counters_t)` before the call.
+    /// Size of the struct: set it to `sizeof(lads_counters_t)` before the call.
     pub struct_bytes: u32,
-    /// All.
+    /// Number of control periods.
     pub periods: u64,
-    /// With the policy's action.
+    /// Number of periods with the policy's action.
     pub policy: u64,
-    /// Before arming.
+    /// Number of periods before arming.
     pub not_armed: u64,
-    /// While stopped.
+    /// Number of periods while stopped.
     pub stopped: u64,
-    /// Without an observation.
+    /// Number of periods without an observation.
     pub no_observation: u64,
-    /// With a stale observation, or one whose timestamp jumps.
+    /// Number of periods with a stale observation, or one whose timestamp jumps.
     pub stale: u64,
-    /// In which too many periods had been missed.
+    /// Number of periods in which too many periods had been missed.
     pub late: u64,
-    /// With an observation that was not finite.
+    /// Number of periods with an observation that was not finite.
     pub not_finite: u64,
-    /// With an observation outside the contract's limits.
+    /// Number of periods with an observation outside the contract's limits.
     pub out_of_limits: u64,
-    /// That the controller refused for another reason: no instruction, a full context, a wrong length.
+    /// Number of periods in which the controller refused for another reason: no instruction, a full
+    /// context, a wrong length.
     pub refused: u64,
-    /// In which the last action was repeated; counted above as well.
+    /// Number of periods in which the last action was repeated; also counted above.
     pub coasted: u64,
-    /// Missed periods.
+    /// Number of missed periods.
     pub missed: u64,
-    /// With an action at a limit.
+    /// Number of periods with an action at a limit.
     pub saturated: u64,
-    /// With an action that the rate held back.
+    /// Number of periods with an action that the rate limit reduced.
     pub rate_limited: u64,
 }
 

@@ -1,4 +1,4 @@
-//! What a C program would have around the library, for tests that call it as C does.
+//! Memory and helpers of a C program around the library, for tests that call it as C does.
 #![allow(dead_code, reason = "each suite uses its part")]
 
 #[path = "../../../core/tests/support/mod.rs"]
@@ -12,7 +12,7 @@ use support::assemble::parts;
 use support::writer::Parts;
 use support::{Image, Model, Spec};
 
-/// A small LADS policy with a recorded episode.
+/// Makes a small LADS policy with a recorded episode.
 pub fn lads(seed: u64) -> Parts {
     parts(&Model::random(Spec::TINY, seed)).with_golden(12)
 }
@@ -28,14 +28,14 @@ pub const LINE: usize = LADS_WORKSPACE_ALIGN;
 #[repr(C, align(64))]
 pub struct Line(pub [u8; LINE]);
 
-/// Everything that a C program would allocate for one controller.
+/// Memory that a C program would allocate for one controller.
 pub struct Host {
     pub image: Image,
     pub policy: Box<LadsPolicy>,
     pub workspace: Vec<Line>,
 }
 
-/// An opened policy, or why not.
+/// Opens a policy, or returns the reason why not.
 pub fn open(bytes: &[u8]) -> Result<Box<LadsPolicy>, Status> {
     let mut policy = Box::new(LadsPolicy {
         private_words: [u64::MAX; LADS_POLICY_WORDS],
@@ -84,7 +84,7 @@ impl Host {
         (status, made)
     }
 
-    /// A controller that nobody has tested.
+    /// Sets up a controller that is not tested.
     pub fn controller(&mut self) -> *mut LadsController {
         let (status, made) = self.init(&LadsOptions {
             flags: LADS_ARM_WITHOUT_SELF_TEST,
@@ -130,7 +130,7 @@ pub fn counters(controller: *mut LadsController) -> LadsCounters {
     written(|to| unsafe { lads_counters(controller, to) }).expect("it is alive")
 }
 
-/// What is written through a pointer by a function that returns a status.
+/// Returns the value that a function, which returns a status, writes through a pointer.
 pub fn written<T: Default>(f: impl FnOnce(*mut T) -> Status) -> Result<T, Status> {
     let mut value = T::default();
     match f(&raw mut value) {
@@ -139,7 +139,7 @@ pub fn written<T: Default>(f: impl FnOnce(*mut T) -> Status) -> Result<T, Status
     }
 }
 
-/// The values of a channel as C gives them.
+/// Returns the values of a channel in C's form.
 pub fn input(channel: u32, values: &support::Values) -> LadsInput {
     let (dtype, data, len) = match values {
         support::Values::F32(values) => (LADS_F32, values.as_ptr().cast(), values.len()),
@@ -155,7 +155,7 @@ pub fn input(channel: u32, values: &support::Values) -> LadsInput {
     }
 }
 
-/// A control period with any channels.
+/// Runs one control period with any channels.
 pub fn step_channels(
     controller: *mut LadsController,
     inputs: &[LadsInput],
