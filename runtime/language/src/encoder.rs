@@ -35,7 +35,7 @@ impl Encoder {
     /// This takes some seconds: the network is checked against its sha256 and optimised.
     pub fn open(folder: &Path, contract: &Contract) -> Result<Self, LanguageError> {
         let (Some(wanted), Some([most, _])) = (&contract.language, contract.words()) else {
-            return Err(LanguageError::Deaf);
+            return Err(LanguageError::NoInstructions);
         };
         let manifest = Manifest::read(folder, wanted)?;
         manifest.check(folder, wanted)?;

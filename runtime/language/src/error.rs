@@ -16,7 +16,7 @@ pub enum LanguageError {
     #[error(
         "the policy takes no instructions, so no sentence can be put to it; leave the sentence out"
     )]
-    Deaf,
+    NoInstructions,
     /// No environment variable gives the folder of the cache.
     #[error(
         "no folder for the language encoder: none of LADS_CACHE, XDG_CACHE_HOME and HOME is set; set LADS_CACHE"

@@ -61,7 +61,7 @@ fn sleep_until(due: u64) {
         tv_sec: (due / 1_000_000_000) as i64,
         tv_nsec: (due % 1_000_000_000) as _,
     };
-    // An interrupted sleep goes on until the same deadline.
+    // An interrupted sleep continues until the same deadline.
     while rustix::thread::clock_nanosleep_absolute(ClockId::Monotonic, &deadline)
         == Err(rustix::io::Errno::INTR)
     {}

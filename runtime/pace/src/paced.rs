@@ -45,7 +45,7 @@ pub struct Protocol {
 /// An invalid field of a [`Protocol`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{field}: {wrong}; {remedy}")]
-pub struct Senseless {
+pub struct InvalidField {
     /// Name of the field.
     pub field: &'static str,
     /// Fault of the field.
@@ -56,10 +56,10 @@ pub struct Senseless {
 
 impl Protocol {
     /// Refuses rates, times and loads with which nothing can be measured on this machine.
-    pub fn check(&self) -> Result<(), Senseless> {
+    pub fn check(&self) -> Result<(), InvalidField> {
         let senseless = |field, wrong, remedy: &str| {
             let remedy = remedy.to_owned();
-            Err(Senseless {
+            Err(InvalidField {
                 field,
                 wrong,
                 remedy,
@@ -97,7 +97,7 @@ pub struct Report {
     steps: usize,
 }
 
-/// Measures the candidates and the others.
+/// Measures the candidate images and all other contenders.
 pub fn measure(
     candidates: &[Candidate<'_>],
     others: &dyn Others,

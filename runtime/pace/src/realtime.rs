@@ -50,7 +50,7 @@ impl Drop for Realtime {
         if self.fifo.is_ok() {
             let normal =
                 ThreadSchedulePolicy::Normal(thread_priority::NormalThreadSchedulePolicy::Other);
-            // Failing to become less important again harms nobody but this process.
+            // Failing to lower the priority again affects only this process.
             let _ = set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Min, normal);
         }
         if let Some(Ok(())) = self.locked {

@@ -133,9 +133,9 @@ fn summary(values: impl Iterator<Item = u64>, medians: &[f64]) -> Option<Summary
 pub struct Ratio {
     /// Median over the rounds.
     pub median: f64,
-    /// First quartile.
+    /// First quartile over the rounds.
     pub low: f64,
-    /// Third quartile.
+    /// Third quartile over the rounds.
     pub high: f64,
 }
 
