@@ -55,7 +55,7 @@ pub struct Request {
 
 /// Compiles a bundle and writes the requested files.
 pub fn compile(request: Request) -> Result<(), Refusal> {
-    // What is no bundle is refused below, with what it is instead.
+    // A file that is not a bundle is refused below, with its actual kind.
     let bundle = Bundle::open(&request.model).ok();
     let formats = Formats {
         weights: request.weights.0,

@@ -111,7 +111,7 @@ pub fn command(arguments: impl IntoIterator<Item = OsString>) -> u8 {
             return REFUSED;
         }
         Err(help) => {
-            // Help or version; a closed pipe is no failure.
+            // Help or version; a closed pipe is not a failure.
             let _ = help.print();
             return 0;
         }

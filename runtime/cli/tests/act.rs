@@ -77,7 +77,7 @@ fn an_empty_line_starts_a_new_episode() {
     let once = answer(&act(&model, &["--plans"]), episode);
     let twice = answer(&act(&model, &["--plans"]), &format!("{episode}\n{episode}"));
     assert_eq!(twice, once.repeat(2));
-    // Without it the episode goes on: three steps are less than a horizon, so the second plan is drawn later.
+    // Without it the episode continues: three steps are less than a horizon, so the second plan is drawn later.
     let sample = |seed: u32, asked: &str| {
         let seed = seed.to_string();
         answer(

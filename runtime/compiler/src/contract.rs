@@ -55,7 +55,7 @@ pub enum ClearedBy {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Fill {
-    /// Zeros.
+    /// Rows of zeros.
     #[default]
     Zero,
     /// Copies of the oldest row.

@@ -98,7 +98,7 @@ pub enum BundleError {
         /// Fault of the record.
         problem: Line,
     },
-    /// Any other error of this type, with the path of the file.
+    /// Error of a bundle file, with its path.
     #[error("{path}: {source}", path = path.display())]
     File {
         /// Path of the file.

@@ -168,7 +168,7 @@ impl Decision {
 pub enum NoiseKind {
     /// Standard normal numbers of a seeded generator.
     Seeded,
-    /// Zeros.
+    /// Noise of zeros.
     Zero,
 }
 

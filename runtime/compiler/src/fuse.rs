@@ -22,7 +22,7 @@ pub(crate) struct Fused {
     pub graph: Graph,
     /// All inputs, including those that are no longer read.
     pub inputs: Vec<(String, Id)>,
-    /// Requested outputs.
+    /// Requested outputs of the entry.
     pub outputs: Vec<(String, Id)>,
     /// Nodes of type `Record` for the layers whose attention is not computed.
     pub records: Vec<Id>,

@@ -383,7 +383,11 @@ impl<'a, 's> Lowering<'a, 's> {
             let place = if self.g.ty(*id) == Type::I64 {
                 match self.ints.get(id) {
                     Some(&(slot, 0)) => Place::Int(slot),
-                    _ => return Err(format!("output {name} is not an index that an operation computes")),
+                    _ => {
+                        return Err(format!(
+                            "output {name} is not an index that an operation computes"
+                        ));
+                    }
                 }
             } else {
                 // A value that is an input or a constant is copied, so that outputs are the program's own.

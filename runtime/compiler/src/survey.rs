@@ -25,7 +25,10 @@ const FIELDS: [(&str, &str); 6] = [
         "family",
         "the family of policies and its own fields; {\"kind\": \"plain\"} for one graph from observations to an action",
     ),
-    ("environment", "`id` and `version` of the environment that it was made for"),
+    (
+        "environment",
+        "`id` and `version` of the environment that it was made for",
+    ),
     (
         "control_period_s",
         "the time from one control step to the next, in seconds",

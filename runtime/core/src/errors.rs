@@ -271,7 +271,7 @@ pub enum FollowError {
     },
     /// The index is out of range.
     Index {
-        /// Index given.
+        /// Index that was given.
         got: u32,
         /// Number of indices.
         count: u32,

@@ -30,8 +30,8 @@ type Ints = [u32; INT_SLOTS];
 pub(crate) struct Rows {
     /// Number of valid rows.
     pub len: u32,
-    /// For a ring, the row of its memory that holds the oldest; for a KV cache with two halves, the
-    /// half in force.
+    /// Start of the valid rows: for a ring, the row of its memory that holds the oldest; for a KV
+    /// cache with two halves, the half in force.
     pub start: u32,
 }
 
@@ -50,7 +50,7 @@ impl Rows {
 pub(crate) struct Counters {
     /// Number of control steps since the context began.
     pub timestep: u32,
-    /// Index in force.
+    /// Selected index in force.
     pub selected: u32,
     /// Largest score of the last selection minus the second largest.
     pub margin: f32,
@@ -78,7 +78,7 @@ impl Counters {
 /// Source of the noise of a step.
 #[derive(Debug, Clone)]
 pub(crate) enum Draws<'d> {
-    /// Zeros.
+    /// Noise of zeros.
     Zero,
     /// A seeded generator.
     Seeded(Normals),

@@ -52,7 +52,7 @@ pub(crate) struct Sizes {
     pub bank_len: usize,
     /// Plain states that last one step.
     pub scratch_len: usize,
-    /// Noise of the step that draws most.
+    /// Number of elements of noise of the step that draws most.
     pub noise_len: usize,
     /// Period of an unbounded context; 1 for others.
     pub period: u32,

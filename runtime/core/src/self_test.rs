@@ -44,7 +44,7 @@ pub enum SelfTestError {
     Selected {
         /// Number of the step.
         step: u32,
-        /// Recorded index.
+        /// Index in the recorded episode.
         expected: u32,
         /// Index on this target.
         got: u32,
@@ -56,7 +56,7 @@ pub enum SelfTestError {
         step: u32,
         /// Element of the action.
         index: u32,
-        /// Recorded value.
+        /// Value in the recorded episode.
         expected: f32,
         /// Value on this target.
         got: f32,

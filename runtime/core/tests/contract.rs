@@ -285,7 +285,7 @@ fn bytes_behind_the_image_and_sections_of_other_tags_are_ignored() {
     let mut image = lads().image();
     image.0.extend([u32::MAX; 5]);
     assert!(image.policy().checksum_matches());
-    // A tag that nobody knows: the golden section is not found any more.
+    // An unknown tag: the golden section is no longer found.
     let [offset, _] = section_row(Tag::Golden);
     image.0[offset - 1] = u32::from_le_bytes(*b"LATE");
     assert!(image.policy().golden().is_none());

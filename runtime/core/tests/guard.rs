@@ -75,7 +75,7 @@ fn nothing_moves_before_the_self_test_has_passed() {
         assert!(!guarded.is_armed());
         guarded.self_test().expect("the policy is sound");
         assert!(guarded.is_armed());
-        // Idle is no fault.
+        // Being idle is not a fault.
         let refused = Some(Intervention::Refused(StepError::NoInstruction));
         assert_eq!(step(guarded, [0.0; 3]).0.intervention, refused);
         guarded
@@ -318,7 +318,7 @@ fn one_damaged_timestamp_is_refused_itself() {
         [None, None, Some(Intervention::Jump), None, None, None, None]
     );
     assert_eq!((counters.policy, counters.stale), (6, 1));
-    // The bound itself is no jump.
+    // The bound itself is not a jump.
     let (seen, _) = run(80);
     assert_eq!(
         seen,

@@ -43,7 +43,7 @@ fn calls_do_what_their_event_allows() {
     assert_eq!(edit(LAST, &|c| c.record.entry = 7), call(LAST));
     // A chain that begins with otherwise.
     assert_eq!(edit(FIRST, &|c| c.record.otherwise = true), call(FIRST));
-    // Periods where there are none, and none where they are.
+    // A period where none is allowed, and none where one is required.
     assert_eq!(edit(LAST, &|c| c.record.every = 2), call(LAST));
     assert_eq!(edit(LOOK, &|c| c.record.every = 0), call(LOOK));
     assert_eq!(edit(FIRST, &|c| c.record.every = 1), call(FIRST));
@@ -54,7 +54,7 @@ fn calls_do_what_their_event_allows() {
             "{count}"
         );
     }
-    // Rows of what is no ring.
+    // Rows of a state that is not a ring.
     for ring in [CONTEXT, PLAN, 9] {
         assert_eq!(
             edit(LAST, &|c| (c.record.repeat, c.record.count) =
@@ -244,7 +244,7 @@ fn caches_have_the_rows_that_the_longest_context_needs() {
         parts.calls[1].clears.push(0);
     };
     assert_eq!(chunks.sealed_fault(words), state(0));
-    // The instruction's rows are as many as its words, and nothing stands behind them.
+    // The instruction's rows are as many as its words, and no rows follow them.
     assert_eq!(
         chunks.sealed_fault(|parts| parts.calls.insert(0, Call::on(Event::Instruct, 0))),
         call(1)

@@ -160,7 +160,7 @@ fn noise_is_zero_drawn_or_given() {
                 step(controller, &observation).0,
                 denoised(&observation, noise)
             );
-            // The stream goes on over a reset.
+            // The stream continues over a reset.
             controller.reset();
         }
         for i in 0..3 {

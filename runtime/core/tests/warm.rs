@@ -110,7 +110,7 @@ fn before_the_first_step_later_programs_run() {
         if warms {
             controller.warm();
         }
-        // The values of the first layer lie behind its keys, which take two blocks of sixteen tokens.
+        // The values of the first layer follow its keys, which take two blocks of sixteen tokens.
         let width = spec.width();
         let values = &memory.state[32 * width..];
         [0, 1, 2].map(|i| {

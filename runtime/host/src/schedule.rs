@@ -30,7 +30,7 @@ pub enum Steps {
     First,
     /// One control step in every so many; the first among them unless it has a place of its own.
     Every(u32),
-    /// Control steps that no other place names.
+    /// All control steps that no other [`Place`] of the table covers.
     Other,
 }
 

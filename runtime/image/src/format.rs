@@ -66,25 +66,27 @@ macro_rules! tags {
 }
 
 tags! {
-    /// One [`ContractRecord`](crate::records::ContractRecord).
+    /// Section of the one [`ContractRecord`](crate::records::ContractRecord).
     Contract = b"CONT",
-    /// [`ChannelRecord`](crate::records::ChannelRecord)s.
+    /// Section of the [`ChannelRecord`](crate::records::ChannelRecord)s.
     Channels = b"CHAN",
-    /// [`ElementRecord`](crate::records::ElementRecord)s, which the channels point into.
+    /// Section of the [`ElementRecord`](crate::records::ElementRecord)s, which the channels point
+    /// into.
     Elements = b"ELEM",
-    /// [`InstructionRecord`](crate::records::InstructionRecord)s.
+    /// Section of the [`InstructionRecord`](crate::records::InstructionRecord)s.
     Instructions = b"INST",
-    /// UTF-8, zero-padded to a word; [`Text`](crate::records::Text) points into it.
+    /// Section of texts in UTF-8, zero-padded to a word; [`Text`](crate::records::Text) points into
+    /// it.
     Strings = b"STRS",
-    /// [`StateRecord`](crate::records::StateRecord)s.
+    /// Section of the [`StateRecord`](crate::records::StateRecord)s.
     States = b"STAT",
-    /// [`EntryRecord`](crate::records::EntryRecord)s.
+    /// Section of the [`EntryRecord`](crate::records::EntryRecord)s.
     Entries = b"ENTR",
-    /// [`PortRecord`](crate::records::PortRecord)s, which the entries point into.
+    /// Section of the [`PortRecord`](crate::records::PortRecord)s, which the entries point into.
     Ports = b"PORT",
-    /// [`CallRecord`](crate::records::CallRecord)s: the schedule.
+    /// Section of the [`CallRecord`](crate::records::CallRecord)s: the schedule.
     Calls = b"CALL",
-    /// Indices of the states that calls clear, one word each.
+    /// Section of the states that calls clear: their indices, one word each.
     Clears = b"CLRS",
     /// Encoded ops, [`OP_WORDS`](crate::OP_WORDS) words each, the entries' ops one after the other.
     Ops = b"OPS ",

@@ -56,7 +56,7 @@ word_enum! {
 }
 
 record! {
-    /// Elements `offset..offset + len` of either space, read only.
+    /// Elements `offset..offset + len` of the weights or of the arena, read only.
     #[derive(Eq)]
     pub struct Operand {
         /// Space of the operand.

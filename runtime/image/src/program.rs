@@ -129,7 +129,7 @@ impl<'a> Program<'a> {
     /// Returns the ops, in the order in which they run.
     #[inline]
     pub fn ops(&self) -> impl Iterator<Item = Op> + 'a {
-        // Decoded once already, with the zeros behind each.
+        // Decoded once already, with the zeros after each op.
         self.ops
             .iter()
             .filter_map(|words| Op::take(&mut Reader::new(words)))

@@ -65,11 +65,11 @@ word_enum! {
 word_enum! {
     /// Order of the components of the quaternions in a channel.
     pub enum QuaternionOrder {
-        /// No quaternions.
+        /// The channel has no quaternions.
         None = 0,
-        /// Scalar first.
+        /// Quaternions with the scalar first.
         Wxyz = 1,
-        /// Scalar last.
+        /// Quaternions with the scalar last.
         Xyzw = 2,
     }
 }
@@ -133,17 +133,17 @@ word_enum! {
 word_enum! {
     /// Type of a channel's elements.
     pub enum DType {
-        /// 32-bit floats.
+        /// Elements of 32-bit floats.
         F32 = 0,
-        /// Bytes, such as the pixels of a camera.
+        /// Elements of bytes, such as the pixels of a camera.
         U8 = 1,
-        /// Signed 32-bit integers.
+        /// Elements of signed 32-bit integers.
         I32 = 2,
     }
 }
 
 record! {
-    /// One channel.
+    /// Record of one channel.
     pub struct ChannelRecord {
         /// Name of the channel, unique in the image.
         pub name: Text,
@@ -225,12 +225,12 @@ word_enum! {
 word_enum! {
     /// Lifetime of a state.
     pub enum Scope {
-        /// Until another instruction is set.
+        /// The state lasts until another instruction is set.
         Instruction = 0,
-        /// Until the episode ends or the context starts again; rows that the instruct event
-        /// appended stay.
+        /// The state lasts until the episode ends or the context starts again; rows that the
+        /// instruct event appended stay.
         Episode = 1,
-        /// Until the control step ends.
+        /// The state lasts until the control step ends.
         Step = 2,
     }
 }
@@ -238,7 +238,7 @@ word_enum! {
 word_enum! {
     /// Content of the rows that a ring does not have yet, when it is read as a whole.
     pub enum Fill {
-        /// Zeros.
+        /// Rows of zeros.
         Zero = 0,
         /// Copies of the oldest row.
         First = 1,
@@ -334,7 +334,7 @@ record! {
 }
 
 record! {
-    /// One entry.
+    /// Record of one entry.
     pub struct EntryRecord {
         /// Name of the entry, such as `low_level/act`, unique in the image.
         pub name: Text,
@@ -379,9 +379,9 @@ word_enum! {
     pub enum When {
         /// Every control step.
         Always = 0,
-        /// At timestep 0.
+        /// The control step at timestep 0.
         First = 1,
-        /// At multiples of the period, 0 among them.
+        /// Control steps at multiples of the period, 0 among them.
         Every = 2,
     }
 }
@@ -391,7 +391,7 @@ word_enum! {
     pub enum Repeat {
         /// A fixed number of times, `count`.
         Times = 0,
-        /// Once per valid row of the ring with index `count`.
+        /// One run for each valid row of the ring with index `count`.
         Rows = 1,
     }
 }

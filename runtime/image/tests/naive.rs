@@ -81,7 +81,7 @@ fn compare(
 fn episodes_equal_the_naive_model() {
     let model = Model::random(Spec::TINY, 11);
     for words in &model.instructions {
-        // A full context restarts behind the words.
+        // A full context restarts after the words.
         let largest = compare(&model, words, 2 * model.spec.steps + 2, <[f32]>::to_vec);
         assert!(largest < 1e-5, "actions differ by {largest}");
     }

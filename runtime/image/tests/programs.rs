@@ -145,7 +145,7 @@ fn a_full_cache_is_an_error_of_the_run() {
         runner.run(Kind::Instruct, &inputs),
         Err(ExecError::Full { rows, needed })
     );
-    // Programs that know no cache run beside a full one.
+    // Programs without a cache run although the cache is full.
     runner.past = rows;
     assert_eq!(runner.run(Kind::Lookup, &[("plan_index", &[1.0])]), Ok(()));
 }

@@ -186,7 +186,10 @@ pub(crate) fn recorded(path: &Path, plan: &Plan, problems: &mut Problems) -> Opt
             let text = column.and_then(|column| record.get(column)).unwrap_or("0");
             let number = text.parse::<f32>().ok().filter(|number| number.is_finite());
             if number.is_none() {
-                problems.add(&about, format!("row {row}: `{text}` is not a finite number"));
+                problems.add(
+                    &about,
+                    format!("row {row}: `{text}` is not a finite number"),
+                );
             }
             f64::from(number.unwrap_or(0.0))
         };

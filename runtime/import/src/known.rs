@@ -21,7 +21,7 @@ pub(crate) fn known(name: &str) -> Option<Known> {
     match name {
         "base_ang_vel" => vector(&mut term, "rad/s"),
         "base_lin_vel" => vector(&mut term, "m/s"),
-        // Of unit length; a little more for the rounding of whoever computes it.
+        // Of unit length, with a margin for the rounding of the program that computes it.
         "projected_gravity" => {
             vector(&mut term, "1");
             term.min = Some(Each::One(-1.01));

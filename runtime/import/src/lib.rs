@@ -237,7 +237,7 @@ fn known(request: &Request) -> Result<Known, ImportError> {
         let said = said::metadata(model.metadata(), &mut problems);
         take(said, "metadata", &mut problems);
     }
-    // No problem once somebody has said them.
+    // No problem once a description gives them.
     for (about, gain) in lost {
         let (field, said) = match gain {
             Gain::Stiffness => ("stiffness", &robot.action.stiffness),

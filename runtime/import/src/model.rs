@@ -156,7 +156,8 @@ fn edge(
     axes: &BTreeMap<String, usize>,
 ) -> Result<Edge, String> {
     let tensor = value.r#type.as_ref().and_then(|ty| ty.tensor_type.as_ref());
-    let tensor = tensor.ok_or("is not a tensor; export the policy with tensors as inputs and outputs")?;
+    let tensor =
+        tensor.ok_or("is not a tensor; export the policy with tensors as inputs and outputs")?;
     let shape = tensor
         .shape
         .as_ref()

@@ -54,7 +54,7 @@ pub(crate) enum Source {
     Step,
     /// Indicator that is 1 in the first step.
     First,
-    /// Another output of the graphs.
+    /// Value of another output of the graphs.
     Output(Edge),
 }
 

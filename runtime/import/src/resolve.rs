@@ -66,7 +66,10 @@ impl Edges {
         };
         match matches[..] {
             [edge] => Ok(edge),
-            [] => Err(format!("\"{said}\" is not one of them; there are {}", known())),
+            [] => Err(format!(
+                "\"{said}\" is not one of them; there are {}",
+                known()
+            )),
             _ => Err(format!(
                 "\"{said}\" is in several files; say one of {}",
                 known()

@@ -110,7 +110,7 @@ pub(crate) enum From {
     Step,
     /// Indicator that is 1 in the first step of an episode, 0 afterwards.
     First,
-    /// Another output of the graphs.
+    /// Value of another output of the graphs.
     Output(String),
 }
 

@@ -186,7 +186,12 @@ fn term(form: &mut Form, said: &Term, robot: &Robot) {
             "-1.0",
             "the smallest valid value",
         );
-        form.field("max", full.max.as_ref().map(each), "1.0", "the largest valid value");
+        form.field(
+            "max",
+            full.max.as_ref().map(each),
+            "1.0",
+            "the largest valid value",
+        );
         let posture = robot.default_position.clone().map(Each::Many);
         let offset = full
             .offset
@@ -268,7 +273,12 @@ fn action(form: &mut Form, edges: &Edges, robot: &Robot) {
         "-1.0",
         "the smallest value that the robot may get",
     );
-    form.field("max", said.max.as_ref().map(each), "1.0", "the largest value that the robot may get");
+    form.field(
+        "max",
+        said.max.as_ref().map(each),
+        "1.0",
+        "the largest value that the robot may get",
+    );
     match &said.clip {
         Some(bounds) => form.line(format_args!("clip = {}", clip(bounds))),
         None => form.line("# clip = [-100, 100]   # of the raw output, if training had one"),

@@ -247,7 +247,7 @@ fn rounded_gains_are_told_until_somebody_says_them() {
         &format!("{robot}stiffness = 0.0004\ndamping = 0.02\n"),
     );
     case.import().unwrap_or_else(|error| panic!("{error}"));
-    // Four names and three actions, as one public file has it.
+    // Four names and three actions, as in a public file.
     let mut policy = mirror(3);
     says(&mut policy, &[("joint_names", "a,b,c,d")]);
     let told = Case::new(&policy, &robot).refused();

@@ -184,7 +184,7 @@ fn sums<S: Simd, const P: usize>(
             let l = (ky * cols + kx) * wide + channel;
             if whole {
                 // SAFETY: `l` is at most sixteen from the end of `rows * cols * wide` weights, as `channel` is a multiple of sixteen below
-                // `wide`; each place is at most that of the last kernel element, behind which sixteen inputs lie, as compared above.
+                // `wide`; each place is at most that of the last kernel element, after which sixteen inputs follow, as checked above.
                 unsafe {
                     let w = simd.load(sixteen(layer.w, l));
                     for p in 0..P {

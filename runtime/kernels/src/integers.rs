@@ -260,7 +260,7 @@ pub(crate) fn by_pairs<'w, S: Simd, W: Integer + 'w, const P: usize, const R: us
     for round in 0..rounds {
         for (chain, integers) in integers.iter_mut().take(S::CHAINS).enumerate() {
             let pair = round * S::CHAINS + chain;
-            // SAFETY: `pair` is below `PAIRS`, which is how many a group has: rounds times chains are no more.
+            // SAFETY: `pair` is below `PAIRS`, the number in a group: rounds times chains are no more.
             let x = x.map(|x| simd.splat_pair(unsafe { x.get_unchecked(pair) }));
             for p in 0..P {
                 let w = W::load(simd, w(pair, p));

@@ -17,7 +17,7 @@ pub use images::{conv, depthwise, pool, resize};
 /// Applies a non-linearity to `x`.
 pub fn activation(activation: Activation, x: f64) -> f64 {
     match activation {
-        // What is no number stays none.
+        // NaN stays NaN.
         Activation::Relu | Activation::Clipped(_) if x < 0.0 => 0.0,
         Activation::Clipped(bound) if x > f64::from(bound) => f64::from(bound),
         Activation::None | Activation::Relu | Activation::Clipped(_) => x,

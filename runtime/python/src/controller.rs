@@ -55,7 +55,7 @@ impl Settings {
 pub enum Told {
     /// Number of a known instruction.
     Known(u32),
-    /// Word embeddings.
+    /// Word embeddings [words, dim].
     Words(Vec<f32>),
 }
 

@@ -59,7 +59,7 @@ pub fn open(
         cache: cache.map(caches).transpose()?,
     };
     let opened = py.detach(|| {
-        // What is no bundle is refused below, with what it is instead.
+        // A file that is not a bundle is refused below, with its actual kind.
         let asked = formats != Formats::default();
         let bundle = asked.then(|| Bundle::open(&path).ok()).flatten();
         let storage = bundle.map(|bundle| formats.storage(&bundle)).transpose()?;

@@ -29,7 +29,7 @@ pub fn score(outcomes: Vec<(usize, bool)>) -> PyResult<String> {
     }));
     let mut score =
         serde_json::to_value(&score).map_err(|error| ProofError::new_err(error.to_string()))?;
-    // Nobody has looked, so that 0 would be a claim.
+    // It was not measured, so 0 would be a claim.
     if let Some(fields) = score.as_object_mut() {
         fields.remove("un_instructed");
     }

@@ -70,7 +70,7 @@ pub struct Origin {
     pub observation_names: Vec<String>,
     /// Names of the elements of an action.
     pub action_names: Vec<String>,
-    /// Other notes: faults, versions.
+    /// Further facts: faults, versions.
     pub notes: BTreeMap<String, String>,
 }
 

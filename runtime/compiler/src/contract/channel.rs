@@ -27,11 +27,11 @@ pub enum Role {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum DType {
-    /// 32-bit floats.
+    /// Elements of 32-bit floats.
     F32,
-    /// Bytes.
+    /// Elements of bytes, such as the pixels of a camera.
     U8,
-    /// Signed 32-bit integers.
+    /// Elements of signed 32-bit integers.
     I32,
 }
 
@@ -162,12 +162,12 @@ fn one() -> f32 {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum QuaternionOrder {
-    /// No quaternions.
+    /// The channel has no quaternions.
     #[default]
     None,
-    /// Scalar first.
+    /// Quaternions with the scalar first.
     Wxyz,
-    /// Scalar last.
+    /// Quaternions with the scalar last.
     Xyzw,
 }
 

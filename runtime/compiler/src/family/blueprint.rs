@@ -110,7 +110,7 @@ impl Entry {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Times {
     Times(usize),
-    /// Once for each valid row of a ring.
+    /// One run for each valid row of the named ring.
     Rows(String),
 }
 

@@ -115,7 +115,7 @@ fn turned(g: &mut Graph, old: &Graph, id: Id, x: &[Id]) -> Result<Option<Id>, St
             );
             g.slice(last[0], axis, *start, len)?
         }
-        // Constants beside turned views: what pads them.
+        // Constants beside transposed views: their padding.
         (Op::Concat { axis }, _) if x.iter().any(|&id| inner(g, id).is_some()) => {
             let mut last = vec![];
             for &id in x {

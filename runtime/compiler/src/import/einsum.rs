@@ -62,7 +62,7 @@ pub(super) fn einsum(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
     let mut sum = rest.next().ok_or("has no operand")?;
     let later: Vec<Term> = rest.collect();
     for (i, term) in later.iter().enumerate() {
-        // What somebody still needs after this product.
+        // Axes that are still needed after this product.
         let needed = |name: &char| {
             output.contains(name) || later[i + 1..].iter().any(|term| term.axes.contains(name))
         };

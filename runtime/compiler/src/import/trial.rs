@@ -49,8 +49,7 @@ pub(crate) fn trial(graph: &GraphProto, opset: i64, declared: &Declared) -> Vec<
                 refused.push((at, attempt.refused(node, problem)));
             }
             if attempt.builder.graph.ids().len() > MAX_NODES {
-                let problem =
-                    format!("ends the trial: there are more than {MAX_NODES} operations");
+                let problem = format!("ends the trial: there are more than {MAX_NODES} operations");
                 refused.push((usize::MAX, attempt.refused(node, problem)));
                 break;
             }

@@ -5,7 +5,7 @@
 enum Base {
     /// A buffer of the arena.
     Buffer(usize),
-    /// The weights.
+    /// Weights of the image.
     Weights,
 }
 

@@ -118,7 +118,7 @@ fn old_operator_sets_mean_what_they_meant() {
 
 #[test]
 fn conditions_select_exactly() {
-    // Also beside what overflows: the other side is not computed into the result.
+    // Also when the other side overflows: it is not part of the result.
     let small = Small::new()
         .input("a", &[5])
         .weights("limit", &[1], &[0.5])
@@ -219,7 +219,7 @@ proptest! {
                 rest /= lens[axis];
                 at
             });
-            // An axis that nobody names is no axis.
+            // An axis without a name is not an axis.
             let named = |axis: usize| left.contains(&axis) || right.contains(&axis);
             if (0..4).any(|axis| !named(axis) && at[axis] > 0) {
                 continue;

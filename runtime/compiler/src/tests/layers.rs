@@ -41,7 +41,7 @@ fn layers_take_in_what_follows() {
         .output("y", &[2, 6]);
     assert_eq!(names(&agrees(residual)), ["Linear", "Copy", "Linear"]);
 
-    // Somebody else reads the product: it stays.
+    // The product has another reader: it stays.
     let shared = Small::new()
         .input("a", &[2, 6])
         .random("w", &[6, 6])

@@ -66,7 +66,7 @@ fn every_moved_span_is_found() {
 #[test]
 fn two_live_buffers_in_one_place_are_found() {
     for (lowered, placed) in programs() {
-        // Everything at the start of the arena: whatever lives beside something else clashes.
+        // Everything at the start of the arena: buffers that live at the same time clash.
         let mut wrong = placed.clone();
         for op in &mut wrong.ops {
             op.each_span(&mut |span| span.offset = 0);

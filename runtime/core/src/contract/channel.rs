@@ -36,22 +36,22 @@ pub enum Role {
 /// Type of a channel's elements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum DType {
-    /// 32-bit floats.
+    /// Elements of 32-bit floats.
     F32,
-    /// Bytes, such as the pixels of a camera.
+    /// Elements of bytes, such as the pixels of a camera.
     U8,
-    /// Signed 32-bit integers.
+    /// Elements of signed 32-bit integers.
     I32,
 }
 
 /// Order of the components of the quaternions in a channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum QuaternionOrder {
-    /// No quaternions.
+    /// The channel has no quaternions.
     None,
-    /// Scalar first.
+    /// Quaternions with the scalar first.
     Wxyz,
-    /// Scalar last.
+    /// Quaternions with the scalar last.
     Xyzw,
 }
 

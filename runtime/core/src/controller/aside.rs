@@ -20,7 +20,7 @@ impl Controller<'_, '_> {
         if !self.workspace.fits(&self.policy) {
             return;
         }
-        // With a full context there may be nothing to come, but code and weights are the same.
+        // With a full context no step may follow, but code and weights are the same.
         let mut counters = self.begin().map_or(self.counters, |begun| begun.counters);
         let first = counters.timestep == 0;
         // A table by timestep has no row for what only comes later.
@@ -40,7 +40,7 @@ impl Controller<'_, '_> {
             let cleared = cleared
                 .map(|&state| run.clear(state))
                 .all(|done| done.is_ok());
-            // What is appended lies behind the rows that count, where the next step writes too; nothing else is stored. A program
+            // Appended rows follow the valid rows, where the next step writes too; nothing else is stored. A program
             // that fails does so again in the step, which reports it.
             let room = entry.cache == records::NONE || has_room(&tables, &entry, &run.counters);
             if cleared && room && (first || !only_first) {

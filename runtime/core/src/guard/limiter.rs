@@ -152,7 +152,7 @@ impl<'m> Limiter<'m> {
             };
         }
         let changed = self.write(action);
-        // The safe action may lie at a limit; that is nobody's fault.
+        // The safe action may be at a limit; that is not a fault.
         Changed {
             saturated: false,
             ..changed

@@ -130,7 +130,7 @@ impl Walk<'_, '_> {
         let state = self.tables.state(entry.cache as usize).ok_or(refused)?;
         let again = self.appended & bit(entry.cache) != 0;
         if event == Event::Instruct {
-            // How many of its rows count is known once an instruction is set: nothing may stand behind them.
+            // The number of its valid rows is known once an instruction is set: no rows may follow them.
             let words = self.contract.words_len() as u32;
             if again || entry.tokens != words {
                 return Err(refused);

@@ -38,7 +38,7 @@ record! {
         pub kind: UnaryKind,
         /// Slope of `LeakyRelu`, factor of `Elu`; ignored for the others.
         pub alpha: f32,
-        /// The operand.
+        /// Operand of the function.
         pub x: Operand,
         /// Result, of the length of `x`.
         pub y: Span,

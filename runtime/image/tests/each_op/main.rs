@@ -97,7 +97,7 @@ fn every_operation_is_read_as_it_was_written() {
     for op in samples() {
         let words = op.encode();
         assert_eq!(Op::decode(&words), Some(op));
-        // Words behind an op are zero. Attention fills all of them.
+        // Words after an op are zero. Attention fills all of them.
         let mut more = words;
         more[OP_WORDS - 1] = 1;
         if !matches!(op, Op::Attention(_)) {

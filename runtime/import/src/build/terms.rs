@@ -16,7 +16,7 @@ const LAST_ACTION: &str = "last.action";
 const CLOCK: &str = "gait.clock";
 const STEPS: &str = "episode.steps";
 
-/// Nodes that terms share.
+/// Rings and processed values that several terms share.
 pub(super) struct Pieces<'p> {
     plan: &'p Plan,
     /// Number of rows of each channel's ring, for the rings that are inputs already.

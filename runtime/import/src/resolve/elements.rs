@@ -92,7 +92,10 @@ pub(crate) fn spread(
         .iter()
         .find(|value| !value.is_finite() || value.abs() > 1e30)
     {
-        problems.add(about, format!("holds {value}, which is not a finite number"));
+        problems.add(
+            about,
+            format!("holds {value}, which is not a finite number"),
+        );
         return None;
     }
     Some(values)

@@ -291,7 +291,7 @@ impl<const DOT: bool> Simd for Neon<DOT> {
         x: [&Group; R],
     ) -> [[Self::V; P]; R] {
         if DOT {
-            // SAFETY: whoever made `self` has FEAT_DotProd.
+            // SAFETY: the constructor of `self` guarantees FEAT_DotProd.
             unsafe { dot_products(w, x) }
         } else {
             integers::by_pairs(self, w, x)

@@ -70,21 +70,21 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
 
     #[inline(always)]
     fn splat(self, x: f32) -> Self::V {
-        // SAFETY: whoever made `self` has AVX2.
+        // SAFETY: the constructor of `self` guarantees AVX2.
         [unsafe { _mm256_set1_ps(x) }; 2]
     }
 
     #[inline(always)]
     fn load(self, from: &Block) -> Self::V {
         let from = from.as_ptr();
-        // SAFETY: whoever made `self` has AVX2; both halves lie inside the block.
+        // SAFETY: the constructor of `self` guarantees AVX2; both halves lie inside the block.
         unsafe { [_mm256_loadu_ps(from), _mm256_loadu_ps(from.add(8))] }
     }
 
     #[inline(always)]
     fn store(self, [low, high]: Self::V, to: &mut Block) {
         let to = to.as_mut_ptr();
-        // SAFETY: whoever made `self` has AVX2; both halves lie inside the block.
+        // SAFETY: the constructor of `self` guarantees AVX2; both halves lie inside the block.
         unsafe {
             _mm256_storeu_ps(to, low);
             _mm256_storeu_ps(to.add(8), high);
@@ -93,13 +93,13 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
 
     #[inline(always)]
     fn add(self, a: Self::V, b: Self::V) -> Self::V {
-        // SAFETY: whoever made `self` has AVX2.
+        // SAFETY: the constructor of `self` guarantees AVX2.
         unsafe { [_mm256_add_ps(a[0], b[0]), _mm256_add_ps(a[1], b[1])] }
     }
 
     #[inline(always)]
     fn where_negative(self, [low, high]: Self::V, other: Self::V) -> Self::V {
-        // SAFETY: whoever made `self` has AVX2.
+        // SAFETY: the constructor of `self` guarantees AVX2.
         unsafe {
             let zero = _mm256_setzero_ps();
             let negative = |x| _mm256_cmp_ps::<_CMP_LT_OQ>(x, zero);
@@ -112,13 +112,13 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
 
     #[inline(always)]
     fn at_most(self, x: Self::V, bound: Self::V) -> Self::V {
-        // SAFETY: whoever made `self` has AVX2. The second operand is taken where either is not a number.
+        // SAFETY: the constructor of `self` guarantees AVX2. The second operand is taken where either is not a number.
         unsafe { [_mm256_min_ps(bound[0], x[0]), _mm256_min_ps(bound[1], x[1])] }
     }
 
     #[inline(always)]
     fn mul(self, a: Self::V, b: Self::V) -> Self::V {
-        // SAFETY: whoever made `self` has AVX2.
+        // SAFETY: the constructor of `self` guarantees AVX2.
         unsafe { [_mm256_mul_ps(a[0], b[0]), _mm256_mul_ps(a[1], b[1])] }
     }
 
@@ -130,7 +130,7 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
     #[inline(always)]
     fn load_f16(self, from: &[u16; LANES]) -> Self::V {
         let from = from.as_ptr();
-        // SAFETY: whoever made `self` has AVX2 and F16C; both halves lie inside the block.
+        // SAFETY: the constructor of `self` guarantees AVX2 and F16C; both halves lie inside the block.
         unsafe {
             [
                 _mm256_cvtph_ps(_mm_loadu_si128(from.cast())),
@@ -143,7 +143,7 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
     fn round_to_f16(self, v: Self::V) -> [u16; LANES] {
         let mut to = [0; LANES];
         let at: *mut u16 = to.as_mut_ptr();
-        // SAFETY: whoever made `self` has AVX2 and F16C; both halves lie inside the block.
+        // SAFETY: the constructor of `self` guarantees AVX2 and F16C; both halves lie inside the block.
         unsafe {
             let [low, high] = v.map(|v| _mm256_cvtps_ph::<_MM_FROUND_TO_NEAREST_INT>(v));
             _mm_storeu_si128(at.cast(), low);
@@ -155,7 +155,7 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
     #[inline(always)]
     fn load_bf16(self, from: &[u16; LANES]) -> Self::V {
         let from = from.as_ptr();
-        // SAFETY: whoever made `self` has AVX2; both halves lie inside the block.
+        // SAFETY: the constructor of `self` guarantees AVX2; both halves lie inside the block.
         unsafe {
             [from, from.add(8)].map(|from| {
                 let words = _mm256_cvtepu16_epi32(_mm_loadu_si128(from.cast()));
@@ -166,21 +166,21 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
 
     #[inline(always)]
     fn splat_pair(self, pair: &[i16; 2]) -> Self::Pairs {
-        // SAFETY: whoever made `self` has AVX2.
+        // SAFETY: the constructor of `self` guarantees AVX2.
         [unsafe { _mm256_set1_epi32(joined(*pair)) }; 2]
     }
 
     #[inline(always)]
     fn load_i16(self, from: &[i16; 2 * LANES]) -> Self::Pairs {
         let from = from.as_ptr();
-        // SAFETY: whoever made `self` has AVX2; both halves, of sixteen integers each, lie inside the array.
+        // SAFETY: the constructor of `self` guarantees AVX2; both halves, of sixteen integers each, lie inside the array.
         unsafe { [from, from.add(16)].map(|from| _mm256_loadu_si256(from.cast())) }
     }
 
     #[inline(always)]
     fn load_i8(self, from: &[i8; 2 * LANES]) -> Self::Pairs {
         let from = from.as_ptr();
-        // SAFETY: whoever made `self` has AVX2; both halves, of sixteen bytes each, lie inside the array.
+        // SAFETY: the constructor of `self` guarantees AVX2; both halves, of sixteen bytes each, lie inside the array.
         unsafe {
             [from, from.add(16)].map(|from| _mm256_cvtepi8_epi16(_mm_loadu_si128(from.cast())))
         }
@@ -188,13 +188,13 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
 
     #[inline(always)]
     fn zeros(self) -> Self::Integers {
-        // SAFETY: whoever made `self` has AVX2.
+        // SAFETY: the constructor of `self` guarantees AVX2.
         [unsafe { _mm256_setzero_si256() }; 2]
     }
 
     #[inline(always)]
     fn add_products(self, sum: Self::Integers, a: Self::Pairs, b: Self::Pairs) -> Self::Integers {
-        // SAFETY: whoever made `self` has AVX2.
+        // SAFETY: the constructor of `self` guarantees AVX2.
         unsafe {
             [
                 _mm256_add_epi32(sum[0], _mm256_madd_epi16(a[0], b[0])),
@@ -205,20 +205,20 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
 
     #[inline(always)]
     fn add_integers(self, a: Self::Integers, b: Self::Integers) -> Self::Integers {
-        // SAFETY: whoever made `self` has AVX2.
+        // SAFETY: the constructor of `self` guarantees AVX2.
         unsafe { [_mm256_add_epi32(a[0], b[0]), _mm256_add_epi32(a[1], b[1])] }
     }
 
     #[inline(always)]
     fn floats(self, integers: Self::Integers) -> Self::V {
-        // SAFETY: whoever made `self` has AVX2.
+        // SAFETY: the constructor of `self` guarantees AVX2.
         integers.map(|integers| unsafe { _mm256_cvtepi32_ps(integers) })
     }
 
     #[inline(always)]
     fn whole(self, v: Self::V) -> [i16; LANES] {
         let mut to = [0; LANES];
-        // SAFETY: whoever made `self` has AVX2; the array is sixteen numbers of sixteen bits.
+        // SAFETY: the constructor of `self` guarantees AVX2; the array is sixteen numbers of sixteen bits.
         unsafe {
             let [low, high] = v.map(|v| {
                 let bits = _mm256_castps_si256(_mm256_add_ps(v, _mm256_set1_ps(ROUND)));
@@ -233,7 +233,7 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
 
     #[inline(always)]
     fn larger(self, largest: Self::Integers, v: Self::V) -> Self::Integers {
-        // SAFETY: whoever made `self` has AVX2.
+        // SAFETY: the constructor of `self` guarantees AVX2.
         unsafe {
             let magnitude =
                 |v| _mm256_and_si256(_mm256_castps_si256(v), _mm256_set1_epi32(MAGNITUDE));
@@ -246,7 +246,7 @@ impl<const NARROW: bool> Simd for Halves<NARROW> {
 
     #[inline(always)]
     fn largest(self, [low, high]: Self::Integers) -> u32 {
-        // SAFETY: whoever made `self` has AVX2.
+        // SAFETY: the constructor of `self` guarantees AVX2.
         unsafe {
             let eight = _mm256_max_epi32(low, high);
             let four = _mm_max_epi32(
@@ -272,31 +272,31 @@ impl Simd for Avx512 {
 
     #[inline(always)]
     fn splat(self, x: f32) -> Self::V {
-        // SAFETY: whoever made `self` has AVX-512.
+        // SAFETY: the constructor of `self` guarantees AVX-512.
         unsafe { _mm512_set1_ps(x) }
     }
 
     #[inline(always)]
     fn load(self, from: &Block) -> Self::V {
-        // SAFETY: whoever made `self` has AVX-512; a block is sixteen numbers.
+        // SAFETY: the constructor of `self` guarantees AVX-512; a block is sixteen numbers.
         unsafe { _mm512_loadu_ps(from.as_ptr()) }
     }
 
     #[inline(always)]
     fn store(self, v: Self::V, to: &mut Block) {
-        // SAFETY: whoever made `self` has AVX-512; a block is sixteen numbers.
+        // SAFETY: the constructor of `self` guarantees AVX-512; a block is sixteen numbers.
         unsafe { _mm512_storeu_ps(to.as_mut_ptr(), v) }
     }
 
     #[inline(always)]
     fn add(self, a: Self::V, b: Self::V) -> Self::V {
-        // SAFETY: whoever made `self` has AVX-512.
+        // SAFETY: the constructor of `self` guarantees AVX-512.
         unsafe { _mm512_add_ps(a, b) }
     }
 
     #[inline(always)]
     fn where_negative(self, x: Self::V, other: Self::V) -> Self::V {
-        // SAFETY: whoever made `self` has AVX-512.
+        // SAFETY: the constructor of `self` guarantees AVX-512.
         unsafe {
             let negative = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(x, _mm512_setzero_ps());
             _mm512_mask_blend_ps(negative, x, other)
@@ -305,13 +305,13 @@ impl Simd for Avx512 {
 
     #[inline(always)]
     fn at_most(self, x: Self::V, bound: Self::V) -> Self::V {
-        // SAFETY: whoever made `self` has AVX-512. The second operand is taken where either is not a number.
+        // SAFETY: the constructor of `self` guarantees AVX-512. The second operand is taken where either is not a number.
         unsafe { _mm512_min_ps(bound, x) }
     }
 
     #[inline(always)]
     fn mul(self, a: Self::V, b: Self::V) -> Self::V {
-        // SAFETY: whoever made `self` has AVX-512.
+        // SAFETY: the constructor of `self` guarantees AVX-512.
         unsafe { _mm512_mul_ps(a, b) }
     }
 
@@ -322,14 +322,14 @@ impl Simd for Avx512 {
 
     #[inline(always)]
     fn load_f16(self, from: &[u16; LANES]) -> Self::V {
-        // SAFETY: whoever made `self` has AVX-512; a block is sixteen numbers.
+        // SAFETY: the constructor of `self` guarantees AVX-512; a block is sixteen numbers.
         unsafe { _mm512_cvtph_ps(_mm256_loadu_si256(from.as_ptr().cast())) }
     }
 
     #[inline(always)]
     fn round_to_f16(self, v: Self::V) -> [u16; LANES] {
         let mut to = [0; LANES];
-        // SAFETY: whoever made `self` has AVX-512; a block is sixteen numbers.
+        // SAFETY: the constructor of `self` guarantees AVX-512; a block is sixteen numbers.
         unsafe {
             let halves = _mm512_cvtps_ph::<_MM_FROUND_TO_NEAREST_INT>(v);
             _mm256_storeu_si256(to.as_mut_ptr().cast(), halves);
@@ -339,7 +339,7 @@ impl Simd for Avx512 {
 
     #[inline(always)]
     fn load_bf16(self, from: &[u16; LANES]) -> Self::V {
-        // SAFETY: whoever made `self` has AVX-512; a block is sixteen numbers.
+        // SAFETY: the constructor of `self` guarantees AVX-512; a block is sixteen numbers.
         unsafe {
             let words = _mm512_cvtepu16_epi32(_mm256_loadu_si256(from.as_ptr().cast()));
             _mm512_castsi512_ps(_mm512_slli_epi32::<16>(words))
@@ -348,50 +348,50 @@ impl Simd for Avx512 {
 
     #[inline(always)]
     fn splat_pair(self, pair: &[i16; 2]) -> Self::Pairs {
-        // SAFETY: whoever made `self` has AVX-512.
+        // SAFETY: the constructor of `self` guarantees AVX-512.
         unsafe { _mm512_set1_epi32(joined(*pair)) }
     }
 
     #[inline(always)]
     fn load_i16(self, from: &[i16; 2 * LANES]) -> Self::Pairs {
-        // SAFETY: whoever made `self` has AVX-512; the array is sixteen pairs.
+        // SAFETY: the constructor of `self` guarantees AVX-512; the array is sixteen pairs.
         unsafe { _mm512_loadu_si512(from.as_ptr().cast()) }
     }
 
     #[inline(always)]
     fn load_i8(self, from: &[i8; 2 * LANES]) -> Self::Pairs {
-        // SAFETY: whoever made `self` has AVX-512; the array is sixteen pairs.
+        // SAFETY: the constructor of `self` guarantees AVX-512; the array is sixteen pairs.
         unsafe { _mm512_cvtepi8_epi16(_mm256_loadu_si256(from.as_ptr().cast())) }
     }
 
     #[inline(always)]
     fn zeros(self) -> Self::Integers {
-        // SAFETY: whoever made `self` has AVX-512.
+        // SAFETY: the constructor of `self` guarantees AVX-512.
         unsafe { _mm512_setzero_si512() }
     }
 
     #[inline(always)]
     fn add_products(self, sum: Self::Integers, a: Self::Pairs, b: Self::Pairs) -> Self::Integers {
-        // SAFETY: whoever made `self` has AVX-512.
+        // SAFETY: the constructor of `self` guarantees AVX-512.
         unsafe { _mm512_dpwssd_epi32(sum, a, b) }
     }
 
     #[inline(always)]
     fn add_integers(self, a: Self::Integers, b: Self::Integers) -> Self::Integers {
-        // SAFETY: whoever made `self` has AVX-512.
+        // SAFETY: the constructor of `self` guarantees AVX-512.
         unsafe { _mm512_add_epi32(a, b) }
     }
 
     #[inline(always)]
     fn floats(self, integers: Self::Integers) -> Self::V {
-        // SAFETY: whoever made `self` has AVX-512.
+        // SAFETY: the constructor of `self` guarantees AVX-512.
         unsafe { _mm512_cvtepi32_ps(integers) }
     }
 
     #[inline(always)]
     fn whole(self, v: Self::V) -> [i16; LANES] {
         let mut to = [0; LANES];
-        // SAFETY: whoever made `self` has AVX-512; the array is sixteen numbers of sixteen bits.
+        // SAFETY: the constructor of `self` guarantees AVX-512; the array is sixteen numbers of sixteen bits.
         unsafe {
             let bits = _mm512_castps_si512(_mm512_add_ps(v, _mm512_set1_ps(ROUND)));
             _mm256_storeu_si256(to.as_mut_ptr().cast(), _mm512_cvtepi32_epi16(bits));
@@ -401,7 +401,7 @@ impl Simd for Avx512 {
 
     #[inline(always)]
     fn larger(self, largest: Self::Integers, v: Self::V) -> Self::Integers {
-        // SAFETY: whoever made `self` has AVX-512.
+        // SAFETY: the constructor of `self` guarantees AVX-512.
         unsafe {
             let bits = _mm512_castps_si512(v);
             _mm512_max_epi32(
@@ -413,7 +413,7 @@ impl Simd for Avx512 {
 
     #[inline(always)]
     fn largest(self, integers: Self::Integers) -> u32 {
-        // SAFETY: whoever made `self` has AVX-512.
+        // SAFETY: the constructor of `self` guarantees AVX-512.
         unsafe { _mm512_reduce_max_epi32(integers) }.cast_unsigned()
     }
 }

@@ -75,7 +75,7 @@ pub(super) fn conv<T: Real>(
         }
         let sum = conv.activation.map_or(sum, |unary| apply(unary, sum));
         let bound = conv.bound.map(|bound| T::exact(f32::from_bits(bound)));
-        // A sum that is no number stays none, as in the kernels.
+        // A sum that is NaN stays NaN, as in the kernels.
         bound.map_or(sum, |bound| if sum > bound { bound } else { sum })
     })
 }
