@@ -88,10 +88,11 @@ tags! {
     Calls = b"CALL",
     /// Section of the states that calls clear: their indices, one word each.
     Clears = b"CLRS",
-    /// Encoded ops, [`OP_WORDS`](crate::OP_WORDS) words each, the entries' ops one after the other.
+    /// Section of the encoded ops, [`OP_WORDS`](crate::OP_WORDS) words each, the entries' ops one
+    /// after the other.
     Ops = b"OPS ",
-    /// Packed panels in the format that their ops state, biases, tables, words of the known
-    /// instructions.
+    /// Section of the weights: packed panels in the format that their ops state, biases, tables,
+    /// words of the known instructions.
     Weights = b"WGTS",
     /// Empty, or a [`GoldenRecord`](crate::records::GoldenRecord) and the episode that it
     /// describes.

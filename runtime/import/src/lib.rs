@@ -176,7 +176,7 @@ pub fn template(request: &Request) -> Result<String, ImportError> {
     Ok(template::template(&edges, &known.robot, &known.problems))
 }
 
-/// Reads all files.
+/// Reads all files of a request and collects their facts.
 fn known(request: &Request) -> Result<Known, ImportError> {
     let (mut problems, mut notes) = (Problems::default(), vec![]);
     let mut models = vec![];

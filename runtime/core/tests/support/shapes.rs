@@ -53,7 +53,7 @@ fn parts(name: &str) -> Parts {
     parts
 }
 
-/// The channels of [`parts`].
+/// Numbers of the channels of [`parts`].
 pub const OBSERVATION: u32 = 0;
 pub const ACTION: u32 = 1;
 
