@@ -94,8 +94,8 @@ tags! {
     /// Section of the weights: packed panels in the format that their ops state, biases, tables,
     /// words of the known instructions.
     Weights = b"WGTS",
-    /// Empty, or a [`GoldenRecord`](crate::records::GoldenRecord) and the episode that it
-    /// describes.
+    /// Section of the recorded episode: empty, or a [`GoldenRecord`](crate::records::GoldenRecord)
+    /// and the values that it describes.
     Golden = b"GOLD",
 }
 

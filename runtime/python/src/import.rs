@@ -16,10 +16,10 @@ use crate::policy::Policy;
 /// Path of a policy's only file, or paths of all its files.
 #[derive(FromPyObject)]
 pub enum Files {
-    /// The only file.
+    /// Path of the only file.
     #[pyo3(transparent)]
     One(PathBuf),
-    /// Several files, where one's output is the input of another.
+    /// Paths of several files, where one's output is the input of another.
     #[pyo3(transparent)]
     Several(Vec<PathBuf>),
 }

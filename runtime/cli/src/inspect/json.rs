@@ -1,4 +1,4 @@
-//! The report as one JSON object; lengths count elements, sizes are in bytes.
+//! Report of `lads inspect` as one JSON object; lengths count elements, sizes are in bytes.
 
 use lads_core::{Channel, Decision, Element, GuardedController, KnownInstruction, Noise};
 use lads_host::schedule::{Call, Cost, Place, Steps};

@@ -1,4 +1,4 @@
-//! The report for people.
+//! Report of `lads inspect` as text, for people.
 
 use std::fmt::{self, Display, Formatter};
 
