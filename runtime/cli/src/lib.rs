@@ -5,6 +5,8 @@
 //!
 //! Whatever is refused ends with one line on stderr that names the thing and the remedy, and with exit code 2. Files are written as
 //! [`lads_host::output`] has it: whole or not at all, and never over what is read.
+//!
+#![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
 mod act;

@@ -24,6 +24,8 @@
 //! A program computes with 32-bit floats, whatever width the file's have: constants are rounded as the file says, what is computed
 //! keeps its bits. Integers are indices, or whole numbers exact up to 2^24; truth values are numbers that are 0 or 1. Shapes are
 //! static. GRU and LSTM over several steps are unrolled, 512 at most.
+//!
+#![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
 mod aligned;

@@ -20,6 +20,7 @@ pub struct LayerReport {
 
 /// One program of an image.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct ProgramReport {
     /// For example `high_level/record`.
     pub name: String,
@@ -37,6 +38,7 @@ pub struct ProgramReport {
 
 /// What a compilation made.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct CompileReport {
     /// The programs, in the image's order.
     pub programs: Vec<ProgramReport>,

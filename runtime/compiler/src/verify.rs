@@ -13,6 +13,7 @@ use crate::plan::Placed;
 
 /// What is wrong with a memory plan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
 pub enum PlanFault {
     /// The plan changed more of an op than its offsets, or the number of ops or ports.
     #[error("op {op} is not the op that was planned")]

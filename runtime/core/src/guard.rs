@@ -112,6 +112,7 @@ pub enum Intervention {
 
 /// What happened in a guarded control period.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[non_exhaustive]
 pub struct GuardReport {
     /// What the controller says; `None` when it took no step.
     pub step: Option<StepReport>,

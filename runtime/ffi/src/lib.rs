@@ -33,6 +33,8 @@
 //!
 //! The cargo features of this crate are groups of operations that policies are made of, all on by default; `runtime/ffi/archive.sh` says
 //! how to leave out what a policy does not need.
+//!
+#![doc = include_str!("../README.md")]
 #![no_std]
 #![cfg_attr(
     not(test),

@@ -55,6 +55,7 @@ impl Memory {
 
 /// Why there is no memory for a controller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
 pub enum MemoryError {
     /// The policy asks for more than any policy gets.
     #[error(

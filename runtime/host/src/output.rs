@@ -23,6 +23,7 @@ pub type Named<'a> = (&'a str, &'a Path);
 
 /// Why outputs cannot be written where they were asked for.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum OutputError {
     /// One of them is what is read.
     #[error("{output}: it is what {input} reads; name another file")]

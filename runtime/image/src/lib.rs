@@ -7,6 +7,8 @@
 //!
 //! Invariants: no `std`, no allocation, no unsafe code, no panic, whatever the words of an image say. What was checked can fail
 //! on two accounts when it runs: an index outside its table and a full KV cache ([`ExecError`]).
+//!
+#![doc = include_str!("../README.md")]
 #![no_std]
 #![forbid(unsafe_code)]
 #![cfg_attr(

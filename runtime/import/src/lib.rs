@@ -9,6 +9,8 @@
 //! The bundle does the hand-written part too: raw sensor values in, what the robot's motors get out. Nothing is guessed: what neither the
 //! files nor the person say, and what contradicts, is told all at once ([`ImportError::Problems`]), and [`template`] prints the form to
 //! fill in. Files may be hostile; nothing private of them (paths, robot descriptions) enters the bundle, and nothing in them is executed.
+//!
+#![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
 mod build;
@@ -76,6 +78,7 @@ pub struct Imported {
 
 /// Why there is no bundle.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum ImportError {
     /// A file that is no policy at all.
     #[error(transparent)]

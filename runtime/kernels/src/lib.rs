@@ -10,6 +10,8 @@
 //!   step spends its time. Those kernels are compiled once per instruction set and take an [`Isa`], which says which of them to run.
 //!
 //! [`mod@reference`] holds the naive twin of every kernel; `tests/twins.rs` compares them on random shapes.
+//!
+#![doc = include_str!("../README.md")]
 #![no_std]
 #![deny(unsafe_code)]
 #![allow(

@@ -6,6 +6,7 @@ use thiserror::Error;
 
 /// Why there are no word embeddings.
 #[derive(Debug, Error)]
+#[non_exhaustive]
 pub enum LanguageError {
     /// An encoder whose name is no file name.
     #[error(

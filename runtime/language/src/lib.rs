@@ -6,6 +6,8 @@
 //! `lads_core::similarity::nearest` says which known instruction the words are most like and how much, and the contract's
 //! `language.acceptance` from where on that is enough. What can fail: the encoder is missing, damaged or another one; a sentence is empty or longer
 //! than encoder or policy can hear. Each is one line with its remedy.
+//!
+#![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
 mod encoder;
@@ -16,11 +18,6 @@ use std::path::PathBuf;
 
 pub use encoder::Encoder;
 pub use error::LanguageError;
-
-/// README's examples compile as typed.
-#[cfg(doctest)]
-#[doc = include_str!("../../../README.md")]
-pub struct Readme;
 
 /// Names the folder that holds what was downloaded or built once for this user.
 pub const CACHE_VARIABLE: &str = "LADS_CACHE";

@@ -12,6 +12,8 @@
 //!
 //! [`paced`] is the protocol of a whole run with its report. What can fail is a [`BenchError`], one line; a contender that computes
 //! something else than the others is never timed.
+//!
+#![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
 pub mod clock;

@@ -19,6 +19,8 @@
 //! C libraries out of the build.
 //!
 //! What can fail: the disk; and reading a file that is cut off, damaged or something else.
+//!
+#![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
 mod read;
@@ -100,6 +102,7 @@ pub struct Log {
 
 /// Why a log could not be read.
 #[derive(Debug, Error)]
+#[non_exhaustive]
 pub enum LogError {
     /// The file cannot be read.
     #[error("it cannot be read ({0})")]
