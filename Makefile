@@ -20,8 +20,7 @@ PUBLISHED := -p lads-kernels -p lads-image -p lads-core -p lads-compiler -p lads
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report record viewer say language verify tune mutate test test-torch test-full setup lint test-rust test-runtime test-exporter test-python \
-	test-targets wheel sanitize fuzz package msrv deny unused book lock collect train export table reference install bench clean help
+.PHONY: run report record viewer say language verify tune mutate test test-torch test-full setup lint test-rust test-runtime test-exporter test-python test-targets wheel sanitize fuzz package msrv deny unused book lock collect train export table reference install bench clean help
 
 # Says before a build that takes long what it takes, where nothing of it is there yet: $(call first-build,a crate of it,what,minutes)
 first-build = @ls target/release/deps/lib$(1)-*.rlib >/dev/null 2>&1 || echo "The first build of $(2) takes some $(3) minutes of one core; later ones take seconds."

@@ -142,7 +142,7 @@ pub(crate) trait Kernel {
 
 #[cfg(target_arch = "x86_64")]
 mod x86_64 {
-    use core::arch::x86_64::{__cpuid_count, CpuidResult, _xgetbv};
+    use core::arch::x86_64::{__cpuid_count, _xgetbv, CpuidResult};
 
     use super::{Kernel, Level};
     use crate::simd::x86_64::{Avx2, Avx512, Avx512Narrow};

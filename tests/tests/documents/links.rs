@@ -59,10 +59,20 @@ fn a_dead_link_is_found() {
     let all = documents();
     let readme = all.iter().find(|document| document.name == "README.md");
     let readme = readme.expect("the project has one");
-    for to in ["nowhere.md", "#nothing", "ARCHITECTURE.md#nothing", "LICENSE-MIT#top"] {
+    for to in [
+        "nowhere.md",
+        "#nothing",
+        "ARCHITECTURE.md#nothing",
+        "LICENSE-MIT#top",
+    ] {
         assert!(dead(readme, to, &all).is_some(), "{to}");
     }
-    for to in ["docs", "docs/import.md", "https://example.org/x", "#licence"] {
+    for to in [
+        "docs",
+        "docs/import.md",
+        "https://example.org/x",
+        "#licence",
+    ] {
         assert_eq!(dead(readme, to, &all), None, "{to}");
     }
 }
@@ -70,7 +80,9 @@ fn a_dead_link_is_found() {
 #[test]
 fn the_book_has_every_page() {
     let all = documents();
-    let summary = all.iter().find(|document| document.name == "docs/SUMMARY.md");
+    let summary = all
+        .iter()
+        .find(|document| document.name == "docs/SUMMARY.md");
     let summary = summary.expect("mdBook reads it");
     for entry in fs::read_dir(project_path("docs")).expect("it is there") {
         let name = entry.expect("it can be read").file_name();
