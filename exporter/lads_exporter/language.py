@@ -93,7 +93,11 @@ def weights_sha256(encoder):
 def load(encoder):
     """-> tokenizer, model with its hidden layers, sha256 of the weights."""
     import torch  # noqa: F401  transformers gives no models without it
-    from transformers import AutoModel, AutoTokenizer, logging
+
+    try:
+        from transformers import AutoModel, AutoTokenizer, logging
+    except ImportError as error:
+        raise UserError("the language encoder needs transformers: pip install -e 'exporter[language]'") from error
 
     logging.set_verbosity_error()
     logging.disable_progress_bar()

@@ -24,3 +24,8 @@ pub use demonstrations::{collect, dataset, expert, instructions};
 pub use environments::{assets, environment, fit, kitchen, lorel, registry};
 pub use evaluation::{evaluate, faults, results, rollout, spoken, table};
 pub use recordings::{plans, recorder, replay, trace};
+
+/// The examples of the project's README compile as typed.
+#[cfg(all(doctest, feature = "language"))]
+#[doc = include_str!("../../README.md")]
+pub struct Readme;

@@ -1,12 +1,13 @@
-//! The project's documents, read as Markdown: blocks of code, what is set in the font of code, and the commands among them.
+//! The project's documents, read as Markdown: blocks of code, what is set in the font of code, the commands among them, and links.
 //!
 //! The first word of a block's info string is its language; of a block of commands (`sh`) the second one says when a test runs it, see
 //! [`When`]. A block of commands without it is no block of commands to [`Block::when`], and a test refuses that.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use pulldown_cmark::{CodeBlockKind, Event, Parser, Tag, TagEnd};
+use pulldown_cmark::{CodeBlockKind, Event, Options, Parser, Tag, TagEnd};
 
 use crate::project_path;
 
@@ -71,6 +72,15 @@ impl Block {
     }
 }
 
+/// A link or a picture.
+#[derive(Debug, Clone)]
+pub struct Link {
+    /// The line that it stands in, from 1.
+    pub line: usize,
+    /// Where it leads: an address, a path from the document's folder, an anchor, or a path with one.
+    pub to: String,
+}
+
 /// A document with its blocks.
 #[derive(Debug, Clone)]
 pub struct Document {
@@ -80,6 +90,10 @@ pub struct Document {
     pub blocks: Vec<Block>,
     /// Everything else that is set in the font of code.
     pub inline: Vec<String>,
+    /// Its links and pictures.
+    pub links: Vec<Link>,
+    /// The anchors of its headings, as code hosts make them.
+    pub anchors: BTreeSet<String>,
 }
 
 /// All documents of the project, in the order of their names.
@@ -98,10 +112,28 @@ fn read(path: &Path) -> Document {
         name: name.clone(),
         blocks: vec![],
         inline: vec![],
+        links: vec![],
+        anchors: BTreeSet::new(),
     };
+    let line = |start: usize| 1 + text[..start].matches('\n').count();
     let mut open: Option<Block> = None;
-    for (event, range) in Parser::new(&text).into_offset_iter() {
+    let mut heading: Option<String> = None;
+    for (event, range) in Parser::new_ext(&text, Options::ENABLE_TABLES).into_offset_iter() {
+        if let (Some(heading), Event::Text(more) | Event::Code(more)) = (&mut heading, &event) {
+            heading.push_str(more);
+        }
         match (event, &mut open) {
+            (Event::Start(Tag::Heading { .. }), _) => heading = Some(String::new()),
+            (Event::End(TagEnd::Heading(_)), _) => {
+                let new = anchor(&heading.take().unwrap_or_default(), &document.anchors);
+                document.anchors.insert(new);
+            }
+            (Event::Start(Tag::Link { dest_url, .. } | Tag::Image { dest_url, .. }), _) => {
+                document.links.push(Link {
+                    line: line(range.start),
+                    to: dest_url.into_string(),
+                });
+            }
             (Event::Start(Tag::CodeBlock(kind)), _) => {
                 let info = match kind {
                     CodeBlockKind::Fenced(info) => info.into_string(),
@@ -109,7 +141,7 @@ fn read(path: &Path) -> Document {
                 };
                 open = Some(Block {
                     document: name.clone(),
-                    line: 1 + text[..range.start].matches('\n').count(),
+                    line: line(range.start),
                     info,
                     text: String::new(),
                 });
@@ -121,6 +153,22 @@ fn read(path: &Path) -> Document {
         }
     }
     document
+}
+
+/// The anchor of a heading: letters, digits, hyphens and underscores in lower case, blanks as hyphens, and a number where it was taken.
+fn anchor(heading: &str, taken: &BTreeSet<String>) -> String {
+    let lower = heading.to_lowercase();
+    let kept = lower.chars().filter_map(|c| match c {
+        ' ' => Some('-'),
+        c if c.is_alphanumeric() || matches!(c, '-' | '_') => Some(c),
+        _ => None,
+    });
+    let plain: String = kept.collect();
+    let numbered = (1..).map(|n| format!("{plain}-{n}"));
+    let all = std::iter::once(plain.clone()).chain(numbered);
+    all.into_iter()
+        .find(|name| !taken.contains(name))
+        .unwrap_or(plain)
 }
 
 /// Folders that hold nothing of the project's own.
@@ -173,6 +221,16 @@ mod tests {
         );
         assert_eq!(block.commands(), ["make run", "cc a.c     -o a"]);
         assert_eq!(block.when(), Some(When::Always));
+    }
+
+    #[test]
+    fn anchors_are_those_of_code_hosts() {
+        let mut taken = BTreeSet::new();
+        for expected in ["use-it-from-c-and-c", "use-it-from-c-and-c-1"] {
+            let found = anchor("Use it from C and C++", &taken);
+            assert_eq!(found, expected);
+            taken.insert(found);
+        }
     }
 
     #[test]

@@ -110,8 +110,6 @@ fn refusal(model: &Path, error: ImportError) -> Refusal {
             ),
         ),
         ImportError::File(error) => Refusal::of(chain(&error)),
-        error @ ImportError::Compile(_) => {
-            Refusal::with_remedy_inside(model.display(), chain(&error))
-        }
+        error => Refusal::with_remedy_inside(model.display(), chain(&error)),
     }
 }

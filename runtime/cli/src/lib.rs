@@ -8,6 +8,8 @@
 //! Every refusal ends with one line on stderr that names the thing and the remedy, and with exit
 //! code 2. Files are written by [`lads_host::output`]: completely or not at all, and never over an
 //! input.
+//!
+#![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
 mod act;

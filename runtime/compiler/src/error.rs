@@ -36,6 +36,7 @@ impl fmt::Display for Line {
 
 /// Reason why a file cannot be used as a bundle.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum BundleError {
     /// The file cannot be read.
     #[error("cannot be read: {0}; check the path")]
@@ -110,6 +111,7 @@ pub enum BundleError {
 
 /// Reason why a bundle does not compile.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum CompileError {
     /// The graphs contradict the contract.
     #[error(transparent)]

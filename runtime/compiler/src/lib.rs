@@ -26,6 +26,8 @@
 //! rounded as the file states, computed values keep 32 bits. Integers are indices, or whole numbers
 //! exact up to 2^24; truth values are numbers that are 0 or 1. Shapes are static. GRU and LSTM over
 //! several steps are unrolled, 512 at most.
+//!
+#![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
 mod aligned;

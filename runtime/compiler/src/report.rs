@@ -21,6 +21,7 @@ pub struct LayerReport {
 
 /// One program of an image.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct ProgramReport {
     /// Name of the program, for example `high_level/record`.
     pub name: String,
@@ -38,6 +39,7 @@ pub struct ProgramReport {
 
 /// Sizes of the programs that a compilation made.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct CompileReport {
     /// Programs, in the image's order.
     pub programs: Vec<ProgramReport>,

@@ -14,6 +14,7 @@ use crate::plan::Placed;
 
 /// Fault of a memory plan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
 pub enum PlanFault {
     /// The plan changed more of an op than its offsets, or the number of ops or ports.
     #[error("op {op} is not the op that was planned")]

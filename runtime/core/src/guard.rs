@@ -119,6 +119,7 @@ pub enum Intervention {
 
 /// Result of a guarded control period.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[non_exhaustive]
 pub struct GuardReport {
     /// Report of the controller; `None` when it took no step.
     pub step: Option<StepReport>,

@@ -15,29 +15,9 @@
 //! exception: x86-64 treats them as zero while a program runs, so that they cost no time, and other
 //! targets compute with them.
 //!
-//! ```no_run
-//! use lads_core::{Controller, Instruction, Policy, Workspace};
-//!
-//! # fn observe(_: &mut [f32]) {}
-//! # fn actuate(_: &[f32]) {}
-//! fn run(image: &[u8]) -> Result<(), Box<dyn std::error::Error>> {
-//!     let policy = Policy::new_checked(image)?;
-//!     let (mut arena, mut state) = (vec![0.0; policy.arena_len()], vec![0.0; policy.state_len()]);
-//!     let workspace = Workspace::new(&policy, &mut arena, &mut state)?;
-//!     let mut controller = Controller::new(policy, workspace);
-//!     controller.self_test()?;
-//!     controller.set_instruction(Instruction::Id(0))?;
-//!     let mut observation = vec![0.0; policy.contract().observation_len()];
-//!     let mut action = vec![0.0; policy.contract().action_len()];
-//!     loop {
-//!         observe(&mut observation);
-//!         controller.step(&observation, &mut action)?;
-//!         actuate(&action);
-//!     }
-//! }
-//! ```
-//!
 //! The crate lads-image describes the format for the compiler that writes it.
+//!
+#![doc = include_str!("../README.md")]
 #![no_std]
 #![forbid(unsafe_code)]
 #![cfg_attr(

@@ -37,6 +37,8 @@
 //!
 //! The cargo features of this crate are groups of operations of policies, all on by default;
 //! `runtime/ffi/archive.sh` explains how to leave out those that a policy does not need.
+//!
+#![doc = include_str!("../README.md")]
 #![no_std]
 #![cfg_attr(
     not(test),

@@ -16,16 +16,7 @@
 //! is a value that names the thing and the remedy. The feature `compile`, on by default, includes
 //! the compiler; without it, only images are opened.
 //!
-//! ```no_run
-//! # fn run() -> Result<(), Box<dyn std::error::Error>> {
-//! let mut policy = lads_host::open("kitchen.onnx".as_ref())?.load()?;
-//! let instruction = policy.opened().instruction("open the microwave")?;
-//! let mut controller = policy.controller();
-//! controller.self_test()?;
-//! controller.set_instruction(lads_core::Instruction::Id(instruction))?;
-//! # Ok(())
-//! # }
-//! ```
+#![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
 mod aligned;

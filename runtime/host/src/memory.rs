@@ -57,6 +57,7 @@ impl Memory {
 
 /// Reason why there is no memory for a controller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
 pub enum MemoryError {
     /// The policy asks for more memory than any policy gets.
     #[error(

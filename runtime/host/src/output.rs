@@ -25,6 +25,7 @@ pub type Named<'a> = (&'a str, &'a Path);
 
 /// Reason why outputs cannot be written to the given paths.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum OutputError {
     /// An output is also an input.
     #[error("{output}: it is what {input} reads; name another file")]

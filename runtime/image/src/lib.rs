@@ -9,6 +9,8 @@
 //! Invariants: no `std`, no allocation, no unsafe code, no panic, whatever the words of an image
 //! say. A checked program can fail in two ways when it runs: by an index outside its table and by a
 //! full KV cache ([`ExecError`]).
+//!
+#![doc = include_str!("../README.md")]
 #![no_std]
 #![forbid(unsafe_code)]
 #![cfg_attr(

@@ -12,6 +12,8 @@
 //! and every contradiction, is reported at once ([`ImportError::Problems`]), and [`template`]
 //! prints the form to fill in. Files may be hostile; nothing private of them (paths, robot
 //! descriptions) enters the bundle, and nothing in them is executed.
+//!
+#![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
 mod build;
@@ -79,6 +81,7 @@ pub struct Imported {
 
 /// Reason why there is no bundle.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum ImportError {
     /// A file is not a policy at all.
     #[error(transparent)]

@@ -147,7 +147,7 @@ pub(crate) trait Kernel {
 
 #[cfg(target_arch = "x86_64")]
 mod x86_64 {
-    use core::arch::x86_64::{__cpuid, __cpuid_count, _xgetbv};
+    use core::arch::x86_64::{__cpuid_count, _xgetbv, CpuidResult};
 
     use super::{Kernel, Level};
     use crate::simd::x86_64::{Avx2, Avx512, Avx512Narrow};
@@ -183,21 +183,31 @@ mod x86_64 {
     /// Bits of XCR0 for AVX-512: SSE, AVX, the mask registers, the upper halves of the first sixteen ZMM registers, the other sixteen.
     const ZMM_STATE: u64 = 0b1110_0110;
 
+    /// What the CPU says in a leaf.
+    #[allow(
+        unused_unsafe,
+        reason = "a safe function in newer versions of Rust than our `rust-version`"
+    )]
+    fn cpuid(leaf: u32) -> CpuidResult {
+        // SAFETY: every x86-64 CPU has the instruction.
+        unsafe { __cpuid_count(leaf, 0) }
+    }
+
     /// Queries the CPU for the widest level. Bits and leaves are from Intel's manual, volume 1,
     /// sections 14.3, 14.7.1 and 15.2.
     pub fn widest() -> Level {
         let has = |register: u32, bits: &[u32]| bits.iter().all(|bit| register >> bit & 1 == 1);
-        if __cpuid(0).eax < 7 {
+        if cpuid(0).eax < 7 {
             return Level::Portable;
         }
         // Leaf 1, ECX: 27 OSXSAVE, 28 AVX, 29 F16C.
-        if !has(__cpuid(1).ecx, &[27, 28, 29]) {
+        if !has(cpuid(1).ecx, &[27, 28, 29]) {
             return Level::Portable;
         }
         // SAFETY: OSXSAVE, read from the CPU above, says that the operating system has enabled `xgetbv`.
         let saved = unsafe { _xgetbv(0) };
         // Leaf 7, EBX: 5 AVX2, 16 AVX512F, 17 AVX512DQ, 30 AVX512BW, 31 AVX512VL; ECX: 11 AVX512_VNNI.
-        let extended = __cpuid_count(7, 0);
+        let extended = cpuid(7);
         let avx2 = has(extended.ebx, &[5]) && saved & YMM_STATE == YMM_STATE;
         let avx512 = has(extended.ebx, &[16, 17, 30, 31])
             && has(extended.ecx, &[11])

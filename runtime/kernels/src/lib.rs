@@ -14,6 +14,8 @@
 //!   instruction set and take an [`Isa`], which selects the one to run.
 //!
 //! [`mod@reference`] holds the naive twin of every kernel; `tests/twins.rs` compares them on random shapes.
+//!
+#![doc = include_str!("../README.md")]
 #![no_std]
 #![deny(unsafe_code)]
 #![allow(

@@ -6,6 +6,7 @@ use thiserror::Error;
 
 /// Reason why there are no word embeddings.
 #[derive(Debug, Error)]
+#[non_exhaustive]
 pub enum LanguageError {
     /// The encoder's name is not a plain file name.
     #[error(

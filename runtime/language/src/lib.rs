@@ -9,6 +9,8 @@
 //! compare the similarity with the contract's `language.acceptance`. What can fail: the encoder is
 //! missing, damaged or another one; a sentence is empty or longer than encoder or policy can take.
 //! Each is one line with its remedy.
+//!
+#![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
 mod encoder;
@@ -19,11 +21,6 @@ use std::path::PathBuf;
 
 pub use encoder::Encoder;
 pub use error::LanguageError;
-
-/// README's examples compile as typed.
-#[cfg(doctest)]
-#[doc = include_str!("../../../README.md")]
-pub struct Readme;
 
 /// Environment variable that names the folder of this user's downloaded and built files.
 pub const CACHE_VARIABLE: &str = "LADS_CACHE";

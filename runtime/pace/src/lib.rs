@@ -13,6 +13,8 @@
 //!
 //! [`paced`] is the protocol of a whole run with its report. What can fail is a [`BenchError`], one
 //! line; a contender whose results differ from the others' is never timed.
+//!
+#![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
 pub mod clock;

@@ -137,7 +137,7 @@ fn refused(model: &Path, error: &ImportError) -> PyErr {
         ImportError::Problems { problems } => problems,
         // It names the file itself.
         ImportError::File(error) => return OpenError::new_err(lads_cli::chain(error)),
-        ImportError::Compile(error) => {
+        error => {
             return CompileError::new_err(format!("{model}: {}", lads_cli::chain(error)));
         }
     };

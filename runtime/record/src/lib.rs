@@ -19,6 +19,8 @@
 //! C libraries out of the build.
 //!
 //! What can fail: the disk; and reading a file that is truncated, damaged or not a log.
+//!
+#![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
 mod read;
@@ -101,6 +103,7 @@ pub struct Log {
 
 /// Reason why a log could not be read.
 #[derive(Debug, Error)]
+#[non_exhaustive]
 pub enum LogError {
     /// The file cannot be read.
     #[error("it cannot be read ({0})")]

@@ -34,6 +34,7 @@ impl Default for Faults {
 
 /// A setting that means nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
+#[non_exhaustive]
 pub enum FaultError {
     /// Longer than any episode.
     #[error("--delay-steps {0}: give at most {LONGEST_DELAY} control steps")]

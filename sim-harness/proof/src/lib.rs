@@ -2,6 +2,8 @@
 //!
 //! It runs no policy and no simulator, and knows neither: episodes, answers and states come in as numbers. What can fail: a reference that
 //! cannot be read or is of something else ([`mod@reference`]).
+//!
+#![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
 pub mod answers;

@@ -22,6 +22,7 @@ const FORMAT_VERSIONS: [u32; 2] = [1, 2];
 
 /// Why a reference is refused.
 #[derive(Debug, Error)]
+#[non_exhaustive]
 pub enum ReferenceError {
     /// The file cannot be read.
     #[error("{path}: cannot be read ({source}); name a reference, or make one: make reference", path = path.display())]

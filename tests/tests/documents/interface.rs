@@ -9,11 +9,14 @@ use lads_tests::documents::{documents, files};
 use lads_tests::project_path;
 
 /// What begins like a name of the interface and is none.
-const OTHER: [&str; 5] = [
+const OTHER: [&str; 8] = [
     // Environment variables.
     "LADS_CACHE",
     "LADS_OPS",
+    "LADS_REQUIRE_TOOLS",
+    "LADS_TALLY",
     "LADS_WRITE_HEADER",
+    "LADS_WRITE_IMAGE",
     // The package that a program's CMake asks for.
     "lads_VERSION",
     // The package in Python.

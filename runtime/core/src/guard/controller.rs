@@ -24,19 +24,7 @@ use crate::self_test::{SelfTest, SelfTestError};
 /// contract ([`GuardError`]), and a step only when the caller's action has the wrong length, so
 /// that nothing can be written.
 ///
-/// ```no_run
-/// # use lads_core::{Controller, GuardConfig, GuardedController, Instruction, Tick};
-/// # fn run(controller: Controller) -> Result<(), Box<dyn std::error::Error>> {
-/// let mut memory = vec![0.0; GuardedController::memory_len(controller.policy())];
-/// let mut guarded = GuardedController::new(controller, &GuardConfig::default(), &mut memory)?;
-/// guarded.self_test()?; // arms
-/// guarded.set_instruction(Instruction::Id(0))?;
-/// # let (observation, mut action, timestamp) = ([0.0; 60], [0.0; 9], 0);
-/// let tick = Tick { timestamp, missed: 0 };
-/// let report = guarded.step(&observation, Some(tick), &mut action)?; // `action` may go to the motors, whatever the report says
-/// # Ok(())
-/// # }
-/// ```
+/// The [example](crate#example) of this crate drives one.
 #[derive(Debug)]
 pub struct GuardedController<'a, 'm> {
     controller: Controller<'a, 'm>,
