@@ -87,18 +87,30 @@ impl Sweep {
         Some(reach)
     }
 
-    /// The first input and the first output of each of the pixels from `first` on.
+    /// Input elements from one element of the kernel to the next, down and along. Beyond a `usize` they wrap: then the kernel has no second
+    /// one, as [`reach`](Self::reach) found.
+    #[inline(always)]
+    pub(crate) fn apart(&self) -> [usize; 2] {
+        [
+            self.dilation[0].wrapping_mul(self.x_strides[0]),
+            self.dilation[1].wrapping_mul(self.x_strides[1]),
+        ]
+    }
+
+    /// The first input and the first output of each of the pixels from `first` on. Those behind the last pixel are places that nobody looks
+    /// at, whose numbers may be beyond a `usize`; so may a stride be over a single row or column. An output beyond is the last number, where none is.
     #[inline(always)]
     pub(crate) fn pixels<const P: usize>(&self, first: usize) -> [[usize; 2]; P] {
         let (mut row, mut col) = (first / self.out[1].max(1), first % self.out[1].max(1));
         let (rows, cols) = (
-            self.stride[0] * self.x_strides[0],
-            self.stride[1] * self.x_strides[1],
+            self.stride[0].wrapping_mul(self.x_strides[0]),
+            self.stride[1].wrapping_mul(self.x_strides[1]),
         );
+        let [y_row, y_col] = self.y_strides;
         [(); P].map(|()| {
             let at = [
-                row * rows + col * cols,
-                row * self.y_strides[0] + col * self.y_strides[1],
+                row.wrapping_mul(rows).wrapping_add(col.wrapping_mul(cols)),
+                (row.saturating_mul(y_row)).saturating_add(col.saturating_mul(y_col)),
             ];
             col += 1;
             if col == self.out[1] {
@@ -170,13 +182,8 @@ struct Runs {
 impl Runs {
     #[inline(always)]
     fn of(conv: &Conv) -> Self {
-        let Sweep {
-            kernel: [rows, cols],
-            dilation,
-            x_strides,
-            ..
-        } = conv.sweep;
-        let apart = [dilation[0] * x_strides[0], dilation[1] * x_strides[1]];
+        let [rows, cols] = conv.sweep.kernel;
+        let apart = conv.sweep.apart();
         if apart[1] == conv.c || cols == 1 {
             Self {
                 times: [rows, 1],
@@ -270,7 +277,10 @@ impl Pixels<'_> {
             let bias = simd.load(block(self.conv.bias, first, &mut spare));
             let width = LANES.min(self.conv.n - first);
             for (sum, [_, at]) in sums.iter().zip(at).take(black_box(size)) {
-                let y = self.y.get_mut(at + first..).unwrap_or(&mut []);
+                let y = self
+                    .y
+                    .get_mut(at.saturating_add(first)..)
+                    .unwrap_or(&mut []);
                 self.conv
                     .finish(simd, simd.add(simd.load(sum), bias), y, width);
             }
