@@ -8,6 +8,7 @@ mod language;
 
 use std::collections::HashSet;
 
+use lads_image::records::{NoiseRule, SelectionRule};
 use serde::Deserialize;
 
 use crate::error::BundleError;
@@ -237,6 +238,27 @@ impl Contract {
     /// Control steps from one selection to the next; `None` for a policy that selects nothing.
     pub fn period(&self) -> Option<usize> {
         self.family.period()
+    }
+
+    /// How an index is picked from scores.
+    pub fn decision(&self) -> lads_core::Decision {
+        let selection = self.family.kind().selection();
+        match selection.rule {
+            SelectionRule::Argmax => lads_core::Decision::Argmax,
+            SelectionRule::Sample => lads_core::Decision::Sample {
+                temperature: selection.temperature,
+                seed: selection.seed,
+            },
+        }
+    }
+
+    /// Where the values of noise channels come from.
+    pub fn noise(&self) -> lads_core::Noise {
+        let noise = self.family.kind().noise();
+        match noise.rule {
+            NoiseRule::Zero => lads_core::Noise::Zero,
+            NoiseRule::Seeded => lads_core::Noise::Seeded { seed: noise.seed },
+        }
     }
 
     /// The sub-tasks and the split of an instruction; empty where the bundle does not say.

@@ -33,7 +33,7 @@ mod softmax;
 mod unary;
 
 use crate::access::Access;
-use crate::check::{Checker, Fault};
+use crate::check::{Checker, Fault, product};
 use crate::codec::{Field, Reader, Writer};
 use crate::machine::{ExecError, Machine};
 
@@ -96,7 +96,7 @@ pub struct Slots {
 /// What an op or a program costs. Sums and products saturate.
 #[derive(Debug, Clone, core::marker::Copy, PartialEq, Eq, Default)]
 pub struct Work {
-    /// Multiply-adds of products; an op that goes over elements one by one counts one for each; copies count none.
+    /// Multiply-adds of products; an op that goes over elements one by one counts one for each, and so does one that only moves or fills them.
     pub multiply_adds: u64,
     /// 4-byte words of weights that are read.
     pub weight_words: u64,
@@ -117,9 +117,7 @@ impl Work {
 
     fn products<const N: usize>(dims: [u32; N]) -> Self {
         Self {
-            multiply_adds: dims
-                .into_iter()
-                .fold(1, |product: u64, dim| product.saturating_mul(dim.into())),
+            multiply_adds: product(dims),
             ..Self::default()
         }
     }

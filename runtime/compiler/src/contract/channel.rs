@@ -74,7 +74,7 @@ impl Channel {
     }
 
     /// The limits of a channel without elements of its own: what was said, or all that the type holds.
-    pub(crate) fn limits(&self) -> (f32, f32) {
+    pub fn limits(&self) -> (f32, f32) {
         let (min, max) = match self.dtype {
             DType::F32 => (f32::MIN, f32::MAX),
             DType::U8 => (0.0, 255.0),

@@ -14,11 +14,17 @@ use super::{NUMBERS, Regions, Stream, slack};
 use crate::certificate::DIFFERENCE;
 use crate::pairs::{N_RATE_MARGIN, RATE_MARGIN};
 
-/// How one episode ended: which of the commanded sub-tasks were done, and whether that counts as success.
-#[derive(Clone, PartialEq)]
+/// How one episode ended: which of the commanded sub-tasks were done, a bit for each in their order, and whether that counts as success.
+#[derive(Clone, Copy, PartialEq)]
 struct Outcome {
-    done: Vec<bool>,
+    done: u32,
     success: bool,
+}
+
+impl Outcome {
+    fn did(self, place: usize) -> bool {
+        self.done >> place & 1 == 1
+    }
 }
 
 struct Instruction {
@@ -81,7 +87,10 @@ impl Shipped {
                 let completed = list(episode, "completions");
                 let is_done = |name: &Value| completed.iter().any(|one| one["sub_task"] == *name);
                 Outcome {
-                    done: names.iter().map(is_done).collect(),
+                    done: (0..)
+                        .zip(&names)
+                        .map(|(place, name)| u32::from(is_done(name)) << place)
+                        .sum(),
                     success: episode["success"].as_bool().unwrap(),
                 }
             };
@@ -118,7 +127,7 @@ impl Shipped {
             };
             for (place, &index) in row.commanded.iter().enumerate() {
                 rates[index][0] += 1.0;
-                rates[index][1] += share(&|episode| episode.done[place]);
+                rates[index][1] += share(&|episode| episode.did(place));
             }
             let full = rates.len() - 1;
             rates[full][0] += 1.0;
@@ -139,7 +148,7 @@ impl Shipped {
             }
             Lost::Completions => {
                 let with = self.order(n).map(|row| {
-                    let some = row.episodes.iter().filter(|one| one.done.contains(&true));
+                    let some = row.episodes.iter().filter(|one| one.done != 0);
                     some.count() as f64 / row.episodes.len() as f64
                 });
                 N_RATE_MARGIN * n as f64 / with.sum::<f64>()
@@ -162,24 +171,24 @@ impl Shipped {
         for row in self.order(n) {
             let mut draw = || {
                 let place = (stream.unit() * row.episodes.len() as f64) as usize;
-                &row.episodes[place]
+                row.episodes[place]
             };
             let reference = draw();
             let anew = draw();
             let mut run = match beside {
-                Beside::Few if stream.unit() < 0.04 => anew.clone(),
-                Beside::Same | Beside::Few => reference.clone(),
-                Beside::All => anew.clone(),
+                Beside::Few if stream.unit() < 0.04 => anew,
+                Beside::Same | Beside::Few => reference,
+                Beside::All => anew,
             };
             if stream.unit() < share {
                 lose(&mut run, lost, &row.commanded, full);
             }
             for (place, &index) in row.commanded.iter().enumerate() {
-                pairs[index].add(run.done[place], reference.done[place]);
+                pairs[index].add(run.did(place), reference.did(place));
             }
             pairs[full].add(run.success, reference.success);
-            let completed = |one: &Outcome| one.done.iter().filter(|&&done| done).count();
-            counts.add(completed(&run), completed(reference), row.commanded.len());
+            let [ours, theirs] = [run, reference].map(|one| one.done.count_ones() as usize);
+            counts.add(ours, theirs, row.commanded.len());
         }
         let present: Vec<_> = pairs.iter().filter(|pairs| !pairs.is_empty()).collect();
         let level = DIFFERENCE / (present.len() + 1) as f64;
@@ -245,12 +254,12 @@ fn lose(run: &mut Outcome, lost: Lost, commanded: &[usize], full: usize) {
             None
         }
         Lost::Rate(rate) => commanded.iter().position(|&index| index == rate),
-        Lost::Completions => run.done.iter().position(|&done| done),
+        Lost::Completions => (run.done != 0).then(|| run.done.trailing_zeros() as usize),
     };
     if let Some(place) = place
-        && run.done[place]
+        && run.did(place)
     {
-        run.done[place] = false;
+        run.done &= !(1 << place);
         run.success = false;
     }
 }
@@ -291,9 +300,10 @@ fn the_verdict_of_what_ships_holds_its_level() {
 #[test]
 #[ignore = "minutes; prints the tables of README.md"]
 fn whole_verdict() {
-    let trials = 2000;
     for name in ["kitchen", "lorel"] {
         let (shipped, mut regions) = (Shipped::open(name), Regions::default());
+        // Thousands of pairs take long, one by one.
+        let trials = |n: usize| if n > 1000 { 400 } else { 2000 };
         let numbers: Vec<usize> = NUMBERS.into_iter().chain([shipped.all]).collect();
         let heading = numbers.iter().map(|n| format!(" {n} |"));
         println!(
@@ -314,12 +324,12 @@ fn whole_verdict() {
             ("the same, all drawn anew", Beside::All),
         ] {
             row(title, &mut |n| {
-                shipped.most_equivalent(&mut regions, beside, n, trials)
+                shipped.most_equivalent(&mut regions, beside, n, trials(n))
             });
         }
         let alike = (Lost::Nothing, Beside::All);
         row("DIFFERENT, two samples of one policy", &mut |n| {
-            shipped.shares(&mut regions, alike, n, trials).unwrap()[1]
+            shipped.shares(&mut regions, alike, n, trials(n)).unwrap()[1]
         });
         for (title, beside) in [
             (
@@ -330,7 +340,7 @@ fn whole_verdict() {
         ] {
             row(title, &mut |n| {
                 shipped
-                    .shares(&mut regions, (Lost::Nothing, beside), n, trials)
+                    .shares(&mut regions, (Lost::Nothing, beside), n, trials(n))
                     .unwrap()[0]
             });
         }
