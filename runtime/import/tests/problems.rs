@@ -154,6 +154,11 @@ fn axes_of_unknown_length_are_told_and_nothing_that_follows_from_them() {
         "{told}"
     );
     assert!(told.contains("axes.height = LENGTH"), "{told}");
+    assert!(told.contains("axes.width = LENGTH"), "{told}");
+    assert!(
+        told.contains("settle its shape first") && !told.contains("none of them"),
+        "{told}"
+    );
     assert!(!told.contains("window") && !told.contains("Conv"), "{told}");
     let told = Case::new(&policy("Hardmax"), &robot).refused();
     assert!(
