@@ -9,6 +9,9 @@ use lads_compiler::Options;
 use lads_proof::reference::Reference;
 use mutate::{Judged, Model, Said};
 
+/// What is added at the end of the low level.
+const LAST_BIAS: &str = "low_level.layer.6.bias";
+
 /// The first traced episode of each seventh instruction.
 const EVERY: usize = 7;
 
@@ -97,6 +100,49 @@ fn damaged_weights_are_different() {
     }
 }
 
+/// The bounds of a certificate are where it says they are: the same change a little smaller is allowed, a little larger it is DIFFERENT.
+#[test]
+fn changes_are_different_from_the_bounds_on() {
+    use lads_proof::answers::{ACTION_TOLERANCE, LOGIT_TOLERANCE};
+    let (model, reference) = shipped();
+    let noise = reference.float_noise.unwrap();
+    assert!(2.0 * noise.logit < LOGIT_TOLERANCE);
+    // Adds to one logit, or to one element of the action, so much.
+    let cases: [(&str, f64, fn(&Judged) -> f64); 2] = [
+        ("high_level.head.bias", LOGIT_TOLERANCE, |found| {
+            found.answers.largest_logit_difference
+        }),
+        (
+            LAST_BIAS,
+            ACTION_TOLERANCE.max(2.0 * noise.action),
+            |found| found.answers.largest_action_difference,
+        ),
+    ];
+    for (name, bound, moved) in cases {
+        let with = |added: f64| {
+            let mut changed = model.clone();
+            changed.edit(name, |values| values[0] += added as f32);
+            judged(&changed, &reference)
+        };
+        // How much moves is not how much was added: a logit counts up to a constant, an action passes its limits.
+        let gain = moved(&with(0.5 * bound)) / (0.5 * bound);
+        for (share, different) in [(0.9, false), (1.1, true), (2.0, true), (20.0, true)] {
+            let found = with(share * bound / gain);
+            let moved = moved(&found);
+            assert!(
+                (moved / (share * bound) - 1.0).abs() < 0.08,
+                "{name}: {moved:.2e} instead of {share} times {bound:.2e}"
+            );
+            assert_eq!(
+                found.different(),
+                different,
+                "{name}, {share} times the bound: {}",
+                found.reason()
+            );
+        }
+    }
+}
+
 #[test]
 fn every_field_of_the_contract_is_compared_or_refused() {
     let (model, reference) = shipped();
@@ -115,7 +161,7 @@ fn every_field_of_the_contract_is_compared_or_refused() {
         let found = lads_proof::contract::Compared::new(
             &changed,
             reference.contract.as_ref(),
-            &serde_json::json!({}),
+            [&serde_json::Value::Null; 2],
         );
         let history = ["/version", "/provenance"]
             .iter()
@@ -130,6 +176,152 @@ fn every_field_of_the_contract_is_compared_or_refused() {
     assert!(
         compared > 10 && compared + refused == places.len(),
         "{compared} {refused}"
+    );
+}
+
+/// An image is compared with its bundle in everything that it holds of a contract: one change of each kind is found, and named.
+#[test]
+fn an_image_of_another_bundle_is_told_apart_by_every_kind_of_field() {
+    use serde_json::json;
+    let model = Model::open(&project_file("models/kitchen-small.onnx"));
+    let bundle = lads_compiler::Bundle::from_bytes(model.bytes()).unwrap();
+    let said = lads_sim::verify::contract::of_bundle(&bundle).unwrap();
+    let fields = |other: &Model| -> Vec<String> {
+        let opened = lads_host::from_bytes_with(other.bytes(), &Options::exact()).unwrap();
+        let image = lads_sim::verify::contract::of_image(&opened.policy());
+        let found = lads_proof::contract::Compared::new(&json!({}), None, [&image, &said]);
+        let named = found.image_differing.into_iter().map(|it| it.field);
+        named.filter(|field| field != "bundle_sha256").collect()
+    };
+    assert_eq!(fields(&model), [""; 0]);
+    let joint = "channels[observation].elements[panda_joint1].joint";
+    let (observation, action) = (
+        "/channels/0/elements/0",
+        "channels[action].elements[panda_joint1_velocity]",
+    );
+    let contract = model.contract();
+    let place = contract["channels"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .position(|channel| channel["role"] == "action")
+        .unwrap();
+    let acting = format!("/channels/{place}/elements/0");
+    let cases = [
+        (
+            format!("{observation}/joint"),
+            json!("other"),
+            joint.to_owned(),
+        ),
+        (
+            format!("{observation}/joint"),
+            json!(null),
+            joint.to_owned(),
+        ),
+        (
+            format!("{observation}/interface"),
+            json!("effort"),
+            joint.replace(".joint", ".interface"),
+        ),
+        (
+            format!("{observation}/unit"),
+            json!("deg"),
+            joint.replace(".joint", ".unit"),
+        ),
+        (
+            format!("{observation}/max"),
+            json!(9.5),
+            joint.replace(".joint", ".max"),
+        ),
+        (
+            format!("{acting}/scale"),
+            json!(0.5),
+            format!("{action}.scale"),
+        ),
+        (
+            format!("{acting}/offset"),
+            json!(0.5),
+            format!("{action}.offset"),
+        ),
+        (
+            format!("{acting}/physical_unit"),
+            json!("deg/s"),
+            format!("{action}.physical_unit"),
+        ),
+        (
+            format!("/channels/{place}/reference"),
+            json!("nothing"),
+            "channels[action].reference".to_owned(),
+        ),
+        (
+            "/channels/0/quaternion_order".to_owned(),
+            json!("xyzw"),
+            "channels[observation].quaternion_order".to_owned(),
+        ),
+        (
+            "/environment/version".to_owned(),
+            json!("2"),
+            "environment[1]".to_owned(),
+        ),
+        (
+            "/control_period_s".to_owned(),
+            json!(0.05),
+            "control_period_s".to_owned(),
+        ),
+        (
+            "/context/steps".to_owned(),
+            json!(40),
+            "context.steps".to_owned(),
+        ),
+        (
+            "/context/beyond".to_owned(),
+            json!("refuse"),
+            "context.beyond".to_owned(),
+        ),
+        (
+            "/family/decision/rule".to_owned(),
+            json!("sample"),
+            "decision.rule".to_owned(),
+        ),
+        (
+            "/language/encoder".to_owned(),
+            json!("other"),
+            "language[0]".to_owned(),
+        ),
+        (
+            "/language/acceptance/threshold".to_owned(),
+            json!(0.5),
+            "acceptance".to_owned(),
+        ),
+        (
+            "/instructions/3/text".to_owned(),
+            json!("sit down"),
+            format!(
+                "instructions[{}].text",
+                contract["instructions"][3]["id"].as_str().unwrap()
+            ),
+        ),
+    ];
+    for (pointer, value, wanted) in cases {
+        let mut changed = contract.clone();
+        let (parent, key) = pointer.rsplit_once('/').unwrap();
+        changed.pointer_mut(parent).unwrap()[key] = value;
+        let found = fields(&model.with_contract(&changed));
+        assert!(found.contains(&wanted), "{pointer}: {found:?}");
+        // The rule of sampling brings its numbers along.
+        assert!(
+            found
+                .iter()
+                .all(|field| field == &wanted || field.starts_with("decision."))
+        );
+    }
+    // Other words under the same texts.
+    let mut misheard = model.clone();
+    misheard.edit("instruction.words", |values| values[0] += 0.25);
+    let first = contract["instructions"][0]["id"].as_str().unwrap();
+    assert_eq!(
+        fields(&misheard),
+        [format!("instructions[{first}].words_sha256")]
     );
 }
 

@@ -128,7 +128,7 @@ def drawn(number):
         ways = ("half_pixel", "asymmetric", "align_corners", "pytorch_half_pixel")
         attributes = {"mode": mode, "coordinate_transformation_mode": ways[whole(0, 3)], "nearest_mode": ("floor", "ceil", "round_prefer_floor", "round_prefer_ceil")[whole(0, 3)]}
     elif operator == "AveragePool":
-        attributes |= {"count_include_pad": whole(0, 1), "ceil_mode": 0}
+        attributes |= {"count_include_pad": whole(0, 1), "ceil_mode": whole(0, 1)}
     else:
         attributes["ceil_mode"] = whole(0, 1)
     node = helper.make_node(operator, ["X", *constants], ["Y"], **attributes)
@@ -157,7 +157,7 @@ def test_node_cases(tmp_path):
     images = [case for case in map(drawn, range(400)) if case]
     assert len(images) > 300
     written += sum(write(case, tmp_path) for case in images)
-    command = ["cargo", "test", *SELECTION, "--lib", "onnx_node_cases", "--", "--nocapture"]
+    command = ["cargo", "test", *SELECTION, "--lib", "onnx_node_cases", "--", "--ignored", "--nocapture"]
     done = subprocess.run(command, cwd=ROOT, env=os.environ | {"LADS_ONNX_NODES": str(tmp_path)}, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     agreed, refused = map(int, re.search(r"(\d+) cases agree, (\d+) are refused", done.stdout).groups())

@@ -3,7 +3,7 @@
 use std::collections::{HashMap, HashSet};
 
 use lads_core::{Controller, Policy, PolicyError, ScheduleError, Workspace};
-use lads_image::op::{CacheFormat, WeightSpan};
+use lads_image::op::CacheFormat;
 
 use crate::bundle::Bundle;
 use crate::entries::{self, LOOKUP_INSTRUCTION, Signature};
@@ -127,7 +127,15 @@ pub fn compile_with(bundle: &Bundle, options: &Options) -> Result<Image, Compile
         .iter()
         .find(|known| known.entry == LOOKUP_INSTRUCTION)
     {
-        Some(signature) => instruction_words(bundle, &model, signature, &mut weights)?,
+        Some(signature) => {
+            let dim = contract.words().map_or(0, |[_, dim]| dim);
+            let mut all = vec![];
+            for words in instruction_words(bundle, &model, signature)? {
+                let span = weights.store(&words).map_err(in_lookup)?;
+                all.push(((words.len() / dim) as u32, span));
+            }
+            all
+        }
         None => vec![],
     };
     let mut parts = Parts {
@@ -274,19 +282,37 @@ fn fused(
     }
 }
 
+/// Returns the word embeddings of every known instruction, `[words, elements]` each, in the
+/// contract's order, by evaluating the bundle's table; empty for a policy without instructions.
+pub fn words(bundle: &Bundle) -> Result<Vec<Vec<f32>>, CompileError> {
+    let contract = bundle.contract();
+    let blueprint = contract.family.kind().blueprint(contract);
+    let signatures =
+        entries::signatures(bundle.graph(), contract, &blueprint).map_err(CompileError::Bundle)?;
+    let model = Model::new(&bundle.model, bundle.graph())?;
+    let lookup = signatures
+        .iter()
+        .find(|known| known.entry == LOOKUP_INSTRUCTION);
+    lookup.map_or(Ok(vec![]), |signature| {
+        instruction_words(bundle, &model, signature)
+    })
+}
+
+fn in_lookup(problem: String) -> CompileError {
+    CompileError::Entry {
+        entry: LOOKUP_INSTRUCTION.into(),
+        problem: problem.into(),
+    }
+}
+
 /// Computes the words of every known instruction by evaluating the entry for each id.
 fn instruction_words(
     bundle: &Bundle,
     model: &Model,
     signature: &Signature,
-    weights: &mut Weights<'_>,
-) -> Result<Vec<(u32, WeightSpan)>, CompileError> {
+) -> Result<Vec<Vec<f32>>, CompileError> {
     let contract = bundle.contract();
     let [most, dim] = contract.words().unwrap_or_default();
-    let refused = |problem: String| CompileError::Entry {
-        entry: LOOKUP_INSTRUCTION.into(),
-        problem: problem.into(),
-    };
     let mut all = vec![];
     for (id, known) in contract.instructions.iter().enumerate() {
         let entry = model.import(
@@ -301,7 +327,7 @@ fn instruction_words(
             .and_then(|tensor| tensor.as_i64().and_then(|data| data.first().copied()));
         let words = constant("words").and_then(|tensor| tensor.as_f32());
         let (Some(length), Some(words)) = (length, words) else {
-            return Err(refused(format!(
+            return Err(in_lookup(format!(
                 "it is not a table: instruction {} does not evaluate to constants",
                 known.id
             )));
@@ -310,19 +336,18 @@ fn instruction_words(
             .ok()
             .filter(|length| (1..=most).contains(length));
         let length = length.ok_or_else(|| {
-            refused(format!(
+            in_lookup(format!(
                 "instruction {} has no length from 1 to the {most} words of its channel",
                 known.id
             ))
         })?;
         if words.iter().any(|x| !x.is_finite()) {
-            return Err(refused(format!(
+            return Err(in_lookup(format!(
                 "the words of instruction {} are not finite",
                 known.id
             )));
         }
-        let span = weights.store(&words[..length * dim]).map_err(refused)?;
-        all.push((length as u32, span));
+        all.push(words[..length * dim].to_vec());
     }
     Ok(all)
 }

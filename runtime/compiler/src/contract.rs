@@ -10,6 +10,7 @@ mod language;
 
 use std::collections::HashSet;
 
+use lads_image::records::{NoiseRule, SelectionRule};
 use serde::Deserialize;
 
 use crate::error::BundleError;
@@ -244,6 +245,27 @@ impl Contract {
     /// selects nothing.
     pub fn period(&self) -> Option<usize> {
         self.family.period()
+    }
+
+    /// Rule by which an index is picked from scores.
+    pub fn decision(&self) -> lads_core::Decision {
+        let selection = self.family.kind().selection();
+        match selection.rule {
+            SelectionRule::Argmax => lads_core::Decision::Argmax,
+            SelectionRule::Sample => lads_core::Decision::Sample {
+                temperature: selection.temperature,
+                seed: selection.seed,
+            },
+        }
+    }
+
+    /// Source of the values of noise channels.
+    pub fn noise(&self) -> lads_core::Noise {
+        let noise = self.family.kind().noise();
+        match noise.rule {
+            NoiseRule::Zero => lads_core::Noise::Zero,
+            NoiseRule::Seeded => lads_core::Noise::Seeded { seed: noise.seed },
+        }
     }
 
     /// Returns the sub-tasks and the split of an instruction; empty where the bundle does not say.

@@ -36,7 +36,7 @@ use crate::tensor::Tensor;
 
 use attributes::Attributes;
 use sequences::Given;
-pub(crate) use trial::{Declared, trial};
+pub(crate) use trial::{Declared, Refused, trial};
 
 /// Operator sets that the translations were written for.
 const OPSETS: std::ops::RangeInclusive<i64> = 7..=28;

@@ -58,7 +58,7 @@ mod verify;
 mod tests;
 
 pub use bundle::Bundle;
-pub use compile::{Options, compile, compile_with};
+pub use compile::{Options, compile, compile_with, words};
 pub use contract::Contract;
 pub use digest::sha256;
 pub use error::{BundleError, CompileError, Line};

@@ -15,7 +15,7 @@ use crate::entries;
 use crate::error::{BundleError, Line};
 use crate::golden::Golden;
 use crate::graph::{Dim, Type, show};
-use crate::import::{Declared, Model, trial};
+use crate::import::{Declared, Model, Refused, trial};
 use crate::onnx::{self, GraphProto, ModelProto, TensorTypeProto, ValueInfoProto, data_type};
 
 /// Top-level fields that every contract requires.
@@ -167,15 +167,25 @@ pub fn survey(bytes: &[u8]) -> Result<Survey, BundleError> {
             problem: line(&error.to_string()),
         });
     }
-    let declared: Declared = (inputs.iter().copied())
-        .chain(&graph.output)
-        .chain(&inner)
-        .filter_map(|value| Some((value.name.as_str(), taken(value)?)))
-        .collect();
+    let values = || (inputs.iter().copied()).chain(&graph.output).chain(&inner);
+    let declared = |open| -> Declared {
+        let known = values().filter_map(|value| Some((value.name.as_str(), taken(value, open)?)));
+        known.collect()
+    };
     let default = |domain: &str| domain.is_empty() || domain == "ai.onnx";
     let sets = &model.opset_import;
     let opset = (sets.iter().find(|set| default(&set.domain))).map(|set| set.version);
-    let refused = trial(graph, opset.unwrap_or(i64::MAX), &declared);
+    let attempt = |open| trial(graph, opset.unwrap_or(i64::MAX), &declared(open));
+    let mut refused = attempt(1);
+    // What is wrong with a length that nobody said is no fault of the node: the axis is reported.
+    if !refused.is_empty() && declared(1) != declared(OPEN) {
+        let at_any = attempt(OPEN);
+        refused.retain(|node| {
+            let same =
+                |other: &Refused| (&other.node, &other.problem) == (&node.node, &node.problem);
+            at_any.iter().any(same)
+        });
+    }
     missing.operators.extend(refused.into_iter().map(|node| {
         Operator {
             operator: line(&node.operator),
@@ -215,9 +225,12 @@ fn tensor(value: &ValueInfoProto) -> Option<&TensorTypeProto> {
     value.r#type.as_ref()?.tensor_type.as_ref()
 }
 
+/// Second length for axes of unknown length, beside 1: longer than any window over them.
+const OPEN: usize = 256;
+
 /// Returns a value's type and shape as the compiler reads them; a named axis that is not the
-/// context's length counts as 1.
-fn taken(value: &ValueInfoProto) -> Option<(Type, Vec<Dim>)> {
+/// context's length counts as `open`, the first one, of batches, as 1.
+fn taken(value: &ValueInfoProto, open: usize) -> Option<(Type, Vec<Dim>)> {
     let tensor = tensor(value)?;
     let ty = match tensor.elem_type {
         data_type::FLOAT
@@ -230,13 +243,16 @@ fn taken(value: &ValueInfoProto) -> Option<(Type, Vec<Dim>)> {
         _ => return None,
     };
     let dims = tensor.shape.as_ref()?.dim.iter();
-    let dims = dims.map(|dim| match (dim.dim_value, &dim.dim_param) {
-        (Some(len), _) => usize::try_from(len)
-            .ok()
-            .filter(|&len| len > 0)
-            .map(Dim::of),
-        (None, Some(name)) => Some(entries::past(name).unwrap_or(Dim::of(1))),
-        (None, None) => Some(Dim::of(1)),
+    let dims = dims.enumerate().map(|(axis, dim)| {
+        let open = Dim::of(if axis == 0 { 1 } else { open });
+        match (dim.dim_value, &dim.dim_param) {
+            (Some(len), _) => usize::try_from(len)
+                .ok()
+                .filter(|&len| len > 0)
+                .map(Dim::of),
+            (None, Some(name)) => Some(entries::past(name).unwrap_or(open)),
+            (None, None) => Some(open),
+        }
     });
     Some((ty, dims.collect::<Option<_>>()?))
 }
@@ -314,20 +330,20 @@ fn of_stranger(inputs: &[&ValueInfoProto], graph: &GraphProto, missing: &mut Mis
         }
     }
     let shape = |value: &ValueInfoProto| {
-        let taken = taken(value).map(|(_, shape)| show(&shape));
+        let taken = taken(value, 1).map(|(_, shape)| show(&shape));
         taken.unwrap_or_else(|| "of a type that no channel has".into())
     };
     let len = |value: &ValueInfoProto| {
-        let shape = taken(value)?.1;
+        let shape = taken(value, 1)?.1;
         let mut lens = shape.iter().map(|dim| dim.known());
         lens.try_fold(1_usize, |len, dim| len.checked_mul(dim?))
     };
     let shapes: HashMap<&str, _> = (graph.output.iter())
-        .filter_map(|output| Some((output.name.as_str(), taken(output)?)))
+        .filter_map(|output| Some((output.name.as_str(), taken(output, 1)?)))
         .collect();
     for input in inputs {
         let elements = len(input).map_or("its".into(), |len| len.to_string());
-        let own = taken(input);
+        let own = taken(input, 1);
         let mut fed: Vec<&str> = (shapes.iter())
             .filter(|(_, of_output)| own.as_ref() == Some(of_output))
             .map(|(name, _)| *name)

@@ -67,20 +67,29 @@ pub(crate) fn require(condition: bool, fault: Fault) -> Checked {
     if condition { Ok(()) } else { Err(fault) }
 }
 
+/// Returns the number of elements of a shape, `u64::MAX` where it is larger.
+#[inline]
+pub(crate) fn product<const N: usize>(dims: [u32; N]) -> u64 {
+    dims.into_iter()
+        .fold(1, |product: u64, dim| product.saturating_mul(dim.into()))
+}
+
 /// Checks that `len` is the product of `dims`, none of which is zero.
 pub(crate) fn exactly<const N: usize>(len: u32, dims: [u32; N]) -> Checked {
-    let product: u128 = dims.into_iter().map(u128::from).product();
-    require(product != 0 && product == u128::from(len), Fault::Shape)
+    let product = product(dims);
+    require(product != 0 && product == u64::from(len), Fault::Shape)
 }
 
 /// Checks that a strided layout stays inside `len` elements.
 pub(crate) fn reaches<const N: usize>(len: u32, dims: [u32; N], strides: [u32; N]) -> Checked {
-    let last: u128 = dims
+    let last = dims
         .into_iter()
         .zip(strides)
-        .map(|(dim, stride)| u128::from(dim.saturating_sub(1)).saturating_mul(u128::from(stride)))
-        .sum();
-    require(last < u128::from(len), Fault::Shape)
+        .fold(0, |last: u64, (dim, stride)| {
+            let steps = u64::from(dim.saturating_sub(1));
+            last.saturating_add(steps.saturating_mul(stride.into()))
+        });
+    require(last < u64::from(len), Fault::Shape)
 }
 
 /// Checks that `offset..offset + len` lies inside `0..space` and is not empty.

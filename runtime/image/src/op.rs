@@ -36,7 +36,7 @@ mod softmax;
 mod unary;
 
 use crate::access::Access;
-use crate::check::{Checker, Fault};
+use crate::check::{Checker, Fault, product};
 use crate::codec::{Field, Reader, Writer};
 use crate::machine::{ExecError, Machine};
 
@@ -101,8 +101,8 @@ pub struct Slots {
 /// Cost of an op or a program. Sums and products saturate.
 #[derive(Debug, Clone, core::marker::Copy, PartialEq, Eq, Default)]
 pub struct Work {
-    /// Number of multiply-adds of products; an op that works element by element counts one for
-    /// each; copies count none.
+    /// Number of multiply-adds of products; an op that works element by element, copies and fills
+    /// included, counts one for each.
     pub multiply_adds: u64,
     /// Number of 4-byte words of weights that are read.
     pub weight_words: u64,
@@ -123,9 +123,7 @@ impl Work {
 
     fn products<const N: usize>(dims: [u32; N]) -> Self {
         Self {
-            multiply_adds: dims
-                .into_iter()
-                .fold(1, |product: u64, dim| product.saturating_mul(dim.into())),
+            multiply_adds: product(dims),
             ..Self::default()
         }
     }

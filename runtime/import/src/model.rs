@@ -162,9 +162,15 @@ fn edge(
         .shape
         .as_ref()
         .ok_or("has no shape; export the policy with static shapes")?;
-    let mut dims = vec![];
+    let (mut dims, mut unknown) = (vec![], vec![]);
     for (axis, dim) in shape.dim.iter().enumerate() {
-        dims.push(length(axis, dim, axes)?);
+        match length(axis, dim, axes) {
+            Ok(len) => dims.push(len),
+            Err(problem) => unknown.push(problem),
+        }
+    }
+    if !unknown.is_empty() {
+        return Err(unknown.join("; "));
     }
     let len = dims
         .iter()

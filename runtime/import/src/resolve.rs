@@ -21,13 +21,24 @@ pub(crate) struct Edges {
     pub inputs: Vec<Edge>,
     pub outputs: Vec<Edge>,
     stems: Vec<String>,
+    /// Names of inputs that are there and of which something is still to be said.
+    unsettled: Vec<String>,
 }
 
 impl Edges {
     pub fn of(models: &[Model], axes: &BTreeMap<String, usize>, problems: &mut Problems) -> Self {
-        let (mut inputs, mut outputs) = (vec![], vec![]);
+        let (mut inputs, mut outputs, mut unsettled) = (vec![], vec![], vec![]);
         for (file, model) in models.iter().enumerate() {
             let (read, given) = model.edges(file, axes, problems);
+            let graph = model.graph();
+            let is_weight = |name: &str| graph.initializer.iter().any(|one| one.name == name);
+            let is_settled = |name: &str| read.iter().any(|edge| edge.name == name);
+            let names = graph.input.iter().map(|value| value.name.as_str());
+            unsettled.extend(
+                names
+                    .filter(|name| !is_weight(name) && !is_settled(name))
+                    .map(str::to_owned),
+            );
             inputs.extend(read);
             outputs.extend(given);
         }
@@ -36,6 +47,7 @@ impl Edges {
             inputs,
             outputs,
             stems,
+            unsettled,
         }
     }
 
@@ -66,6 +78,9 @@ impl Edges {
         };
         match matches[..] {
             [edge] => Ok(edge),
+            [] if self.unsettled.iter().any(|name| name == said) => Err(format!(
+                "\"{said}\" is not an input yet; settle its shape first"
+            )),
             [] => Err(format!(
                 "\"{said}\" is not one of them; there are {}",
                 known()

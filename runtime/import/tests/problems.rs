@@ -119,6 +119,59 @@ fn contradictions_are_told_with_both_sides() {
     }
 }
 
+/// What a convolution finds too short is a length that nobody said: the axis is told, not the convolution. What is wrong at any length is told
+/// all the same.
+#[test]
+fn axes_of_unknown_length_are_told_and_nothing_that_follows_from_them() {
+    use lads_compiler::onnx::DimensionProto;
+    let named = |name: &str| DimensionProto {
+        dim_value: None,
+        dim_param: Some(name.into()),
+    };
+    let mut image = value("image", &[-1, 3, 1, 1]);
+    let shape = image.r#type.as_mut().and_then(|ty| ty.tensor_type.as_mut());
+    let shape = shape.and_then(|tensor| tensor.shape.as_mut()).unwrap();
+    shape.dim[2] = named("height");
+    shape.dim[3] = named("width");
+    let weights = weight("w", &[4, 3, 3, 3], &[0.1; 108]);
+    let policy = |odd: &str| {
+        model(
+            vec![image.clone()],
+            vec![
+                node("Conv", &["image", "w"], &["c"]),
+                node(odd, &["c"], &["r"]),
+                node("GlobalAveragePool", &["r"], &["p"]),
+                node("Flatten", &["p"], &["actions"]),
+            ],
+            vec![weights.clone()],
+            vec![value("actions", &[1, 4])],
+        )
+    };
+    let term = format!("[[term]]\nname = \"camera\"\ninput = \"image\"\n{SENSOR}");
+    let robot = format!("{HEAD}{term}{}", wide_action(4));
+    let told = Case::new(&policy("Relu"), &robot).refused();
+    assert!(
+        told.contains("an axis `height` of unknown length"),
+        "{told}"
+    );
+    assert!(told.contains("axes.height = LENGTH"), "{told}");
+    assert!(told.contains("axes.width = LENGTH"), "{told}");
+    assert!(
+        told.contains("settle its shape first") && !told.contains("none of them"),
+        "{told}"
+    );
+    assert!(!told.contains("window") && !told.contains("Conv"), "{told}");
+    let told = Case::new(&policy("Hardmax"), &robot).refused();
+    assert!(
+        told.contains("Hardmax") && !told.contains("window"),
+        "{told}"
+    );
+    // A length that was said is judged.
+    let robot = format!("axes = {{ height = 2, width = 8 }}\n{robot}");
+    let told = Case::new(&policy("Relu"), &robot).refused();
+    assert!(told.contains("a window of 3 over 2 elements"), "{told}");
+}
+
 #[test]
 fn the_form_names_all_and_is_enough_once_it_is_filled_in() {
     let mut policy = mirror(6);

@@ -92,18 +92,32 @@ impl Sweep {
         Some(reach)
     }
 
-    /// Returns the first input and the first output of `P` pixels, starting at pixel `first`.
+    /// Returns the distance in input elements from one element of the kernel to the next, down and
+    /// along. A distance beyond a `usize` wraps: [`reach`](Self::reach) found that the kernel has no
+    /// second element there.
+    #[inline(always)]
+    pub(crate) fn apart(&self) -> [usize; 2] {
+        [
+            self.dilation[0].wrapping_mul(self.x_strides[0]),
+            self.dilation[1].wrapping_mul(self.x_strides[1]),
+        ]
+    }
+
+    /// Returns the first input and the first output of `P` pixels, starting at pixel `first`. Pixels
+    /// behind the last one are never accessed; their positions wrap or saturate, as do strides over
+    /// a single row or column.
     #[inline(always)]
     pub(crate) fn pixels<const P: usize>(&self, first: usize) -> [[usize; 2]; P] {
         let (mut row, mut col) = (first / self.out[1].max(1), first % self.out[1].max(1));
         let (rows, cols) = (
-            self.stride[0] * self.x_strides[0],
-            self.stride[1] * self.x_strides[1],
+            self.stride[0].wrapping_mul(self.x_strides[0]),
+            self.stride[1].wrapping_mul(self.x_strides[1]),
         );
+        let [y_row, y_col] = self.y_strides;
         [(); P].map(|()| {
             let at = [
-                row * rows + col * cols,
-                row * self.y_strides[0] + col * self.y_strides[1],
+                row.wrapping_mul(rows).wrapping_add(col.wrapping_mul(cols)),
+                (row.saturating_mul(y_row)).saturating_add(col.saturating_mul(y_col)),
             ];
             col += 1;
             if col == self.out[1] {
@@ -177,13 +191,8 @@ struct Runs {
 impl Runs {
     #[inline(always)]
     fn of(conv: &Conv) -> Self {
-        let Sweep {
-            kernel: [rows, cols],
-            dilation,
-            x_strides,
-            ..
-        } = conv.sweep;
-        let apart = [dilation[0] * x_strides[0], dilation[1] * x_strides[1]];
+        let [rows, cols] = conv.sweep.kernel;
+        let apart = conv.sweep.apart();
         if apart[1] == conv.c || cols == 1 {
             Self {
                 times: [rows, 1],
@@ -278,7 +287,10 @@ impl Pixels<'_> {
             let bias = simd.load(block(self.conv.bias, first, &mut spare));
             let width = LANES.min(self.conv.n - first);
             for (sum, [_, at]) in sums.iter().zip(at).take(black_box(size)) {
-                let y = self.y.get_mut(at + first..).unwrap_or(&mut []);
+                let y = self
+                    .y
+                    .get_mut(at.saturating_add(first)..)
+                    .unwrap_or(&mut []);
                 self.conv
                     .finish(simd, simd.add(simd.load(sum), bias), y, width);
             }

@@ -131,7 +131,10 @@ impl Channels<'_> {
         let width = LANES.min(layer.c - channel);
         for (sum, [_, at]) in sums.iter().zip(at).take(black_box(size)) {
             let v = layer.activation.apply(simd, simd.add(simd.load(sum), bias));
-            let y = self.y.get_mut(at + channel..).unwrap_or(&mut []);
+            let y = self
+                .y
+                .get_mut(at.saturating_add(channel)..)
+                .unwrap_or(&mut []);
             if width == LANES
                 && let Some(y) = y.first_chunk_mut()
             {
@@ -163,15 +166,10 @@ fn sums<S: Simd, const P: usize>(
     channel: usize,
     out: &mut [Block; MOST],
 ) {
-    let Sweep {
-        kernel: [rows, cols],
-        dilation,
-        x_strides,
-        ..
-    } = layer.sweep;
+    let [rows, cols] = layer.sweep.kernel;
     let mut sums = [simd.splat(0.0); P];
     let wide = layer.c.next_multiple_of(LANES);
-    let [down, along] = [dilation[0] * x_strides[0], dilation[1] * x_strides[1]];
+    let [down, along] = layer.sweep.apart();
     let last = channel + rows.saturating_sub(1) * down + cols.saturating_sub(1) * along;
     let mut places = at.iter().take(P).map(|&[at, _]| at);
     // `run` found the weights of every channel.

@@ -241,6 +241,55 @@ fn what_is_too_short_is_left_as_it_was() {
     }
 }
 
+/// Over one row or column a stride says nothing, however large it is; and outputs that lie beyond any memory are not written.
+#[test]
+fn strides_that_nothing_goes_along_may_be_anything() {
+    const MOST: usize = usize::MAX;
+    let one = Sweep {
+        out: [1, 1],
+        kernel: [1, 1],
+        stride: [MOST, MOST],
+        dilation: [MOST, MOST],
+        x_strides: [MOST, MOST],
+        y_strides: [MOST, MOST],
+    };
+    let far = Sweep {
+        out: [2, 3],
+        stride: [1, 1],
+        x_strides: [0, 0],
+        ..one
+    };
+    let (packed, bias) = (vec![1.0; conv_packed_len([2, 2])], [0.5; 2]);
+    for (sweep, pixels) in [(one, 1), (far, 1)] {
+        let conv = Conv {
+            sweep,
+            c: 2,
+            n: 2,
+            w: &packed,
+            bias: &bias,
+            activation: Activation::None,
+            accumulate: false,
+        };
+        let layer = Depthwise {
+            sweep,
+            c: 2,
+            w: &packed[..depthwise_packed_len([1, 2])],
+            bias: &bias,
+            activation: Activation::None,
+        };
+        let results = on_all(|isa| {
+            let (mut dense, mut deep) = (vec![7.0; 8], vec![7.0; 8]);
+            conv.run(isa, &[1.0, 2.0], &mut dense);
+            layer.run(isa, &[1.0, 2.0], &mut deep);
+            [dense, deep]
+        });
+        for (y, wanted) in results.iter().zip([[3.5, 3.5], [1.5, 2.5]]) {
+            assert_eq!(y[..2 * pixels], wanted);
+            assert!(y[2 * pixels..].iter().all(|&y| y == 7.0), "{y:?}");
+        }
+    }
+}
+
 #[test]
 fn activations_keep_what_is_no_number_and_bound_what_is_infinite() {
     let kinds = [
@@ -324,24 +373,104 @@ fn not_a_number_is_not_lost() {
 /// Pins result bits that must never change, on any target or at any optimisation level.
 #[test]
 fn results_have_the_same_bits_everywhere() {
-    let (sweep, [x_len, y_len]) = sweep([19, 37], [[5, 7], [3, 3], [2, 1], [1, 1]], [0, 0]);
-    let k = 9 * 19;
-    let mut packed = vec![0.0; conv_packed_len([k, 37])];
-    conv_pack(&values(k * 37, 1), [k, 37], &mut packed);
+    let over = |channels, activation: Activation, accumulate: bool| {
+        let (sweep, [x_len, y_len]) = sweep(channels, [[5, 7], [3, 3], [2, 1], [1, 1]], [0, 0]);
+        let [c, n] = channels;
+        let k = 9 * c;
+        let mut packed = vec![0.0; conv_packed_len([k, n])];
+        conv_pack(&values(k * n, 1), [k, n], &mut packed);
+        let bias = values(n, 2);
+        let conv = Conv {
+            sweep,
+            c,
+            n,
+            w: &packed,
+            bias: &bias,
+            activation,
+            accumulate,
+        };
+        let [y] = on_all(|isa| {
+            let mut y = values(y_len, 4);
+            conv.run(isa, &values(x_len, 3), &mut y);
+            [y]
+        });
+        y
+    };
+    let (deep, [x_len, y_len]) = sweep([37, 37], [[5, 7], [3, 3], [2, 1], [1, 2]], [0, 0]);
+    let mut packed = vec![0.0; depthwise_packed_len([9, 37])];
+    depthwise_pack(&values(9 * 37, 1), [9, 37], &mut packed);
     let bias = values(37, 2);
-    let conv = Conv {
-        sweep,
-        c: 19,
-        n: 37,
+    let layer = Depthwise {
+        sweep: deep,
+        c: 37,
         w: &packed,
         bias: &bias,
-        activation: Activation::Clipped(6.0),
-        accumulate: false,
+        activation: Activation::Elu(0.7),
     };
-    let [y] = on_all(|isa| {
+    let [depthwise] = on_all(|isa| {
         let mut y = vec![0.0; y_len];
-        conv.run(isa, &values(x_len, 3), &mut y);
+        layer.run(isa, &values(x_len, 3), &mut y);
         [y]
     });
-    assert_eq!(digest(&y), 13_669_488_750_079_871_009);
+    let pool = |kind| {
+        let pool = Pool {
+            kind,
+            size: [9, 8],
+            out: [4, 6],
+            c: 19,
+            kernel: [3, 2],
+            stride: [3, 2],
+            dilation: [1, 2],
+            before: [1, 2],
+            after: [1, 2],
+            x_strides: [19 * 8, 19],
+            y_strides: [19 * 6, 19],
+        };
+        let [y] = on_all(|isa| {
+            let mut y = vec![0.0; 4 * 6 * 19];
+            pool.run(isa, &values(9 * 8 * 19, 5), &mut y);
+            [y]
+        });
+        y
+    };
+    let table = [
+        [0.0, 1.0, 0.25],
+        [1.0, 2.0, 0.7],
+        [4.0, 4.0, 0.0],
+        [3.0, 4.0, 0.1],
+    ];
+    let resize = Resize {
+        size: [5, 5],
+        c: 19,
+        rows: table.as_flattened(),
+        cols: table.as_flattened(),
+        x_strides: [19 * 5, 19],
+        y_strides: [19 * 4, 19],
+    };
+    let [resized] = on_all(|isa| {
+        let mut y = vec![0.0; 4 * 4 * 19];
+        resize.run(isa, &values(5 * 5 * 19, 6), &mut y);
+        [y]
+    });
+    let results = [
+        over([19, 37], Activation::Clipped(6.0), false),
+        over([19, 37], Activation::Tanh, true),
+        depthwise,
+        pool(PoolKind::Max),
+        pool(PoolKind::Mean),
+        pool(PoolKind::PaddedMean),
+        resized,
+    ];
+    assert_eq!(
+        results.map(|y| digest(&y)),
+        [
+            13_669_488_750_079_871_009,
+            13_999_116_788_343_981_019,
+            3_101_047_274_708_411_837,
+            3_911_788_625_827_074_647,
+            7_856_214_053_099_813_820,
+            8_040_180_050_763_095_212,
+            16_607_212_345_964_279_329,
+        ]
+    );
 }

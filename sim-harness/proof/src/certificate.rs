@@ -34,7 +34,7 @@ pub const FORMAT_VERSION: u32 = 2;
 /// Chance of McNemar's tests together to call something different that is not.
 const SIGNIFICANCE: f64 = 0.05;
 /// Chance of all tests of a difference beyond its margin together to find one that is not.
-const DIFFERENCE: f64 = 0.01;
+pub(crate) const DIFFERENCE: f64 = 0.01;
 /// So many of a list of differing fields are named.
 const NAMED: usize = 5;
 

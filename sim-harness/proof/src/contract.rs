@@ -36,9 +36,8 @@ pub struct Compared {
 }
 
 impl Compared {
-    /// Compares the contract of the run with the reference's, and what the image that ran says with the run's contract. The image says some
-    /// of the fields, with numbers of 32 bits.
-    pub fn new(run: &Value, reference: Option<&Value>, image: &Value) -> Self {
+    /// Compares the contract of the run with the reference's, and what the image that ran says with what its bundle says of the same fields.
+    pub fn new(run: &Value, reference: Option<&Value>, [image, bundle]: [&Value; 2]) -> Self {
         let mut compared = Self {
             remedy: "complete it: python -m lads_exporter reference --complete",
             ..Self::default()
@@ -59,7 +58,7 @@ impl Compared {
                 .cloned()
                 .collect();
         }
-        restricted(String::new(), image, run, &mut compared.image_differing);
+        differences(String::new(), image, bundle, &mut compared.image_differing);
         compared
     }
 
@@ -200,7 +199,7 @@ mod tests {
         run["action"][1]["max"] = json!(2.5);
         run["extra"] = json!(true);
         run["provenance"]["seed"] = json!(7);
-        let found = Compared::new(&run, Some(&contract()), &json!({}));
+        let found = Compared::new(&run, Some(&contract()), [&Value::Null; 2]);
         assert_eq!(
             fields(&found.differing),
             ["action[turn].max", "decision.rule", "extra"]
@@ -209,7 +208,7 @@ mod tests {
         assert_eq!(fields(&found.history), ["provenance.seed"]);
         assert_eq!(found.fields, ["action", "decision"]);
         run["action"] = json!([]);
-        let found = Compared::new(&run, Some(&contract()), &json!({}));
+        let found = Compared::new(&run, Some(&contract()), [&Value::Null; 2]);
         assert!(fields(&found.differing).contains(&"action.len"));
     }
 
@@ -217,11 +216,9 @@ mod tests {
     fn numbers_are_compared_as_numbers() {
         let mut run = contract();
         run["action"][1]["max"] = json!(2.0);
-        let found = Compared::new(
-            &run,
-            Some(&contract()),
-            &json!({"action": [{"max": 0.1_f32}, {"max": 2.0}]}),
-        );
+        let image = json!({"action": [{"max": 0.5}, {"max": 2.0}]});
+        let bundle = json!({"action": [{"max": 0.5}, {"max": 2}]});
+        let found = Compared::new(&run, Some(&contract()), [&image, &bundle]);
         assert!(
             found.differing.is_empty() && found.image_differing.is_empty(),
             "{found:?}"
@@ -242,8 +239,13 @@ mod tests {
 
     #[test]
     fn an_image_that_says_otherwise_is_found_and_no_recorded_contract_is_none_compared() {
-        let found = Compared::new(&contract(), None, &json!({"decision": {"rule": "sample"}}));
-        assert_eq!(fields(&found.image_differing), ["decision.rule"]);
+        let image = json!({"decision": {"rule": "sample"}, "joint": "elbow"});
+        let bundle = json!({"decision": {"rule": "argmax"}, "interface": "effort"});
+        let found = Compared::new(&contract(), None, [&image, &bundle]);
+        assert_eq!(
+            fields(&found.image_differing),
+            ["decision.rule", "interface", "joint"]
+        );
         assert!(found.fields.is_empty() && found.differing.is_empty());
     }
 }

@@ -87,6 +87,9 @@ pub enum EvaluationError {
     /// There is no memory for the policy's controller.
     #[error(transparent)]
     Memory(MemoryError),
+    /// The bundle's table of instructions cannot be evaluated, so its image cannot be compared with it.
+    #[error(transparent)]
+    Bundle(lads_compiler::CompileError),
     /// An episode could not be finished.
     #[error("episode {episode} of instruction {instruction}: {source}")]
     Rollout {

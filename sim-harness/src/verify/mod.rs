@@ -101,10 +101,11 @@ pub fn run(
     let stated = bundle
         .metadata("lads.contract")
         .and_then(|text| serde_json::from_str(text).ok());
+    let bundled = contract::of_bundle(bundle).map_err(EvaluationError::Bundle)?;
     let compared = Compared::new(
         &stated.unwrap_or_default(),
         reference.contract.as_ref(),
-        &contract::of_image(&evaluation.policy),
+        [&contract::of_image(&evaluation.policy), &bundled],
     );
     let not_covered = unseen(evaluation, &answers);
     Ok(Certificate::new(

@@ -273,7 +273,10 @@ pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usi
         contract: Compared::new(
             &stated,
             reference.contract.as_ref(),
-            &verify::contract::of_image(&policy),
+            [
+                &verify::contract::of_image(&policy),
+                &verify::contract::of_bundle(bundle).unwrap(),
+            ],
         ),
         answers: Answers::judge(reference, &replays, tolerance).0,
     }))

@@ -75,7 +75,7 @@ impl Channel {
 
     /// Returns the limits of a channel without elements of its own: those stated, or the whole
     /// range of its type.
-    pub(crate) fn limits(&self) -> (f32, f32) {
+    pub fn limits(&self) -> (f32, f32) {
         let (min, max) = match self.dtype {
             DType::F32 => (f32::MIN, f32::MAX),
             DType::U8 => (0.0, 255.0),

@@ -78,7 +78,9 @@ fn numbers(
         })
         .collect();
     all.filter(|all| all.len() == sides).ok_or_else(|| {
-        format!("has {name} {found:?}, it must have {sides} numbers from {least} to {MAX_SIDE}")
+        format!(
+            "has {name} {found:?}, it must have {sides} numbers from {least} to {MAX_SIDE}; give the layer such {name} and export the model again"
+        )
     })
 }
 
@@ -120,7 +122,10 @@ fn windows(
         }
         let padded = sides[i] + before[i] + after[i];
         let rest = padded.checked_sub(wide).ok_or_else(|| {
-            format!("has a window of {wide} over {padded} elements, padding included")
+            format!(
+                "has a window of {wide} over {padded} elements, padding included; give it a larger input, or smaller dilations ({}) or a smaller kernel ({})",
+                dilation[i], kernel[i]
+            )
         })?;
         let mut steps = if round_up {
             rest.div_ceil(stride[i])
@@ -132,7 +137,9 @@ fn windows(
             steps -= 1;
         }
         if steps >= MAX_SIDE || before[i].max(after[i]) > MAX_SIDE {
-            return Err(format!("gives an image with a side beyond {MAX_SIDE}"));
+            return Err(format!(
+                "gives an image with a side beyond {MAX_SIDE}; give it a smaller input or larger strides"
+            ));
         }
         out.push(steps + 1);
     }
@@ -175,18 +182,20 @@ fn conv(g: &mut Graph, x: &Operands, a: &Attributes) -> Outputs {
         || !outputs.is_multiple_of(groups)
     {
         return Err(format!(
-            "has weights {shape:?} in {groups} groups for {channels} channels"
+            "has weights {shape:?} in {groups} groups for {channels} channels; group times the weights' second axis has to be the channels, and the first axis a multiple of group: correct the layer's group or its weights and export the model again"
         ));
     }
     let depthwise = groups == channels && outputs == channels;
     if !depthwise && images.saturating_mul(groups) > MAX_PARTS {
         return Err(format!(
-            "has {images} images in {groups} groups, together at most {MAX_PARTS} are supported"
+            "has {images} images in {groups} groups, together at most {MAX_PARTS} are supported; export the model for fewer images, or with fewer groups"
         ));
     }
     let named = numbers(a, "kernel_shape", sides.len(), 0, 1)?;
     if !named.contains(&0) && named != kernel {
-        return Err(format!("has weights {shape:?} and kernel_shape {named:?}"));
+        return Err(format!(
+            "has weights {shape:?} and kernel_shape {named:?}; leave kernel_shape out, or give it that of the weights"
+        ));
     }
     let windows = windows(a, &sides, kernel, false)?;
     // [kernel.., C / group, M]
@@ -229,7 +238,8 @@ fn pool(g: &mut Graph, x: &Operands, a: &Attributes, kind: PoolKind) -> Outputs 
     let covered = [0, 1].map(|i| (windows.kernel[i] - 1) * windows.dilation[i] + 1);
     if (0..2).any(|i| windows.before[i].max(windows.after[i]) >= covered[i]) {
         return Err(
-            "has a padding as large as its window, so that some windows see nothing".into(),
+            "has a padding as large as its window, so that some windows see nothing; pad less"
+                .into(),
         );
     }
     let last = channels_last(g, image)?;

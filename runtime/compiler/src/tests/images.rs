@@ -302,21 +302,34 @@ fn images_that_are_refused() {
     let with = |attribute| y(w(image()).node("Conv", &["a", "w"], &["y"], &[attribute]));
     refused(
         &with(int("group", 3)),
-        &["Conv", "[2, 4, 3, 3]", "3 groups for 4 channels"],
+        &[
+            "Conv",
+            "[2, 4, 3, 3]",
+            "3 groups for 4 channels",
+            "correct the layer's group",
+        ],
     );
     refused(
         &with(ints("strides", &[0, 1])),
-        &["strides [0, 1]", "2 numbers from 1"],
+        &[
+            "strides [0, 1]",
+            "2 numbers from 1",
+            "give the layer such strides",
+        ],
     );
     refused(&with(ints("pads", &[1, 1])), &["pads [1, 1]", "4 numbers"]);
     refused(
         &with(ints("dilations", &[3, 3])),
-        &["a window of 7 over 5 elements"],
+        &[
+            "a window of 7 over 5 elements",
+            "smaller dilations (3)",
+            "a larger input",
+        ],
     );
     refused(&with(text("auto_pad", "SAME")), &["auto_pad = SAME"]);
     refused(
         &with(ints("kernel_shape", &[2, 3])),
-        &["kernel_shape [2, 3]"],
+        &["kernel_shape [2, 3]", "leave kernel_shape out"],
     );
     let empty = image().weights("w", &[2, 4, 0, 3], &[]);
     refused(

@@ -1,5 +1,7 @@
 #!/bin/sh
-# The self-test of a small policy on other targets under qemu, bit for bit as on this machine. What is missing is skipped and named.
+# The self-test of a small policy on other targets under qemu, bit for bit as on this machine. What is missing is skipped and named. Of the
+# program for Cortex-M it also says what it takes: flash, RAM, stack, and the instructions of a control step (docs/firmware.md). LADS_OPS as for
+# runtime/ffi/archive.sh.
 # usage: runtime/ffi/examples/targets/run.sh <image.c>     image.c: lads compile models/kitchen-small.onnx --emit-c image.c
 # Needs, per target, the C compiler and the qemu named below, and Rust's core for it: the target added to a toolchain
 # (rustup target add), or a toolchain with rust-src, of which core is built on the way. Every toolchain on PATH and of rustup is tried.
@@ -52,8 +54,8 @@ archive() {
 }
 same() {
     printf '%s: ' "$1"
-    if [ "$(echo "$2" | grep -v '^stack')" = "$expected" ]; then
-        echo "the same bits$(echo "$2" | sed -n 's/^stack/; stack/p')"
+    if [ "$(echo "$2" | grep -v '^stack\|^step')" = "$expected" ]; then
+        echo "the same bits$(echo "$2" | sed -n 's/^st\(ack\|ep\)/; &/p' | tr -d '\n')"
     else
         echo "differs: $2"
         exit 1
@@ -85,7 +87,9 @@ if have arm-none-eabi-gcc qemu-system-arm && toolchain thumbv7em-none-eabihf; th
     # shellcheck disable=SC2086
     arm-none-eabi-gcc $flags -ffreestanding -fno-builtin -nostdlib -mthumb -mcpu=cortex-m4 -mfloat-abi=hard -mfpu=fpv4-sp-d16 \
         "$here/selftest.c" "$here/startup.c" "$image" "$archive" -lgcc -T "$here/mps2.ld" -o "$work/cortex"
+    arm-none-eabi-size "$work/cortex" | awk -v image="$bytes" \
+        'END { print "Cortex-M: flash " $1 + $2 " bytes, of which the image " image "; RAM " $2 + $3 " bytes, to which the stack comes" }'
     for board in mps2-an386 mps2-an500; do
-        same "$board" "$(qemu-system-arm -machine $board -nographic -semihosting -kernel "$work/cortex" 2>&1)"
+        same "$board" "$(qemu-system-arm -machine $board -icount shift=0 -nographic -semihosting -kernel "$work/cortex" 2>&1)"
     done
 fi

@@ -1,6 +1,6 @@
 /* Runs the self-test of the image that is linked in, then an episode of its own that is longer than a context of 50 steps, and
  * prints a hash of all bits of the actions of both: the same on every target. Hosted, or bare on Cortex-M with semihosting
- * (startup.c), where it also says how much stack was used. */
+ * (startup.c), where it also says how much stack was used and how many instructions a control step executed. */
 #include <lads.h>
 
 #ifndef WORKSPACE_BYTES
@@ -10,6 +10,10 @@ enum { OBSERVATION_MOST = 64, ACTION_MOST = 16, STEPS = 70 };
 
 extern const unsigned char IMAGE[IMAGE_BYTES];
 void say(const char *text);
+/* Of startup.c. */
+void say_number(const char *what, uint32_t number, const char *unit);
+void count_from_here(void);
+uint32_t instructions_counted(void);
 
 static lads_policy policy;
 static _Alignas(LADS_WORKSPACE_ALIGN) unsigned char workspace[WORKSPACE_BYTES];
@@ -48,7 +52,7 @@ int run(void) {
         return 1;
     }
     say_hash("self-test passed, actions ", tested.digest);
-    uint32_t hash = 2166136261u, random = 1;
+    uint32_t hash = 2166136261u, random = 1, most = 0, sum = 0;
     for (int step = 0; step < STEPS; step++) {
         for (size_t i = 0; i < contract.observation_len; i++) {
             lads_channel_element(&policy, contract.observation, i, &element);
@@ -58,7 +62,11 @@ int run(void) {
             const float part = width * share;
             observation[i] = element.min + part;
         }
+        count_from_here();
         status = lads_step(controller, observation, contract.observation_len, NULL, action, contract.action_len, NULL);
+        const uint32_t executed = instructions_counted();
+        most = executed > most ? executed : most;
+        sum += executed;
         if (status != LADS_STATUS_OK) {
             say(lads_status_text(status));
             say("\n");
@@ -72,11 +80,18 @@ int run(void) {
         }
     }
     say_hash("own episode, actions ", hash);
+    if (most > 0) {
+        say_number("step ", sum / STEPS, " instructions in the mean,");
+        say_number(" ", most, " at most\n");
+    }
     return 0;
 }
 
 #if __STDC_HOSTED__
 #include <stdio.h>
 void say(const char *text) { fputs(text, stdout); }
+void say_number(const char *what, uint32_t number, const char *unit) { printf("%s%lu%s", what, (unsigned long)number, unit); }
+void count_from_here(void) {}
+uint32_t instructions_counted(void) { return 0; }
 int main(void) { return run(); }
 #endif

@@ -5,7 +5,7 @@ use lads_kernels::attention_scratch_len;
 
 use super::{Operation, Work};
 use crate::access::{self, Access, AccessKind};
-use crate::check::{Checked, Checker, Fault, apart, exactly, overlap, require};
+use crate::check::{Checked, Checker, Fault, apart, exactly, overlap, product, require};
 use crate::codec::{record, word_enum_for};
 use crate::machine::{ExecError, Machine};
 use crate::place::{Span, StateSpan};
@@ -235,11 +235,11 @@ fn rows(span: Span, rows: u32, stride: u32, width: u32) -> Checked {
 /// Returns whether `len` words hold exactly the elements of a format of the cache with these
 /// dimensions.
 fn holds(len: u32, format: CacheFormat, dims: [u32; 2]) -> bool {
-    let elements: u128 = dims.into_iter().map(u128::from).product();
-    let held = u128::from(len).saturating_mul(format.per_word() as u128);
+    let elements = product(dims);
+    let held = u64::from(len).saturating_mul(format.per_word() as u64);
     // The last word may be half empty.
     let fits = held
         .checked_sub(elements)
-        .is_some_and(|spare| spare < format.per_word() as u128);
+        .is_some_and(|spare| spare < format.per_word() as u64);
     elements != 0 && fits
 }

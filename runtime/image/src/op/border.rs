@@ -120,7 +120,11 @@ impl Operation for Border {
     }
 
     fn work(&self) -> Work {
-        Work::default().with_weights(self.value)
+        let filled = |work: Work, [_, rows, len]: [u32; 3]| work.and(Work::products([rows, len]));
+        self.sides()
+            .into_iter()
+            .fold(Work::default(), filled)
+            .with_weights(self.value)
     }
 }
 

@@ -4,7 +4,7 @@ use lads_kernels as kernels;
 
 use super::{Operation, Work};
 use crate::access::{self, Access, AccessKind};
-use crate::check::{Checked, Checker, Fault, reaches, require};
+use crate::check::{Checked, Checker, Fault, product, reaches, require};
 use crate::codec::record;
 use crate::machine::{ExecError, Machine, Readable};
 use crate::place::{Operand, Span};
@@ -32,14 +32,14 @@ impl Operation for Copy {
         reaches(self.x.len, self.dims, self.x_strides)?;
         reaches(self.y.len, self.dims, self.y_strides)?;
         // Each element is written once.
-        let written: u128 = self.dims.into_iter().map(u128::from).product();
+        let written = product(self.dims);
         let once = self
             .dims
             .into_iter()
             .zip(self.y_strides)
             .all(|(dim, stride)| dim == 1 || stride != 0);
         require(
-            written != 0 && written <= u128::from(self.y.len) && once,
+            written != 0 && written <= u64::from(self.y.len) && once,
             Fault::Shape,
         )
     }
@@ -72,7 +72,7 @@ impl Operation for Copy {
     }
 
     fn work(&self) -> Work {
-        Work::default().with_operand(self.x)
+        Work::products(self.dims).with_operand(self.x)
     }
 }
 

@@ -71,7 +71,7 @@ impl Operation for GatherRow {
         let weights = matches!(self.table.space, Space::Weights);
         Work {
             weight_words: if weights { self.row_len.into() } else { 0 },
-            ..Work::default()
+            ..Work::elements(self.row_len)
         }
     }
 }

@@ -299,17 +299,20 @@ fn work_counts_what_is_multiplied_and_read() {
             }
             Op::GatherRow(op) => {
                 let weights = op.table.space == Space::Weights;
-                assert_eq!(work, of(0, if weights { 3 } else { 0 }, 0));
+                assert_eq!(work, of(3, if weights { 3 } else { 0 }, 0));
             }
             Op::Copy(op) => {
                 let weights = op.x.space == Space::Weights;
-                assert_eq!(work, of(0, if weights { 12 } else { 0 }, 0));
+                assert_eq!(work, of(12, if weights { 12 } else { 0 }, 0));
             }
             Op::MatMul(_) => assert_eq!(work.multiply_adds, 24),
             Op::Conv(op) => assert_eq!(work, of(108, u64::from(op.w.len + 3), 0)),
             Op::Depthwise(op) => assert_eq!(work, of(36, u64::from(op.w.len + 3), 0)),
             Op::Border(op) => {
-                assert_eq!(work, of(0, op.value.map_or(0, |value| value.len.into()), 0));
+                let inside = u64::from(op.inside.rows) * u64::from(op.inside.cols);
+                let filled = u64::from(op.y.len) - inside * u64::from(op.c);
+                let weights = op.value.map_or(0, |value| value.len.into());
+                assert_eq!(work, of(filled, weights, 0));
             }
             Op::LayerNorm(_) => assert_eq!(work, of(10, 10, 0)),
             Op::Attention(_) => assert!(work.state_words > 0 && work.weight_words == 0),
