@@ -11,7 +11,7 @@ use std::process::ExitCode;
 
 use lads_compiler::{CacheFormat, Options, Storage, WeightFormat};
 use lads_proof::reference::Reference;
-use mutate::{Model, Normals, Said};
+use mutate::{Model, Normals, Outcome};
 
 /// A change that moves so much is to be found.
 const LOGIT: f64 = 1e-2;
@@ -40,8 +40,8 @@ impl Bench {
     fn add(&self, kind: &mut Kind, what: &str, bytes: &[u8], options: &Options) {
         kind.changes += 1;
         let judged = match mutate::verify(bytes, options, &self.reference, self.every) {
-            Said::Judged(judged) => judged,
-            Said::Refused(why) => {
+            Outcome::Judged(judged) => judged,
+            Outcome::Refused(why) => {
                 kind.refused += 1;
                 kind.refusals.push(format!("{what}: {why}"));
                 return;

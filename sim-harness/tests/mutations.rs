@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use lads_compiler::Options;
 use lads_proof::reference::Reference;
-use mutate::{Judged, Model, Said};
+use mutate::{Judged, Model, Outcome};
 
 /// The first traced episode of each seventh instruction.
 const EVERY: usize = 7;
@@ -24,8 +24,8 @@ fn shipped() -> (Model, Reference) {
 
 fn judged(model: &Model, reference: &Reference) -> Box<Judged> {
     match mutate::verify(model.bytes(), &Options::exact(), reference, EVERY) {
-        Said::Judged(judged) => judged,
-        Said::Refused(why) => panic!("{why}"),
+        Outcome::Judged(judged) => judged,
+        Outcome::Refused(why) => panic!("{why}"),
     }
 }
 

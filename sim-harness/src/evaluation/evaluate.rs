@@ -18,7 +18,7 @@ use crate::faults::Faults;
 use crate::plans::PlanBook;
 use crate::random::Stream;
 use crate::results::{self, Asked};
-use crate::rollout::{Actor, Driver, Episode, Onlooker, RolloutError, Task, Timing};
+use crate::rollout::{Actor, Driver, Episode, Observer, RolloutError, Task, Timing};
 use crate::spoken::WordBook;
 use crate::trace::Trace;
 
@@ -53,8 +53,8 @@ pub struct Setup<'e> {
     pub stop_where_refused: bool,
     /// How many of each instruction's episodes, from the first, keep every control step.
     pub traced: u32,
-    /// Who looks on at the policy's episodes.
-    pub onlooker: Option<&'e dyn Onlooker>,
+    /// Observer of the policy's episodes.
+    pub observer: Option<&'e dyn Observer>,
 }
 
 /// What to run, and how.
@@ -236,7 +236,7 @@ impl Evaluation<'_> {
         if self.setup.traced > 0 {
             driver.record();
         }
-        driver.show(self.setup.onlooker);
+        driver.set_observer(self.setup.observer);
         let (mut episodes, mut refused_at) = (Vec::new(), Vec::new());
         while let Some(place) = next() {
             let episode = (place % self.episodes as usize) as u32;

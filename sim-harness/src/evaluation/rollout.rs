@@ -50,24 +50,24 @@ pub enum RolloutError {
         /// The environment's reason.
         error: ActionError,
     },
-    /// Who looks on has seen enough.
-    #[error("stopped while it was looked at")]
+    /// The observer stopped the episode.
+    #[error("stopped by its observer")]
     Stopped,
 }
 
-/// An episode as it stands, for who looks on.
-pub struct Glimpse<'g> {
-    /// Which episode.
+/// State of a running episode, as passed to its [`Observer`].
+pub struct Snapshot<'g> {
+    /// The episode's task: instruction, seed, limits.
     pub task: &'g Task<'g>,
-    /// How far it is.
-    pub stand: Stand,
-    /// To look at, not to change.
+    /// Whether a control step is about to be executed, or the last one was.
+    pub phase: Phase,
+    /// The environment in its present state; mutable only because rendering needs it, not to be changed.
     pub environment: &'g mut dyn Environment,
 }
 
-/// How far an episode is.
+/// Phase of an episode at the moment it is observed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Stand {
+pub enum Phase {
     /// The next action is about to be executed.
     Acting {
         /// The plan in force; `None` of a policy that selects none.
@@ -80,21 +80,21 @@ pub enum Stand {
     },
 }
 
-/// How an episode that is looked at goes on.
+/// An [`Observer`]'s decision on how its episode continues.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Go {
-    /// With the next control step.
-    On,
-    /// From its start, as it was.
-    Again,
-    /// Not at all.
+pub enum Control {
+    /// Executes the next control step.
+    Continue,
+    /// Runs the same episode again from its start.
+    Restart,
+    /// Ends the run.
     Stop,
 }
 
-/// Looks on while episodes run, at every control step between decision and action, and once after the last. It may take its time.
-pub trait Onlooker: std::fmt::Debug + Sync {
-    /// One control step.
-    fn look(&self, glimpse: Glimpse<'_>) -> Go;
+/// Observes running episodes: at every control step between decision and action, and once after the last. It may block.
+pub trait Observer: std::fmt::Debug + Sync {
+    /// Called at each control step and once at the end of the episode; says how the episode continues.
+    fn observe(&self, snapshot: Snapshot<'_>) -> Control;
 }
 
 /// Who acts.
@@ -171,7 +171,7 @@ pub struct Driver<'a, 'm, 'e> {
     plans: Vec<u32>,
     /// Control steps of the episode, where they are kept.
     recording: Option<Vec<Step>>,
-    onlooker: Option<&'e dyn Onlooker>,
+    observer: Option<&'e dyn Observer>,
     /// What was measured so far.
     pub timing: Timing,
 }
@@ -197,7 +197,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             limits,
             plans: Vec::new(),
             recording: None,
-            onlooker: None,
+            observer: None,
             timing: Timing::default(),
         }
     }
@@ -226,9 +226,9 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         }
     }
 
-    /// Lets someone look on at the policy's episodes to come.
-    pub fn show(&mut self, onlooker: Option<&'e dyn Onlooker>) {
-        self.onlooker = onlooker;
+    /// Sets the observer of the episodes that follow; `None` removes it.
+    pub fn set_observer(&mut self, observer: Option<&'e dyn Observer>) {
+        self.observer = observer;
     }
 
     /// Runs one episode to its end: the instruction is carried out, or the steps or the commanded plans are used up.
@@ -243,7 +243,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         Ok(episode)
     }
 
-    /// An episode; `None` if who looks on wants it again.
+    /// Runs the episode once; `None` if the observer asked for a restart.
     fn attempt(&mut self, task: &Task<'_>) -> Result<Option<Episode>, RolloutError> {
         if let Some(recording) = &mut self.recording {
             recording.clear();
@@ -270,10 +270,10 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
                     let fresh = selected.filter(|selected| selected.fresh);
                     self.plans.extend(fresh.map(|selected| selected.index));
                     let plan = selected.map(|selected| selected.index);
-                    match self.look(task, Stand::Acting { plan }) {
-                        Go::On => {}
-                        Go::Again => return Ok(None),
-                        Go::Stop => return Err(RolloutError::Stopped),
+                    match self.observe(task, Phase::Acting { plan }) {
+                        Control::Continue => {}
+                        Control::Restart => return Ok(None),
+                        Control::Stop => return Err(RolloutError::Stopped),
                     }
                     let before_cpu = cpu_time();
                     link.actuate(&self.action, &mut self.executed);
@@ -287,16 +287,16 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             step += 1;
         }
         let success = self.succeeded(task);
-        let go = self.look(task, Stand::Ended { success });
-        Ok((go != Go::Again).then(|| self.outcome(task)))
+        let control = self.observe(task, Phase::Ended { success });
+        Ok((control != Control::Restart).then(|| self.outcome(task)))
     }
 
-    /// Shows the episode as it stands to who looks on.
-    fn look(&mut self, task: &Task<'_>, stand: Stand) -> Go {
-        self.onlooker.map_or(Go::On, |onlooker| {
-            onlooker.look(Glimpse {
+    /// Passes the episode's state to the observer, if there is one.
+    fn observe(&mut self, task: &Task<'_>, phase: Phase) -> Control {
+        self.observer.map_or(Control::Continue, |observer| {
+            observer.observe(Snapshot {
                 task,
-                stand,
+                phase,
                 environment: &mut *self.environment,
             })
         })

@@ -11,7 +11,7 @@ use embedded_graphics::text::{Alignment, Baseline, Text, TextStyleBuilder};
 
 use super::canvas::Canvas;
 use crate::environment::Completion;
-use crate::rollout::Stand;
+use crate::rollout::Phase;
 
 /// Height above the picture, in pixels.
 pub const HEAD: u32 = 48;
@@ -74,7 +74,7 @@ pub struct Progress<'p> {
     /// Completions so far.
     pub completions: &'p [Completion],
     /// What comes next.
-    pub stand: Stand,
+    pub phase: Phase,
 }
 
 /// Writes a line across the picture whose upper edge is at `top`.
@@ -120,17 +120,17 @@ impl Caption<'_> {
     fn status(&self, progress: Progress<'_>, top: i32, canvas: &mut Canvas) {
         let (number, all) = (progress.plans.len(), self.steps);
         let at = number as f64 * self.period_s;
-        let state = match progress.stand {
-            Stand::Acting { plan } => {
+        let state = match progress.phase {
+            Phase::Acting { plan } => {
                 plan.map_or_else(String::new, |plan| format!("plan {plan:>3}"))
             }
-            Stand::Ended { .. } if self.commanded.is_empty() => "ended".to_owned(),
-            Stand::Ended { success: true } => "carried out".to_owned(),
-            Stand::Ended { success: false } => "not carried out".to_owned(),
+            Phase::Ended { .. } if self.commanded.is_empty() => "ended".to_owned(),
+            Phase::Ended { success: true } => "carried out".to_owned(),
+            Phase::Ended { success: false } => "not carried out".to_owned(),
         };
         let text = format!("step {number:>3} of {all}  {at:>5.2} s  {state}");
         write(canvas, &FONT_8X13, INK, Point::new(MARGIN, top), &text);
-        if let Stand::Acting { plan: Some(plan) } = progress.stand {
+        if let Phase::Acting { plan: Some(plan) } = progress.phase {
             let x = MARGIN + FONT_8X13.character_size.width as i32 * (text.len() as i32 + 1);
             fill(canvas, Point::new(x, top + 1), [11, 11], plan_color(plan));
         }

@@ -24,7 +24,7 @@ use self::canvas::Canvas;
 use self::caption::{Caption, Progress};
 use self::file::{Finished, Form, Sink, shown_s};
 use crate::environment::{ActionError, Environment, EpisodeSeed};
-use crate::rollout::Stand;
+use crate::rollout::Phase;
 use crate::trace::{Step, Trace};
 
 /// Why there are no pictures.
@@ -209,9 +209,9 @@ impl Scene<'_> {
         Progress {
             plans: plans.get(..moment.number).unwrap_or(plans),
             completions: done.get(..done_len).unwrap_or(done),
-            stand: moment
+            phase: moment
                 .step
-                .map_or(Stand::Ended { success }, |step| Stand::Acting {
+                .map_or(Phase::Ended { success }, |step| Phase::Acting {
                     plan: step.plan,
                 }),
         }

@@ -26,7 +26,7 @@ use self::window::Screen;
 use crate::environment::{Environment, EpisodeSeed};
 use crate::film::FilmError;
 use crate::film::camera::Camera;
-use crate::rollout::Onlooker;
+use crate::rollout::Observer;
 
 /// Why there is no window.
 #[derive(Debug, Error)]
@@ -117,13 +117,13 @@ impl Viewer {
         })
     }
 
-    /// Opens the window and does `work` beside it, with the onlooker that its episodes are to have; closes the window after it. A person who
+    /// Opens the window and does `work` beside it, with the observer that its episodes are to have; closes the window after it. A person who
     /// closes the window stops the episodes, and so does `stop`.
     pub fn run<W: Send>(
         self,
         texts: &Texts,
         stop: &AtomicBool,
-        work: impl FnOnce(&dyn Onlooker) -> W + Send,
+        work: impl FnOnce(&dyn Observer) -> W + Send,
     ) -> Result<W, ViewerError> {
         let proxy = self.events.create_proxy();
         let tell = proxy.clone();
@@ -141,7 +141,7 @@ impl Viewer {
                 work(show)
             });
             let ran = self.events.run_app(&mut screen).map_err(no_window);
-            show.ask(|wish| wish.window = show::Window::Closed);
+            show.ask(|request| request.window = show::Window::Closed);
             let worked = worker.join();
             let worked = worked.unwrap_or_else(|panic| panic::resume_unwind(panic));
             screen.failed().map_or(ran, Err).map(|()| worked)

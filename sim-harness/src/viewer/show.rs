@@ -1,6 +1,6 @@
 //! What the window shows and what it asks for, between its thread and the one that runs episodes.
 //!
-//! [`Show`] looks on at the episodes ([`Onlooker`]), copies each state and lets the control step begin when it is due. It only reads, so
+//! [`Show`] is the [`Observer`] of the episodes: it copies each state and lets the control step begin when it is due. It only reads, so
 //! an episode is the same with and without it. What can fail: nothing.
 
 use std::fmt;
@@ -12,7 +12,7 @@ use mujoco_rs::wrappers::{MjData, MjModel};
 
 use super::pace::Pace;
 use crate::environment::Completion;
-use crate::rollout::{Glimpse, Go, Onlooker, Stand};
+use crate::rollout::{Control, Observer, Phase, Snapshot};
 
 /// How long the start of an episode stays in view, and its end.
 const START: Duration = Duration::from_millis(500);
@@ -37,20 +37,20 @@ pub struct Shown {
     /// Completions so far.
     pub completions: Vec<Completion>,
     /// What comes next; `None` before the first control step of all.
-    pub stand: Option<Stand>,
+    pub phase: Option<Phase>,
     /// What the person asked for.
-    pub wish: Wish,
+    pub request: Request,
 }
 
 /// What a person asked for.
 #[derive(Debug, Clone, Copy)]
-pub struct Wish {
+pub struct Request {
     /// No control step begins.
     pub paused: bool,
     /// Control steps that begin nevertheless.
     pub single: u32,
     /// The episode is to start again.
-    pub again: bool,
+    pub restart: bool,
     /// Deadlines of control steps.
     pub pace: Pace,
     /// Whether there is a window that shows it.
@@ -92,10 +92,10 @@ impl<'s> Show<'s> {
         stop: &'s AtomicBool,
         tell: Box<dyn Fn() + Send + Sync + 's>,
     ) -> Self {
-        let wish = Wish {
+        let request = Request {
             paused: false,
             single: 0,
-            again: false,
+            restart: false,
             pace: Pace::new(period_s),
             window: Window::Awaited,
         };
@@ -107,8 +107,8 @@ impl<'s> Show<'s> {
             max_steps: 0,
             plans: Vec::new(),
             completions: Vec::new(),
-            stand: None,
-            wish,
+            phase: None,
+            request,
         };
         Self {
             shown: Mutex::new(shown),
@@ -124,33 +124,33 @@ impl<'s> Show<'s> {
     }
 
     /// Changes what is asked for.
-    pub fn ask(&self, change: impl FnOnce(&mut Wish)) {
-        change(&mut self.now().wish);
+    pub fn ask(&self, change: impl FnOnce(&mut Request)) {
+        change(&mut self.now().request);
         self.changed.notify_all();
     }
 
     /// Waits until the control step is due, or `hold` is over where there is one, or what is shown is to end otherwise.
-    fn wait(&self, mut shown: MutexGuard<'_, Shown>, hold: Option<Duration>) -> Go {
+    fn wait(&self, mut shown: MutexGuard<'_, Shown>, hold: Option<Duration>) -> Control {
         let come = Instant::now();
         loop {
-            let wish = &mut shown.wish;
-            if self.stop.load(Ordering::Relaxed) || wish.window == Window::Closed {
-                return Go::Stop;
+            let request = &mut shown.request;
+            if self.stop.load(Ordering::Relaxed) || request.window == Window::Closed {
+                return Control::Stop;
             }
-            if wish.again {
-                wish.again = false;
-                wish.pace.rest();
-                return Go::Again;
+            if request.restart {
+                request.restart = false;
+                request.pace.rest();
+                return Control::Restart;
             }
             let now = Instant::now();
-            let held = wish.window == Window::Awaited || (wish.paused && wish.single == 0);
-            let due = hold.map_or_else(|| wish.pace.due(now), |hold| come + hold);
+            let held = request.window == Window::Awaited || (request.paused && request.single == 0);
+            let due = hold.map_or_else(|| request.pace.due(now), |hold| come + hold);
             if held {
-                wish.pace.rest();
-            } else if now >= due || wish.single > 0 {
-                wish.single = wish.single.saturating_sub(1);
-                wish.pace.step(due);
-                return Go::On;
+                request.pace.rest();
+            } else if now >= due || request.single > 0 {
+                request.single = request.single.saturating_sub(1);
+                request.pace.step(due);
+                return Control::Continue;
             }
             let left = due.saturating_duration_since(now);
             let glance = if held { GLANCE } else { left.min(GLANCE) };
@@ -162,13 +162,13 @@ impl<'s> Show<'s> {
 
 impl Shown {
     /// Takes over what there is to see; `None` if the environment has no simulator.
-    fn take(&mut self, glimpse: Glimpse<'_>) -> Option<()> {
-        let Glimpse {
+    fn take(&mut self, snapshot: Snapshot<'_>) -> Option<()> {
+        let Snapshot {
             task,
-            stand,
+            phase,
             environment,
-        } = glimpse;
-        self.stand = Some(stand);
+        } = snapshot;
+        self.phase = Some(phase);
         self.instruction = task.instruction;
         self.episode = task.seed.episode;
         self.max_steps = task.max_steps;
@@ -183,21 +183,21 @@ impl Shown {
     }
 }
 
-impl Onlooker for Show<'_> {
-    fn look(&self, glimpse: Glimpse<'_>) -> Go {
-        let stand = glimpse.stand;
+impl Observer for Show<'_> {
+    fn observe(&self, snapshot: Snapshot<'_>) -> Control {
+        let phase = snapshot.phase;
         let mut shown = self.now();
         // The window's camera has refused an environment without a simulator.
-        let _ = shown.take(glimpse);
+        let _ = shown.take(snapshot);
         (self.tell)();
-        let hold = match stand {
-            Stand::Ended { .. } => Some(END),
-            Stand::Acting { .. } => shown.plans.is_empty().then_some(START),
+        let hold = match phase {
+            Phase::Ended { .. } => Some(END),
+            Phase::Acting { .. } => shown.plans.is_empty().then_some(START),
         };
-        let go = self.wait(shown, hold);
-        if let (Go::On, Stand::Acting { plan }) = (go, stand) {
+        let control = self.wait(shown, hold);
+        if let (Control::Continue, Phase::Acting { plan }) = (control, phase) {
             self.now().plans.push(plan);
         }
-        go
+        control
     }
 }

@@ -160,15 +160,17 @@ impl<'s> Screen<'s> {
     fn key(&mut self, key: &Key, events: &ActiveEventLoop) {
         match key.as_ref() {
             Key::Named(NamedKey::Space) | Key::Character(" ") => {
-                self.show.ask(|wish| wish.paused = !wish.paused);
+                self.show.ask(|request| request.paused = !request.paused);
             }
-            Key::Character("." | ">") | Key::Named(NamedKey::ArrowRight) => self.show.ask(|wish| {
-                wish.single += u32::from(wish.paused);
-                wish.paused = true;
-            }),
-            Key::Character("+" | "=") => self.show.ask(|wish| wish.pace.change(1)),
-            Key::Character("-") => self.show.ask(|wish| wish.pace.change(-1)),
-            Key::Character("r" | "R") => self.show.ask(|wish| wish.again = true),
+            Key::Character("." | ">") | Key::Named(NamedKey::ArrowRight) => {
+                self.show.ask(|request| {
+                    request.single += u32::from(request.paused);
+                    request.paused = true;
+                })
+            }
+            Key::Character("+" | "=") => self.show.ask(|request| request.pace.change(1)),
+            Key::Character("-") => self.show.ask(|request| request.pace.change(-1)),
+            Key::Character("r" | "R") => self.show.ask(|request| request.restart = true),
             Key::Character("q" | "Q") | Key::Named(NamedKey::Escape) => events.exit(),
             _ => {}
         }
@@ -192,20 +194,20 @@ fn draw(
     canvas: &mut Canvas,
 ) -> Result<String, ViewerError> {
     let mut shown = show.now();
-    let Some(stand) = shown.stand else {
+    let Some(phase) = shown.phase else {
         return Ok("lads".to_owned());
     };
     camera.see(&mut shown.data)?;
     let instructions = &mut texts.instructions.iter();
     let known = instructions.find(|(index, _)| *index == shown.instruction);
     let text = known.map_or("", |(_, text)| text);
-    let (wish, plans) = (shown.wish, shown.plans.clone());
+    let (request, plans) = (shown.request, shown.plans.clone());
     let (completions, commanded) = (shown.completions.clone(), shown.commanded.clone());
     let (episode, steps) = (shown.episode + 1, shown.max_steps);
     // Episodes go on while the picture is drawn.
     drop(shown);
-    let speed = wish.pace.speed();
-    let pace = if wish.paused {
+    let speed = request.pace.speed();
+    let pace = if request.paused {
         "paused".to_owned()
     } else {
         format!("{speed} x real time")
@@ -225,7 +227,7 @@ fn draw(
     let progress = Progress {
         plans: &plans,
         completions: &completions,
-        stand,
+        phase,
     };
     let bottom = canvas.size()[1].saturating_sub(caption::LINE_HEIGHT);
     caption.draw(progress, bottom, canvas);
@@ -237,7 +239,7 @@ impl ApplicationHandler<()> for Screen<'_> {
     fn resumed(&mut self, events: &ActiveEventLoop) {
         if self.opened.is_none() {
             match self.open(events) {
-                Ok(()) => self.show.ask(|wish| wish.window = show::Window::Open),
+                Ok(()) => self.show.ask(|request| request.window = show::Window::Open),
                 Err(error) => {
                     self.failed = Some(error);
                     events.exit();

@@ -203,7 +203,7 @@ impl Model {
 
 /// What a verification says.
 #[derive(Debug, Clone)]
-pub enum Said {
+pub enum Outcome {
     /// The bundle is not even opened or compiled.
     Refused(String),
     Judged(Box<Judged>),
@@ -242,10 +242,10 @@ impl Judged {
 
 /// Compares a bundle with its reference: the contract, and the policy's answers to the first traced episode of the instructions whose index
 /// is a multiple of `every`.
-pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usize) -> Said {
+pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usize) -> Outcome {
     let opened = match lads_host::from_bytes_with(bytes, options) {
         Ok(opened) => opened,
-        Err(refused) => return Said::Refused(refused.to_string()),
+        Err(refused) => return Outcome::Refused(refused.to_string()),
     };
     let (bundle, policy) = (opened.bundle().unwrap(), opened.policy());
     let known = (0..reference.instructions.len() as u32).step_by(every);
@@ -269,7 +269,7 @@ pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usi
     .unwrap();
     let tolerance = policy.golden().map(|golden| f64::from(golden.tolerance()));
     let stated = serde_json::from_str(bundle.metadata(CONTRACT).unwrap()).unwrap();
-    Said::Judged(Box::new(Judged {
+    Outcome::Judged(Box::new(Judged {
         contract: Compared::new(
             &stated,
             reference.contract.as_ref(),

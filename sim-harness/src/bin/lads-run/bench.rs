@@ -98,7 +98,7 @@ pub fn with<R>(
             stop_where_refused: false,
             traced: wanted.traced,
             words: Some(&heard.words),
-            onlooker: None,
+            observer: None,
         },
     };
     job(&Bench {

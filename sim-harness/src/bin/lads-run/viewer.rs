@@ -73,9 +73,9 @@ mod with {
             stop: &AtomicBool,
         ) -> Result<Evaluated, End> {
             let bar = progress(evaluation.len());
-            let shown = self.window.run(&self.texts, stop, |onlooker| {
+            let shown = self.window.run(&self.texts, stop, |observer| {
                 let setup = Setup {
-                    onlooker: Some(onlooker),
+                    observer: Some(observer),
                     ..evaluation.setup
                 };
                 let seen = Evaluation {
