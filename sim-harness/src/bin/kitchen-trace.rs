@@ -1,4 +1,4 @@
-//! Steps the kitchen from a pipe at full precision: what the parity test compares with the official environment.
+//! Steps the kitchen from a pipe at full precision, for the parity test against the official environment.
 //!
 //! Each input line is either `reset NOISE SEED INSTRUCTION EPISODE` (NOISE: none, v0 or v1) or an action as a JSON array of nine numbers.
 //! Each answer is one line of JSON: `{"observation": [...], "state": [...], "completions": [["kettle", 40], ...]}`.
@@ -105,7 +105,8 @@ fn parse_reset(text: &str) -> Result<(Noise, EpisodeSeed), String> {
     Ok((noise.parse()?, seed))
 }
 
-/// Reads the numbers with the standard library, which rounds correctly; the JSON reader may be off by one unit in the last place.
+/// Parses an action with the standard library's number parser, which rounds correctly; the JSON reader may be off by one unit in the last
+/// place.
 fn parse_action(line: &str) -> Result<Vec<f64>, String> {
     let inner = line
         .trim()

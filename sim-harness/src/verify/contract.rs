@@ -1,11 +1,11 @@
-//! What the program image that runs says of itself, in the words of a bundle's contract.
+//! Describes a program image with the fields of a bundle's contract.
 //!
 //! Nothing here can fail.
 
 use lads_core::{Channel, Contract, Decision, Policy};
 use serde_json::{Map, Value, json};
 
-/// The fields of the contract that an image holds and that decide what it does.
+/// Lists the fields of the contract that an image holds and that decide what it does.
 pub fn of_image(policy: &Policy<'_>) -> Value {
     let contract = policy.contract();
     let mut family = json!({"kind": contract.family()});
@@ -70,7 +70,7 @@ fn channel(channel: &Channel<'_>) -> Value {
     fields
 }
 
-/// The rule that decides plans, in a word or two.
+/// Describes the rule that decides plans, in a word or two.
 pub fn rule(contract: &Contract<'_>) -> String {
     match contract.decision() {
         Decision::Argmax => "argmax".to_owned(),

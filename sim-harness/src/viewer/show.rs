@@ -1,4 +1,4 @@
-//! What the window shows and what it asks for, between its thread and the one that runs episodes.
+//! State shared between the window's thread and the one that runs episodes: what to show, and what the person asked for.
 //!
 //! [`Show`] is the [`Observer`] of the episodes: it copies each state and lets the control step begin when it is due. It only reads, so
 //! an episode is the same with and without it. What can fail: nothing.
@@ -14,13 +14,13 @@ use super::pace::Pace;
 use crate::environment::Completion;
 use crate::rollout::{Control, Observer, Phase, Snapshot};
 
-/// How long the start of an episode stays in view, and its end.
+/// Time that the start of an episode stays in view, and below, that of its end.
 const START: Duration = Duration::from_millis(500);
 const END: Duration = Duration::from_secs(2);
-/// How often an interrupt is looked for.
+/// Interval at which an interrupt is looked for.
 const GLANCE: Duration = Duration::from_millis(50);
 
-/// An episode as it is shown.
+/// State of the episode that the window shows.
 pub struct Shown {
     /// The simulator's state.
     pub data: MjData<Arc<MjModel>>,
@@ -28,53 +28,53 @@ pub struct Shown {
     pub instruction: u32,
     /// Number of the episode.
     pub episode: u64,
-    /// The sub-tasks that the instruction commands.
+    /// Indices of the sub-tasks that the instruction commands.
     pub commanded: Vec<usize>,
-    /// Control steps of a full episode.
+    /// Number of control steps of a full episode.
     pub max_steps: usize,
     /// Plan of every control step that was executed.
     pub plans: Vec<Option<u32>>,
     /// Completions so far.
     pub completions: Vec<Completion>,
-    /// What comes next; `None` before the first control step of all.
+    /// Phase of the episode; `None` before the first control step of all.
     pub phase: Option<Phase>,
-    /// What the person asked for.
+    /// Requests of the person at the window.
     pub request: Request,
 }
 
-/// What a person asked for.
+/// Requests of the person at the window.
 #[derive(Debug, Clone, Copy)]
 pub struct Request {
-    /// No control step begins.
+    /// Whether control steps wait.
     pub paused: bool,
-    /// Control steps that begin nevertheless.
+    /// Number of control steps to execute nevertheless.
     pub single: u32,
-    /// The episode is to start again.
+    /// Whether the episode is to start again.
     pub restart: bool,
-    /// Deadlines of control steps.
+    /// Pace of the control steps.
     pub pace: Pace,
-    /// Whether there is a window that shows it.
+    /// State of the window.
     pub window: Window,
 }
 
-/// A window's life.
+/// State of the viewer's window.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Window {
-    /// Not open yet: episodes wait.
+    /// The window is not open yet: episodes wait.
     Awaited,
-    /// Open.
+    /// The window is open.
     Open,
-    /// Closed: episodes stop.
+    /// The window is closed: episodes stop.
     Closed,
 }
 
-/// What both threads know.
+/// Connection between the window's thread and the episodes' thread.
 pub struct Show<'s> {
     shown: Mutex<Shown>,
     changed: Condvar,
     /// Raised by an interrupt.
     stop: &'s AtomicBool,
-    /// Tells the window that there is something new.
+    /// Tells the window that there is something new to draw.
     tell: Box<dyn Fn() + Send + Sync + 's>,
 }
 
@@ -85,7 +85,8 @@ impl fmt::Debug for Show<'_> {
 }
 
 impl<'s> Show<'s> {
-    /// Nothing to see yet. `model` is the scene's, `period_s` the control period; `tell` is called whenever there is something new.
+    /// Makes a connection with nothing to show yet. `model` is the scene's, `period_s` the control period; `tell` is called whenever there
+    /// is something new.
     pub fn new(
         model: Arc<MjModel>,
         period_s: f64,
@@ -118,18 +119,18 @@ impl<'s> Show<'s> {
         }
     }
 
-    /// What is shown now, while the other thread waits.
+    /// Locks and returns the shown state; the other thread waits meanwhile.
     pub fn now(&self) -> MutexGuard<'_, Shown> {
         self.shown.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Changes what is asked for.
+    /// Changes the person's requests and wakes the episodes' thread.
     pub fn ask(&self, change: impl FnOnce(&mut Request)) {
         change(&mut self.now().request);
         self.changed.notify_all();
     }
 
-    /// Waits until the control step is due, or `hold` is over where there is one, or what is shown is to end otherwise.
+    /// Waits until the control step is due, or `hold` is over where given, or the episode is to stop or restart.
     fn wait(&self, mut shown: MutexGuard<'_, Shown>, hold: Option<Duration>) -> Control {
         let come = Instant::now();
         loop {
@@ -161,7 +162,7 @@ impl<'s> Show<'s> {
 }
 
 impl Shown {
-    /// Takes over what there is to see; `None` if the environment has no simulator.
+    /// Copies the snapshot into the shown state; `None` if the environment has no simulator.
     fn take(&mut self, snapshot: Snapshot<'_>) -> Option<()> {
         let Snapshot {
             task,

@@ -1,4 +1,4 @@
-//! The window: pictures into it, mouse and keys out of it. What can fail: the display, and drawing.
+//! The viewer's window: pictures into it, mouse and keys out of it. What can fail: the display, and drawing.
 
 use std::num::NonZeroU32;
 use std::rc::Rc;
@@ -20,13 +20,13 @@ use crate::film::camera::{Camera, Motion};
 use crate::film::canvas::Canvas;
 use crate::film::caption::{self, Caption, Progress};
 
-/// Width and height of the window's inside, at first and at least.
+/// Initial and smallest width and height of the window's inside.
 pub const SIZE: [u32; 2] = [
     800,
     caption::HEAD + 540 + caption::FOOT + caption::LINE_HEIGHT,
 ];
 const LEAST: [u32; 2] = [480, 400];
-/// How long a window keeps its size before the camera follows, which takes it a moment.
+/// Time that a window must keep its size before the camera follows, which is slow.
 const SETTLED: Duration = Duration::from_millis(200);
 /// Share of the picture's height that a notch of the wheel zooms by, and that a pixel of a touch pad does.
 const NOTCH: f64 = 0.05;
@@ -36,13 +36,13 @@ const HELP: &str = "drag: turn, right: shift, wheel: zoom | space: pause | .: st
 
 type Pixels = Surface<OwnedDisplayHandle, Rc<Window>>;
 
-/// Size of the picture in a canvas of a size.
+/// Size of the picture in a canvas of this size.
 pub fn picture([width, height]: [u32; 2]) -> [u32; 2] {
     let around = caption::HEAD + caption::FOOT + caption::LINE_HEIGHT;
     [width.max(1), height.saturating_sub(around).max(1)]
 }
 
-/// What the window does when it is told something.
+/// Handler of the window's events.
 pub struct Screen<'s> {
     show: &'s Show<'s>,
     texts: &'s Texts,
@@ -50,7 +50,7 @@ pub struct Screen<'s> {
     canvas: Canvas,
     opened: Option<(Rc<Window>, Pixels)>,
     mouse: Mouse,
-    /// The window's inside, as it was told; a window that is just being destroyed cannot be asked.
+    /// Size of the window's inside, as last reported; a window that is just being destroyed cannot be asked.
     size: PhysicalSize<u32>,
     resized: Option<Instant>,
     title: String,
@@ -58,7 +58,7 @@ pub struct Screen<'s> {
     failed: Option<ViewerError>,
 }
 
-/// Where the mouse is, and what is pressed.
+/// Position of the mouse, and its pressed button.
 #[derive(Default)]
 struct Mouse {
     at: PhysicalPosition<f64>,
@@ -79,7 +79,7 @@ impl Mouse {
 }
 
 impl<'s> Screen<'s> {
-    /// A window to be, that shows what `camera` sees.
+    /// Prepares a window that shows what `camera` sees.
     pub fn new(show: &'s Show<'s>, camera: Camera, texts: &'s Texts) -> Self {
         Self {
             show,
@@ -96,12 +96,12 @@ impl<'s> Screen<'s> {
         }
     }
 
-    /// To be raised, and the window to be told, when there is nothing more to come.
+    /// Flag to raise, before waking the window, when the work has ended.
     pub fn done(&self) -> Arc<AtomicBool> {
         Arc::clone(&self.done)
     }
 
-    /// Why the window closed by itself, if it did.
+    /// Returns why the window closed by itself, if it did.
     pub fn failed(self) -> Option<ViewerError> {
         self.failed
     }
@@ -121,7 +121,7 @@ impl<'s> Screen<'s> {
         Ok(())
     }
 
-    /// Draws what is shown now into the window.
+    /// Draws the shown state into the window.
     fn draw(&mut self) -> Result<(), ViewerError> {
         let Some((window, pixels)) = &mut self.opened else {
             return Ok(());

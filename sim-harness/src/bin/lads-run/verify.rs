@@ -1,4 +1,4 @@
-//! `verify`: the reference, the certificate, and the verdict as exit code.
+//! The `verify` subcommand: runs the reference's episodes, writes the certificate, and gives the verdict as exit code.
 
 use std::ffi::OsStr;
 use std::fmt;
@@ -88,7 +88,7 @@ pub fn run(asked: &Verify, stop: &AtomicBool) -> Result<ExitCode, End> {
     })
 }
 
-/// The certificate on a terminal.
+/// Prints the certificate on a terminal.
 struct Summary<'c>(&'c Certificate);
 
 impl fmt::Display for Summary<'_> {
