@@ -1,4 +1,4 @@
-//! `make mutate`: every change of a bundle, what it moves, and what a verification says of it, as a table.
+//! Prints the table of `make mutate`: every change of a bundle, what it moves, and the verdict on it.
 //!
 //! Exit code 1 if fewer than 98 % of the changes that move a logit by more than 1e-2, an action by more than 1e-4 or an encoding are DIFFERENT, or if one
 //! that is harmless is.
@@ -13,12 +13,12 @@ use lads_compiler::{CacheFormat, Options, Storage, WeightFormat};
 use lads_proof::reference::Reference;
 use mutate::{Model, Normals, Outcome};
 
-/// A change that moves so much is to be found.
+/// Difference of a logit from which on a change must be found.
 const LOGIT: f64 = 1e-2;
 const ACTION: f64 = 1e-4;
 const FOUND: f64 = 0.98;
 
-/// A kind of change, and what came of all of them.
+/// Counts of one kind of change.
 #[derive(Default)]
 struct Kind {
     name: String,

@@ -1,4 +1,4 @@
-//! The certificate against changed policies, a few of each kind; `make mutate` has all of them.
+//! Tests the certificate against changed policies, a few of each kind; `make mutate` has all of them.
 
 #[path = "common/mutate.rs"]
 mod mutate;
@@ -9,7 +9,7 @@ use lads_compiler::Options;
 use lads_proof::reference::Reference;
 use mutate::{Judged, Model, Outcome};
 
-/// The first traced episode of each seventh instruction.
+/// Distance of the instructions whose first traced episode is asked about: each seventh.
 const EVERY: usize = 7;
 
 fn project_file(path: &str) -> PathBuf {
@@ -51,7 +51,7 @@ fn what_is_harmless_is_not_different() {
     );
 }
 
-/// The head times ten chooses the same plans; so does the encoder, which chooses none.
+/// Tests changes that keep every plan: the head times ten chooses the same plans; so does the encoder, which chooses none.
 #[test]
 fn what_chooses_the_same_plans_is_different_all_the_same() {
     let (model, reference) = shipped();
@@ -133,7 +133,7 @@ fn every_field_of_the_contract_is_compared_or_refused() {
     );
 }
 
-/// The attack that made EQUIVALENT of a policy that fails: it samples at temperature 5.
+/// Tests the attack that made EQUIVALENT of a policy that fails: it samples at temperature 5.
 #[test]
 fn another_rule_is_different_and_runs() {
     let (model, reference) = shipped();

@@ -1,4 +1,4 @@
-//! Recorded episodes in an environment without a simulator: what is written is read, replayed, encoded and followed.
+//! Tests recorded episodes in an environment without a simulator: what is written is read, replayed, encoded and followed.
 
 #[path = "common/bench.rs"]
 mod bench;
@@ -148,7 +148,7 @@ fn a_log_reads_back_and_replays_bit_for_bit() {
     }
 }
 
-/// Of a policy that selects nothing and draws at random.
+/// Tests the log of a policy that selects nothing and draws at random.
 #[test]
 fn a_log_without_plans_reads_back() {
     let policy = tiny_policy();

@@ -1,4 +1,5 @@
-//! Rollouts with a compiled policy in an environment without a simulator: what they report, and that threads do not show.
+//! Tests rollouts with a compiled policy in an environment without a simulator: what they report, and that the number of threads does not
+//! show.
 
 #[path = "common/bench.rs"]
 mod bench;
@@ -12,7 +13,7 @@ use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Set
 use lads_sim::fit;
 use lads_sim::rollout::{Actor, Control, Episode, Observer, Phase, Snapshot};
 
-/// The seed is replaced by one per episode.
+/// Decision rule of the tests; the seed is replaced by one per episode.
 const SAMPLE: Decision = Decision::Sample {
     temperature: 1.0,
     seed: 0,
@@ -75,7 +76,7 @@ fn the_number_of_threads_does_not_show() {
     }
 }
 
-/// Has the first episode again after five control steps, and once more at its end; stops the third in the middle.
+/// Restarts the first episode after five control steps, and once more at its end; stops the third in the middle.
 #[derive(Debug, Default)]
 struct RestartingObserver {
     looks: AtomicUsize,
@@ -303,7 +304,7 @@ fn a_contract_that_does_not_fit_is_refused_by_name() {
     }
 }
 
-/// A thread that panics ends the others after their current episode, not after the whole queue.
+/// Tests that a thread that panics ends the others after their current episode, not after the whole queue.
 #[test]
 fn a_panic_stops_all_threads() {
     let policy = tiny_policy();

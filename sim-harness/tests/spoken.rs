@@ -1,4 +1,4 @@
-//! Episodes of instructions whose words are not the table's, in the small bench.
+//! Tests episodes of instructions whose word embeddings are not the table's, in the small environment.
 
 #[path = "common/bench.rs"]
 mod bench;

@@ -15,12 +15,12 @@ static TINY: LazyLock<Opened> = LazyLock::new(|| {
     lads_host::open(&path).unwrap()
 });
 
-/// The small bundle, compiled.
+/// Compiles the small bundle.
 pub fn tiny_policy() -> Policy<'static> {
     TINY.policy()
 }
 
-/// The small bundle's contract.
+/// Returns the contract of the small bundle.
 pub fn tiny_contract() -> &'static Contract {
     TINY.bundle().unwrap().contract()
 }

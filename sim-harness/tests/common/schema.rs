@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 
-/// Panics with the path of the first value that does not fit.
+/// Checks a value; panics with the path of the first value that does not fit.
 pub fn check(value: &Value, schema: &Value, root: &Value, path: &str) {
     for (keyword, rule) in schema.as_object().unwrap() {
         let fits = match keyword.as_str() {
