@@ -1,4 +1,4 @@
-//! What a plain export costs: a model that takes the whole history at once, on the inputs that it was exported with.
+//! Measures a plain export: a model that takes the whole history at once, on the inputs that it was exported with.
 
 use std::path::Path;
 
@@ -53,7 +53,7 @@ impl Recompute {
     }
 }
 
-/// Rows of numbers.
+/// Makes a tensor from rows of numbers.
 fn matrix(rows: &Value) -> Option<Tensor> {
     let rows: Vec<Vec<f32>> = serde_json::from_value(rows.clone()).ok()?;
     let shape = vec![rows.len(), rows.first()?.len()];
