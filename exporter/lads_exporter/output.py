@@ -1,4 +1,4 @@
-"""Files that the exporter's commands write: whole or not at all, and never over what is read.
+"""Writes the files of the exporter's commands: whole or not at all, and never over what is read.
 
 A symbolic link is followed, so that what it leads to is replaced in its own folder; a device or a FIFO is written into.
 """

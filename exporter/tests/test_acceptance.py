@@ -1,4 +1,4 @@
-"""Which free sentences are followed: the measure, the threshold, the shipped calibrations, and how they get into a contract."""
+"""Tests which free sentences are followed: the measure, the threshold, the shipped calibrations, and how they get into a contract."""
 
 import json
 import subprocess
@@ -77,7 +77,7 @@ def test_a_bundle_takes_its_own_calibration_only(name):
 
 
 def calibrate(tmp_path, sentences):
-    """The command on the small encoder of tests; -> exit code, stdout, stderr, the file."""
+    """Runs the command on the small encoder of tests -> exit code, stdout, stderr, the file."""
     (tmp_path / "table.json").write_text(json.dumps(sentences))
     command = [sys.executable, "-m", "lads_exporter", "calibrate", "--config", "configs/tiny.toml"]
     command += ["--sentences", tmp_path / "table.json", "-o", tmp_path / "out.json"]
