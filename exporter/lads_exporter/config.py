@@ -285,7 +285,7 @@ def from_tables(table, environment, instructions, where):
     steps, period = config.high_level.context_steps, config.period
     if period < 1 or steps < 1 or steps % period:
         raise UserError(
-            f"{where}: high_level.context_steps = {steps} is no multiple of the plan period of {period}"
+            f"{where}: high_level.context_steps = {steps} is not a multiple of the plan period of {period}"
             f" (encoder.horizon = {config.encoder.horizon}): where the context starts anew,"
             " a plan would begin off the grid that the policy was trained on"
         )
@@ -302,7 +302,7 @@ def from_tables(table, environment, instructions, where):
     known = {row["id"] for row in rows}
     for name in config.data.weights:
         if name not in known:
-            raise UserError(f"data.weights names {name!r}, which is no instruction id of {config.instructions}")
+            raise UserError(f"data.weights names {name!r}, which is not an instruction id of {config.instructions}")
     return Setting(config, environment, rows, [table, environment, instructions])
 
 

@@ -78,7 +78,7 @@ def of(model, path="the model"):
     """Returns the checked contract of an ONNX model; `path` is its name in errors."""
     text = properties(model).get(KEY)
     if text is None:
-        raise UserError(f"{path}: no contract in its metadata; it is no bundle of this exporter")
+        raise UserError(f"{path}: no contract in its metadata; it is not a bundle of this exporter")
     try:
         found = json.loads(text)
         version = found["version"]
@@ -158,7 +158,7 @@ def _distinct(rows, key, field, where):
 
 def _range(row, field, where):
     low, high = row.get("min"), row.get("max")
-    _need(_number(low) and _number(high) and low < high, where, f"`{field}` has limits {low} to {high}, which is no range")
+    _need(_number(low) and _number(high) and low < high, where, f"`{field}` has limits {low} to {high}, which is not a range")
 
 
 def _channel(row, where):
@@ -209,7 +209,7 @@ def _family(found, where):
         if key in FAMILIES[kind]:
             given = family[key].get("rule")
             _need(given in rules[key], where, f"`family.{key}.rule` is {given!r}; known: {', '.join(rules[key])}")
-            _need(type(family[key].get("seed")) is int, where, f"`family.{key}.seed` is no whole number")
+            _need(type(family[key].get("seed")) is int, where, f"`family.{key}.seed` is not a whole number")
 
 
 def _states(found, where):
@@ -221,7 +221,7 @@ def _states(found, where):
         if row.get("kind") == "ring":
             _positive(row, ["rows"], where)
             sources = [one["name"] for one in of_role(found, "observation")]
-            _need(row.get("source") in (None, *sources), where, f"`{field}.source` {row.get('source')!r} is no observation channel")
+            _need(row.get("source") in (None, *sources), where, f"`{field}.source` {row.get('source')!r} is not an observation channel")
             _need(row.get("fill") in ("first", "zero"), where, f"`{field}.fill` is {row.get('fill')!r}; known: first, zero")
         else:
             _need(row.get("kind") == "plain", where, f"`{field}.kind` is {row.get('kind')!r}; known: plain, ring")

@@ -22,7 +22,7 @@ class Noise:
     """Replaces the official environment's generator: hands out our stream's 30 numbers per observation.
 
     The official environment draws four times per observation: robot positions, robot velocities, object positions, object velocities.
-    Ours draws the 30 positions at once; velocities are no part of our observation and get no noise. `object_scale` turns the amplitudes
+    Ours draws the 30 positions at once; velocities are not part of our observation and get no noise. `object_scale` turns the amplitudes
     that FrankaKitchen-v1 gives the objects into ours.
     """
 

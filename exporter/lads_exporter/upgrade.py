@@ -3,7 +3,7 @@
 What version 1 does not say, an action's meaning and the interface of an element, is taken from the environment file of the same
 id and version; where there is none, the contract says that it is not stated. Files beside the bundle that name its sha256 (the
 reference rollouts, results, the model card) are rewritten with the new one when the bundle is upgraded in place. What can fail:
-a file that is no bundle of version 1 is refused and nothing is written.
+a file that is not a bundle of version 1 is refused and nothing is written.
 """
 
 import base64

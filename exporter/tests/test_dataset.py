@@ -50,7 +50,7 @@ def test_wrong_files_are_refused(setting, tmp_path):
     with pytest.raises(UserError, match="make collect"):
         dataset.load(tmp_path / "absent.safetensors", setting)
     for name, message in (("text.safetensors", "not a lads-dataset file"), ("text.hdf5", "not a D4RL HDF5 file")):
-        (tmp_path / name).write_bytes(b"this is no dataset, whatever its name says")
+        (tmp_path / name).write_bytes(b"this is not a dataset, whatever its name says")
         with pytest.raises(UserError, match=message):
             dataset.load(tmp_path / name, setting)
     whole = synthetic.write(tmp_path / "whole.safetensors", setting).read_bytes()

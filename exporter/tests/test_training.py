@@ -283,7 +283,7 @@ def test_unknown_and_missing_keys_are_named():
 def test_a_context_off_the_grid_of_plans_is_refused(steps):
     tables = copy.deepcopy(config.load("configs/tiny.toml").tables)
     tables[0]["high_level"]["context_steps"] = steps
-    with pytest.raises(UserError, match=f"context_steps = {steps} is no multiple of the plan period of 4"):
+    with pytest.raises(UserError, match=f"context_steps = {steps} is not a multiple of the plan period of 4"):
         config.from_tables(*tables, "test")
 
 

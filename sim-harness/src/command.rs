@@ -20,7 +20,7 @@ pub fn arguments<A: Parser>(name: &str) -> Result<A, ExitCode> {
 pub fn arguments_moved<A: Parser>(name: &str, moved: &[(&str, &str)]) -> Result<A, ExitCode> {
     A::try_parse().map_err(|error| {
         if !error.use_stderr() {
-            // Help or version; a closed pipe is no failure.
+            // Help or version; a closed pipe is not a failure.
             let _ = error.print();
             return ExitCode::SUCCESS;
         }
@@ -46,7 +46,7 @@ pub fn refuse(wrong: impl Display) -> ExitCode {
     ExitCode::from(REFUSED)
 }
 
-/// A progress bar over `count` things, as wide as the terminal leaves room; indicatif hides it where stderr is no terminal.
+/// A progress bar over `count` things, as wide as the terminal leaves room; indicatif hides it where stderr is not a terminal.
 pub fn progress(count: usize, things: &str) -> ProgressBar {
     let bar = ProgressBar::new(count as u64).with_style(style(things));
     bar.enable_steady_tick(Duration::from_millis(200));

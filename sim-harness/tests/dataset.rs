@@ -100,8 +100,8 @@ fn replace(mut file: Vec<u8>, from: &str, to: &str) -> Vec<u8> {
 
 #[test]
 fn damaged_files_are_refused_by_name() {
-    assert!(refusal(|_| b"no dataset".to_vec()).contains("no safetensors file"));
-    assert!(refusal(|file| file[..file.len() - 5].to_vec()).contains("no safetensors file"));
+    assert!(refusal(|_| b"no dataset".to_vec()).contains("not a safetensors file"));
+    assert!(refusal(|file| file[..file.len() - 5].to_vec()).contains("not a safetensors file"));
     assert!(
         refusal(|file| replace(file, "\"version\":\"1\"", "\"version\":\"2\""))
             .contains("version is not \"1\"")

@@ -223,7 +223,7 @@ fn the_source_of_the_reference_is_printed() {
     );
 }
 
-/// Tests a reference of the first version, which records neither contract nor logits: its silence is no agreement.
+/// Tests a reference of the first version, which records neither contract nor logits: its silence is not agreement.
 #[test]
 fn a_reference_without_a_contract_decides_nothing() {
     let folder = tempfile::tempdir().unwrap();

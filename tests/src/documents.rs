@@ -1,7 +1,7 @@
 //! Reads the project's documents as Markdown: blocks of code, inline code, and the commands among them.
 //!
 //! The first word of a block's info string is its language; of a block of commands (`sh`) the second one says when a test runs it, see
-//! [`When`]. A block of commands without it is no block of commands to [`Block::when`], and a test refuses that.
+//! [`When`]. A block of commands without it is not a block of commands to [`Block::when`], and a test refuses that.
 
 use std::fs;
 use std::path::{Path, PathBuf};

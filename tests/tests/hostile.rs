@@ -27,7 +27,7 @@ fn generated(state: &mut u64) -> Vec<u8> {
         let shift = next(state) % 8;
         script.push((next(state) as u8) >> shift);
     }
-    // The length chooses the image; less than an edit at the end is no edit.
+    // The length chooses the image; less than an edit at the end is not an edit.
     script.extend((0..next(state) % 8).map(|_| 0));
     script
 }

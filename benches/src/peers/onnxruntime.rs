@@ -115,7 +115,7 @@ impl Bound {
             let dtype = outlet.dtype();
             let shape = dtype
                 .tensor_shape()
-                .ok_or_else(|| ort::Error::new("an output is no tensor"))?;
+                .ok_or_else(|| ort::Error::new("an output is not a tensor"))?;
             // `present.N.key` is [1, heads, P + new, head_dim], with the past as its symbolic axis.
             let new = if outlet.name().contains("/start/") {
                 1

@@ -28,7 +28,7 @@ impl Recompute {
         let mut session = engine.load(&bytes)?;
         let tensors = inputs.iter().map(|input| matrix(&values[input]));
         let tensors: Option<Vec<_>> = tensors.collect();
-        let tensors = tensors.ok_or_else(|| failed(&name, "its inputs are no matrices"))?;
+        let tensors = tensors.ok_or_else(|| failed(&name, "its inputs are not matrices"))?;
         let named: Vec<_> = inputs.into_iter().zip(&tensors).collect();
         session.bind(&named)?;
         session.call()?;

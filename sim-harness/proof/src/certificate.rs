@@ -4,7 +4,7 @@
 //! The rules, in this order:
 //!
 //! 1. **DIFFERENT** if the contract says otherwise than the reference's did, or the image otherwise than the bundle; if the policy answers the
-//!    reference's questions otherwise (a logit or an action beyond its tolerance, another plan although the reference's margin is no close call,
+//!    reference's questions otherwise (a logit or an action beyond its tolerance, another plan although the reference's margin is not a close call,
 //!    decisions at other steps, another encoding of a trajectory); if the reference's actions lead through other states; or if a test finds a paired
 //!    difference larger than its margin (1 % over all of them together).
 //! 2. **EQUIVALENT** if none of this holds, contract, actions, states and, where the reference decides, logits were compared at all, and every paired difference is
@@ -313,7 +313,7 @@ fn notes(
     notes
 }
 
-/// Lists the comparisons that had nothing to compare: silence is no agreement.
+/// Lists the comparisons that had nothing to compare: silence is not agreement.
 fn uncompared(contract: &Compared, policy: &Answers, environment: &Physics) -> Vec<String> {
     let counts = [
         ("action", policy.compared_steps, true),

@@ -213,7 +213,7 @@ fn numbers<T, const N: usize>(text: &str, read: fn([u8; N]) -> T) -> Result<Vec<
     match bytes.as_chunks::<N>() {
         (whole, []) => Ok(whole.iter().map(|&chunk| read(chunk)).collect()),
         _ => Err(format!(
-            "a trace of {} bytes is no whole number of {N}-byte numbers",
+            "a trace of {} bytes is not a whole number of {N}-byte numbers",
             bytes.len()
         )),
     }

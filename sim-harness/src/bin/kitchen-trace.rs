@@ -74,7 +74,7 @@ fn demonstrate(scene: &Scene, sub_tasks: &str) -> Result<Vec<Vec<f32>>, String> 
     let mut performer = Performer::with_style(&mut kitchen, seed, stream, Style::PLAIN, MAX_STEPS);
     for name in sub_tasks.split(',') {
         let index = SUB_TASK_NAMES.iter().position(|known| *known == name);
-        let index = index.ok_or_else(|| format!("\"{name}\" is no sub-task of the kitchen"))?;
+        let index = index.ok_or_else(|| format!("\"{name}\" is not a sub-task of the kitchen"))?;
         performer
             .perform(index)
             .map_err(|_| format!("the time ran out during \"{name}\""))?;

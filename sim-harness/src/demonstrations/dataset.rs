@@ -204,7 +204,7 @@ impl Dataset {
 
     fn from_bytes(bytes: &[u8]) -> Result<Self, String> {
         let (_, header) = SafeTensors::read_metadata(bytes)
-            .map_err(|error| format!("no safetensors file ({error})"))?;
+            .map_err(|error| format!("not a safetensors file ({error})"))?;
         let metadata = header.metadata().clone().unwrap_or_default();
         for (key, expected) in [("format", FORMAT), ("version", FORMAT_VERSION)] {
             if metadata.get(key).map(String::as_str) != Some(expected) {

@@ -3,7 +3,7 @@
 //! The encoder maps a segment of observations and actions to the plan that it shows (the paper's equation 2 and the nearest plan). Steps of a
 //! recording beyond its last full segment have the plan of the segment that ends with the last step, so that whoever follows the plans
 //! acts until the recording's end. What can fail: a policy without an encoder or that follows no plans, a recording of other lengths, a
-//! file that is none or asks for what the policy does not have.
+//! file that is not one or asks for what the policy does not have.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -59,7 +59,7 @@ pub enum PlanError {
     #[error("{0}")]
     Read(std::io::Error),
     /// The file is not a file of plans.
-    #[error("it is no {FORMAT} file of version {FORMAT_VERSION} ({0})")]
+    #[error("it is not a {FORMAT} file of version {FORMAT_VERSION} ({0})")]
     Form(String),
     /// The plans' period is not the policy's.
     #[error("its plans are for {file} control steps each, the policy's for {policy}")]

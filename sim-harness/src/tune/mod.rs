@@ -2,7 +2,7 @@
 //!
 //! The policy answers the recorded questions of a reference (open loop, as in [`verify::policy`](crate::verify::policy)) once with 32 bits
 //! and once with each candidate's; [`mod@judge`] compares the two, [`mod@search`] tries candidates from the smallest up. The golden episode alone
-//! is no evidence: a policy may replay it with the same bits and decide otherwise elsewhere. What can fail: a bundle that does not compile
+//! is not evidence: a policy may replay it with the same bits and decide otherwise elsewhere. What can fail: a bundle that does not compile
 //! even with 32 bits, memory; it can be told to stop.
 
 mod groups;

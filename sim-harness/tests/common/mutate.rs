@@ -57,7 +57,7 @@ fn varint(bytes: &[u8], at: &mut usize) -> u64 {
     value
 }
 
-/// Splits a message into its fields: number, the whole field, its content. Fields that are no bytes have their value as content.
+/// Splits a message into its fields: number, the whole field, its content. Fields that are not bytes have their value as content.
 fn fields(bytes: &[u8], message: Range<usize>) -> Vec<(u64, Range<usize>, Range<usize>)> {
     let mut found = Vec::new();
     let mut at = message.start;

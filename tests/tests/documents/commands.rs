@@ -42,7 +42,7 @@ fn blocks() -> Vec<Block> {
 fn run(folder: &Path, script: &str) -> Result<String, String> {
     let mut bash = Command::new("bash");
     bash.args(["-euo", "pipefail", "-c", script]);
-    // Those of the test's own build are no user's.
+    // Those of the test's own build are not a user's.
     for variable in ["CARGO_TARGET_DIR", "MAKEFLAGS", "MAKELEVEL", "RUSTFLAGS"] {
         bash.env_remove(variable);
     }

@@ -76,7 +76,7 @@ fn every_rule_with_a_help_line_is_there() {
     for (name, _) in helped {
         assert!(
             name.starts_with(' ') || rules.contains(name),
-            "help of `{name}`, which is no rule"
+            "help of `{name}`, which is not a rule"
         );
     }
 }

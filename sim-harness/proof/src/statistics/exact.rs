@@ -73,7 +73,7 @@ pub fn p_greater(run_only: usize, reference_only: usize, n: usize, delta: f64) -
         f64::midpoint(differing, -delta).max(0.0)
     };
     let (from, to) = (counts(share(0), n).0, counts(share(PLACES - 1), n).1);
-    // The least `run_only` for each `reference_only` whose statistic is as large; no number is where there is none.
+    // The least `run_only` for each `reference_only` whose statistic is as large; beyond all counts where there is none.
     let least: Vec<usize> = (from..=to)
         .map(|reference_only| {
             let (mut low, mut high) = (0, n - reference_only + 1);

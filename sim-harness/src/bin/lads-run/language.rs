@@ -42,7 +42,7 @@ impl Chosen {
         if found.is_empty() {
             if let Some(of_table) = wanted.of_table {
                 return Err(refused(format!(
-                    "{of_table}: for instructions of the bundle's table, and '{text}' is none{}",
+                    "{of_table}: for instructions of the bundle's table, and '{text}' is not one{}",
                     nearest_texts(bundle, text)
                 )));
             }

@@ -1,7 +1,7 @@
 //! The `sweep` subcommand: the benchmark at several levels of each fault, one fault at a time, on the same episodes.
 //!
 //! A fault may lead to observations outside the contract, which the controller refuses. Such an episode ends there, as the machine would
-//! stop, and counts as it stands; how many did is told with each level.
+//! stop, and counts with what it has completed; each level says how many did.
 
 use std::fmt::Write as _;
 
