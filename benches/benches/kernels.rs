@@ -20,7 +20,7 @@ fn numbers(count: usize) -> Vec<f32> {
         .collect()
 }
 
-/// Measures the sweep of a group, after its kernel.
+/// Measures a bare sweep over `bytes` in the group, after the group's kernel was measured.
 fn roofline(group: &mut BenchmarkGroup<'_, WallTime>, bytes: usize) {
     let sweep = Sweep::new(bytes);
     group.bench_function("sweep", |bencher| bencher.iter(|| sweep.read()));

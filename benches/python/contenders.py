@@ -35,7 +35,7 @@ class Torch:
         self.net.instruct(self.net.words(self.instruction))
 
     def at(self, tokens):
-        """Returns to a context of so many tokens."""
+        """Returns to a context of `tokens` tokens."""
         self.net.past = tokens
 
     def tokens(self):

@@ -1,4 +1,4 @@
-"""Exports the language encoder as files for hosts without Python, so that a policy can be told sentences outside its table.
+"""Exports the language encoder as files for hosts without Python, so that a policy can follow sentences outside its table.
 
 A folder of three files: `encoder.onnx` (input `encoder/ids` [n] int64, the tokens of one sentence; output `encoder/hidden`
 [layers + 1, n, E] float32, the embeddings and then every layer's output), `tokenizer.json`, and `manifest.json` with the sha256 of both and

@@ -12,7 +12,7 @@ from .config import UserError
 
 
 def check_apart(inputs, outputs):
-    """Refuses an output that is an input or another output; devices may stand in more than one place."""
+    """Refuses an output that is an input or another output; devices may be named more than once."""
     taken = [(path, "is read") for path in inputs if path]
     for path in outputs:
         for other, what in taken:

@@ -22,7 +22,8 @@ const TOLERANCE: f32 = 1e-5;
 /// Interval of the bytes that are flipped in weights and the golden episode, whose values no check depends on.
 const SPARSE: usize = 997;
 
-/// Largest number of other bytes that are flipped, evenly spread: where each of them is a step of many passes, all of them take minutes.
+/// Largest number of bytes that are flipped outside weights and golden episode, evenly spread: where each of them is a step of many passes,
+/// all of them take minutes.
 const MOST: usize = 30_000;
 
 fn image(kind: &str) -> Image {

@@ -208,7 +208,7 @@ impl<'e> General<'e> {
         Ok(())
     }
 
-    /// Binds all that a timed control step needs, and checks that it computes what the walk did.
+    /// Binds all that a timed control step needs, and checks that it computes the same as the untimed steps before.
     fn bind(&mut self, step: usize) -> Result<(), BenchError> {
         let step = step.max(1);
         if self.bound == Some(step) {

@@ -19,7 +19,7 @@ def alpha_bar(levels):
 
 
 def sinusoids(levels, width, base=1e4):
-    """Computes sine and cosine of what the network is told, level - 1: [len(levels), width]."""
+    """Computes sine and cosine of the noise level as the network gets it, level - 1: [len(levels), width]."""
     rate = np.exp(-np.log(base) * np.arange(width // 2) / (width // 2 - 1))
     angle = (np.asarray(levels)[:, None] - 1) * rate
     return np.concatenate([np.sin(angle), np.cos(angle)], 1).astype(np.float32)

@@ -6,7 +6,7 @@ from . import common
 
 
 def setting(sizes):
-    """Makes the tiny configuration on the bench, with these sizes."""
+    """Makes the tiny configuration on the bench, with the given sizes."""
     table = config.read_toml("configs/tiny.toml")
     table["name"] = "random lads"
     table["language"] |= {"encoder": common.WORDS.encoder}

@@ -77,7 +77,7 @@ class Training(base.Training):
         self.networks.codebook.started.fill_(True)
 
     def _ends(self, episodes, starts):
-        """Returns the last observation of the segments that start there."""
+        """Returns the last observation of the segments that start at the given steps."""
         last = torch.minimum(starts + self.corpus.horizon - 1, self.corpus.lengths.to(starts.device)[episodes] - 1)
         return self.corpus.observations[episodes.to(self.corpus.device), last.clamp(min=0).to(self.corpus.device)]
 

@@ -41,7 +41,7 @@ class Training(base.Training):
         return self.PARTS[stage]
 
     def begin(self, stage):
-        """Computes the codes of all windows, which are frozen from here on."""
+        """Computes the codes of all windows, which stay fixed during the stage."""
         if stage in ("low_level", "high_level"):
             self.networks.eval()
             self.codes = self.corpus.codes(self.encode, range(len(self.corpus.lengths)))

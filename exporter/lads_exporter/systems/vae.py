@@ -60,7 +60,7 @@ class Training(lads.Training):
     }
 
     def begin(self, stage):
-        """Computes q of all windows, frozen from here on."""
+        """Computes q of all windows, which stays fixed during the stage."""
         if stage in ("low_level", "high_level"):
             self.networks.eval()
             self.known = self._every_window(range(len(self.corpus.lengths)))

@@ -40,7 +40,7 @@ class System:
 
     @property
     def trained(self):
-        """Returns the id of the system whose run it is exported from."""
+        """Returns the id of the system whose training run this system is exported from."""
         return self.weights or self.id
 
 

@@ -121,9 +121,9 @@ pub struct Answers {
     pub differing_segments: usize,
     /// Whether the plans are the reference's in another order.
     pub renumbered: bool,
-    /// Number of episodes with any difference beyond these bounds.
+    /// Number of episodes with any difference beyond the tolerances.
     pub differing_episodes: usize,
-    /// First difference beyond these bounds.
+    /// First difference beyond the tolerances.
     pub first_difference: Option<Answer>,
 }
 

@@ -15,7 +15,7 @@ pub struct FieldDifference {
     pub field: String,
     /// Value in the run's contract, as JSON; `null` if absent.
     pub run: String,
-    /// Value that it is compared with, as JSON; `null` if absent.
+    /// Value that the run's value is compared with, as JSON; `null` if absent.
     pub reference: String,
 }
 

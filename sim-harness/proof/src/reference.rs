@@ -48,9 +48,9 @@ pub enum ReferenceError {
         field: &'static str,
         /// The reference's value.
         reference: String,
-        /// Owner of the value that it is compared with.
+        /// Owner of the value that the reference's is compared with.
         whose: &'static str,
-        /// The value that it is compared with.
+        /// Value that the reference's is compared with.
         other: String,
     },
 }

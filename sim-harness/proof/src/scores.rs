@@ -14,7 +14,7 @@ pub struct Completion {
     pub sub_task: String,
     /// First control step, counted from 1, after which the sub-task was done.
     pub step: usize,
-    /// Whether the instruction commands it.
+    /// Whether the instruction commands the sub-task.
     pub commanded: bool,
 }
 

@@ -97,7 +97,7 @@ pub enum EvaluationError {
         /// The episode's error.
         source: RolloutError,
     },
-    /// The evaluation was told to stop.
+    /// The evaluation was stopped by the caller.
     #[error("interrupted")]
     Interrupted,
 }
@@ -107,7 +107,7 @@ pub enum EvaluationError {
 pub struct Evaluated {
     /// One list of episodes per assignment.
     pub episodes: Vec<Vec<Episode>>,
-    /// Traces of the episodes in the same order, where the setup asked for them; empty otherwise.
+    /// Traces of the episodes in the order of `episodes`, where the setup asked for them; empty otherwise.
     pub traces: Vec<Trace>,
     /// Control steps, from 0, at which episodes ended because the controller refused an observation; empty unless the setup lets episodes
     /// end this way.

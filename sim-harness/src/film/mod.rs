@@ -27,7 +27,7 @@ use crate::environment::{ActionError, Environment, EpisodeSeed};
 use crate::rollout::Phase;
 use crate::trace::{Step, Trace};
 
-/// Why there are no pictures.
+/// Why an episode cannot be filmed or drawn.
 #[derive(Debug, Error)]
 pub enum FilmError {
     /// The environment has no simulator to draw.
@@ -44,7 +44,7 @@ pub enum FilmError {
     /// Drawing failed later than at the start.
     #[error("a picture cannot be drawn: {0}")]
     Draw(String),
-    /// The environment refused an action that it once executed.
+    /// The environment refused an action that it executed in the first run.
     #[error("control step {step} cannot be run again: {error}")]
     Action {
         /// Control step, from 0.
@@ -63,7 +63,7 @@ pub enum FilmError {
     /// The program that compresses films, ffmpeg, failed.
     #[error("ffmpeg cannot make it: {0}")]
     Ffmpeg(String),
-    /// Filming was told to stop.
+    /// Filming was stopped by the caller.
     #[error("interrupted")]
     Interrupted,
 }

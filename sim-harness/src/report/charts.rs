@@ -63,7 +63,7 @@ pub struct Mark {
     pub name: String,
     /// Control step of the completion.
     pub step: usize,
-    /// Whether the instruction asks for it.
+    /// Whether the instruction commands the sub-task.
     pub asked: bool,
 }
 

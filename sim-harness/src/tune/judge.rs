@@ -27,9 +27,9 @@ pub enum Loss {
     Refused(String),
     /// Some decisions selected another index.
     Selected {
-        /// Number of such decisions.
+        /// Number of decisions that selected another index.
         changed: usize,
-        /// Largest margin, with 32 bits, among those decisions.
+        /// Largest margin, with 32 bits, among the decisions that selected another index.
         margin: f64,
     },
     /// A logit differs by more than [`LOGIT_BOUND`].

@@ -31,7 +31,7 @@ pub enum TuneError {
     /// The questions cannot be asked, or an interrupt came.
     #[error(transparent)]
     Asking(#[from] EvaluationError),
-    /// The policy with 32 bits refuses a question: the reference is of something else.
+    /// The policy with 32 bits refuses a question: the reference was made for something else.
     #[error(
         "with 32 bits the policy refuses a step of the reference: {0}; make the reference again"
     )]

@@ -131,7 +131,7 @@ pub fn subject<'s>(bundle: &'s Bundle, environment: &'s dyn Environment) -> Subj
     }
 }
 
-/// Lists what these episodes could not show.
+/// Lists what the episodes of this run could not show.
 fn unseen(evaluation: &Evaluation<'_>, answers: &Answers) -> Vec<String> {
     let contract = evaluation.policy.contract();
     let mut unseen = Vec::new();

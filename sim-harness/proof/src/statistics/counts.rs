@@ -18,7 +18,7 @@ const BETS: [(f64, f64); 4] = [(1.0, 0.5), (0.5, 0.25), (0.25, 0.125), (0.125, 0
 #[derive(Debug, Clone, Default)]
 pub struct Counts {
     pairs: Vec<[f64; 2]>,
-    /// Largest number of sub-tasks that any of these episodes commanded.
+    /// Largest number of sub-tasks that any of the episodes commanded.
     most: usize,
 }
 

@@ -28,7 +28,7 @@ use crate::metrics::Interval;
 pub const EQUIVALENCE_LEVEL: f64 = 0.05;
 /// Confidence of the reported intervals.
 const REPORTED: f64 = 0.95;
-/// Confidence of the interval that two one-sided tests at 5 % amount to.
+/// Confidence of the interval that is equivalent to two one-sided tests at 5 %.
 const EQUIVALENCE: f64 = 0.90;
 /// Largest growth at which a search for a sufficient number of episodes ends, as a factor on their number.
 const MOST_GROWTH: f64 = 64.0;
