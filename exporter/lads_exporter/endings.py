@@ -37,7 +37,7 @@ def texts(instructions, variants, seed=0):
 
 
 class Endings:
-    """Word embeddings of the other texts, drawn at random for a trajectory."""
+    """Word embeddings of instructions with other endings, drawn at random for a trajectory."""
 
     def __init__(self, setting, device):
         data = setting.config.data

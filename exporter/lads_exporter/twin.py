@@ -179,7 +179,7 @@ class Twin:
                 state.clear()
 
     def executed(self, action):
-        """Tells the twin that another action than the last step's was executed."""
+        """Sets the action that was really executed, where it was not the last step's."""
         self.previous = np.asarray(action, np.float32).reshape(self.previous.shape)
 
     def step(self, channels):

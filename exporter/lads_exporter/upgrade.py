@@ -41,7 +41,7 @@ def _meant(rows, stated):
 
 
 def contract(old, environment=None):
-    """Upgrades a contract of version 1 -> the same of version 2."""
+    """Upgrades a contract from version 1 to version 2."""
     stated = environment or {"observation": [], "action": []}
     own = {
         "quaternion_order": old["quaternion_order"],
@@ -67,7 +67,7 @@ def contract(old, environment=None):
 
 
 def golden(blob):
-    """Upgrades a golden episode of version 1, base64 -> of version 2."""
+    """Upgrades a golden episode, in base64, from version 1 to version 2."""
     data = base64.b64decode(blob)
     old = load_safetensors(data)
     tensors = {

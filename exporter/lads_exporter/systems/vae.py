@@ -95,7 +95,7 @@ class Training(lads.Training):
         return divergence(known.flatten(0, 1)[marks[marks >= 0]], p[marks >= 0]).sum(-1).mean()
 
     def _decisions(self, marks):
-        """Keeps only the marks at multiples of H, where the configuration says so."""
+        """Keeps only the marks at multiples of H, if the configuration asks for that."""
         if self.config.training.ce_at == "decisions":
             marks = marks.clone()
             marks[:, torch.arange(marks.shape[1]) % self.corpus.horizon > 0] = -1

@@ -36,7 +36,7 @@ const HELP: &str = "drag: turn, right: shift, wheel: zoom | space: pause | .: st
 
 type Pixels = Surface<OwnedDisplayHandle, Rc<Window>>;
 
-/// Size of the picture in a canvas of this size.
+/// Size of the picture inside a canvas of `width` by `height` pixels.
 pub fn picture([width, height]: [u32; 2]) -> [u32; 2] {
     let around = caption::HEAD + caption::FOOT + caption::LINE_HEIGHT;
     [width.max(1), height.saturating_sub(around).max(1)]

@@ -120,7 +120,7 @@ pub struct SubTask {
     pub element: usize,
     /// Direction of the change: 1 or -1.
     pub sign: f64,
-    /// Smallest change that is not enough: the element must change by strictly more.
+    /// Threshold that the element's change must strictly exceed.
     pub threshold: f64,
 }
 
