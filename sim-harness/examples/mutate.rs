@@ -68,7 +68,7 @@ impl Bench {
             let segments = answers.differing_segments;
             let reason = judged.reason();
             kind.exceptions.push(format!(
-                "{what}: {verdict}; largest logit {logit:.1e}, action {action:.1e}, segments encoded otherwise {segments} {reason}"
+                "{what}: {verdict}; largest logit {logit:.1e}, action {action:.1e}, segments encoded as another plan {segments} {reason}"
             ));
         }
     }

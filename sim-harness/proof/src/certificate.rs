@@ -9,7 +9,7 @@
 //!    difference larger than its margin (1 % over all of them together).
 //! 2. **EQUIVALENT** if none of this holds, contract, actions, states and, where the reference decides, logits were compared at all, and every paired difference is
 //!    equivalent: two one-sided tests at 5 %, within 0.05 for rates and 0.1 for the N-rate.
-//! 3. **INCONCLUSIVE** otherwise; then it says how many more episodes of each instruction would decide, if it stays as it is.
+//! 3. **INCONCLUSIVE** otherwise; then it says how many more episodes of each instruction would decide, at these rates.
 //!
 //! A difference that is significant (McNemar's test, 5 % over all rates together) and yet negligible is noted as such: with enough episodes
 //! every difference is significant, and the margin says which ones matter. What was not looked at is listed.

@@ -188,7 +188,7 @@ impl fmt::Display for Summary<'_> {
         match self.0.more_episodes_per_instruction {
             Some(more) => writeln!(
                 f,
-                "- about {more} more episodes of each instruction would decide, if it stays as it is"
+                "- about {more} more episodes of each instruction would decide, at these rates"
             ),
             None => Ok(()),
         }
