@@ -1,4 +1,4 @@
-"""What the Python package costs: a step beside Rust and ONNX Runtime, an import, batches over threads, the size of a wheel.
+"""Measures the Python package: a step beside Rust and ONNX Runtime, an import, batches over threads, the size of a wheel.
 
     make wheel && .venv/bin/python -m pip install target/wheels/lads-*.whl
     .venv/bin/python benches/python.py [--seconds 10] [--rust target/release/examples/step_cost]
@@ -36,7 +36,7 @@ ENTRY = "policy/act"
 
 
 def legged():
-    """A policy of a legged robot's size, 51-512-256-128-14, Elu between, with random weights, as a bundle."""
+    """Makes a policy of a legged robot's size, 51-512-256-128-14, Elu between, with random weights, as a bundle."""
     names = lambda kind, count: [{"name": f"{kind}{i}", "unit": "1", "min": -10.0, "max": 10.0} for i in range(count)]
     environment = {
         "id": "legged-bench",
@@ -64,7 +64,7 @@ def legged():
 
 
 def hot(contenders, seconds):
-    """Microseconds of one call of each, in turns, the fastest share."""
+    """Measures the contenders hot, in turns: microseconds of one call of each, the fastest share."""
     calls = {}
     for name, call in contenders.items():
         start = time.perf_counter()
@@ -84,7 +84,7 @@ def hot(contenders, seconds):
 
 
 def paced(contenders, seconds, rate=50):
-    """Microseconds of one call of each at a control period, median, in turns call by call."""
+    """Measures the contenders at a control period, in turns call by call: microseconds of one call of each, median."""
     found = {name: [] for name in contenders}
     deadline = time.perf_counter()
     for _ in range(int(seconds * rate)):
@@ -98,7 +98,7 @@ def paced(contenders, seconds, rate=50):
 
 
 def stepper(policy):
-    """A call of `step` on the golden episode's first observation."""
+    """Makes a call of `step` on the golden episode's first observation."""
     golden = policy.golden
     controller = policy.controller(golden.instruction)
     (seen,) = (values[0].copy() for values in golden.observations.values())
@@ -107,7 +107,7 @@ def stepper(policy):
 
 
 def beside_rust(program, path, policy, seconds):
-    """Microseconds of a step from Python and from Rust, in turns, the fastest share of each."""
+    """Measures a step from Python and from Rust in microseconds, in turns, the fastest share of each."""
     call = stepper(policy)
     python = native = float("inf")
     deadline = time.perf_counter() + seconds
@@ -120,7 +120,7 @@ def beside_rust(program, path, policy, seconds):
 
 
 def scaling(policy, seconds, count=8):
-    """Microseconds of a step of 8 controllers on one thread and on two."""
+    """Measures a step of 8 controllers on one thread and on two, in microseconds."""
     golden = policy.golden
     (seen,) = (np.repeat(values[:1], count, 0) for values in golden.observations.values())
     out = np.zeros((count, *policy.contract.action.shape), np.float32)
@@ -130,13 +130,13 @@ def scaling(policy, seconds, count=8):
 
 
 def importing():
-    """Milliseconds that the package takes beyond numpy, the fastest of ten, interpreter's start apart."""
+    """Measures the milliseconds that importing the package takes beyond numpy, the fastest of ten, without the interpreter's start."""
     code = "import numpy, time; start = time.perf_counter(); import lads; print((time.perf_counter() - start) * 1000)"
     return min(float(subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout) for _ in range(10))
 
 
 def leak(policy, controllers):
-    """Growth of this process's memory in kB over so many controllers that each take a step."""
+    """Measures the growth of this process's memory in kB over so many controllers that each take a step."""
     golden = policy.golden
     (seen,) = (values[0].copy() for values in golden.observations.values())
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Fetch ONNX Runtime's shared library, the main peer of the benchmarks, into vendor/onnxruntime/.
+"""Fetches ONNX Runtime's shared library, the main peer of the benchmarks, into vendor/onnxruntime/.
 
 It comes from the pinned and checksummed PyPI wheel, which is unpacked, never installed. A second run does nothing. The folder is
 put in place in one rename. Any failure ends with one line on stderr and exit status 2.
@@ -23,7 +23,7 @@ SHA256 = {
 
 
 def harness():
-    """The simulator's setup script, whose downloads and checks are the same."""
+    """Loads the simulator's setup script, whose downloads and checks are the same."""
     spec = importlib.util.spec_from_file_location("harness_setup", ROOT / "sim-harness" / "setup.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

@@ -1,4 +1,4 @@
-//! What a control period costs, and what comes before it: opening, compiling, setting an instruction.
+//! Measures a control period, and what comes before it: opening, compiling, setting an instruction.
 //!
 //! Control steps are measured with 300 tokens in the context (the words and two tokens per step), which is the middle of a kitchen
 //! episode. A step changes its context, so every measured step is preceded by the unmeasured ones that fill it.
@@ -16,12 +16,12 @@ use lads_image::Tables;
 /// Tokens in the context of a measured control step.
 const CONTEXT: usize = 300;
 
-/// Control steps after which the schedule repeats.
+/// Number of control steps after which the schedule repeats.
 fn period(policy: &Policy<'_>) -> usize {
     Tables::new(policy.image()).map_or(1, |tables| schedule::period(&tables) as usize)
 }
 
-/// The first control step that begins a period with at least [`CONTEXT`] tokens, or the last that does in a shorter context.
+/// Finds the first control step that begins a period with at least [`CONTEXT`] tokens, or the last that does in a shorter context.
 fn deciding_step(policy: &Policy<'_>, words: usize) -> usize {
     let steps = policy.contract().context_steps();
     let (period, last) = (period(policy), steps.map_or(CONTEXT, |steps| steps - 1));
@@ -70,7 +70,7 @@ fn control(criterion: &mut Criterion) {
     group.finish();
 }
 
-/// The entries that a call of its own reaches.
+/// Measures the entries that can be called on their own.
 fn entries(criterion: &mut Criterion, controller: &mut Controller<'_, '_>) {
     let policy = *controller.policy();
     let (contract, golden) = (policy.contract(), policy.golden());
@@ -105,7 +105,7 @@ fn entries(criterion: &mut Criterion, controller: &mut Controller<'_, '_>) {
     group.finish();
 }
 
-/// Time of `iterations` control steps, all of them in `measured` of one episode after the other.
+/// Measures `iterations` control steps, all of them in `measured` of one episode after the other.
 fn measure(
     controller: &mut Controller<'_, '_>,
     measured: std::ops::Range<usize>,

@@ -1,5 +1,4 @@
-//! What a simulated control step costs, and how many of them an evaluation makes in a second; with the simulator that `make setup`
-//! fetches.
+//! Measures a simulated control step, and how many of them an evaluation makes in a second, with the simulator that `make setup` fetches.
 
 use std::sync::atomic::AtomicBool;
 
@@ -12,7 +11,7 @@ use lads_sim::environment::{Environment, EpisodeSeed};
 use lads_sim::evaluate::{Assignment, Evaluation};
 use lads_sim::rollout::Actor;
 
-/// Control steps of an episode.
+/// Number of control steps of an episode.
 const STEPS: usize = 280;
 
 const START: EpisodeSeed = EpisodeSeed {

@@ -1,4 +1,4 @@
-//! The kernels of a control step against the least that their bytes can cost: a bare sweep over as much memory, in the same group.
+//! Measures the kernels of a control step against the least that their bytes can cost: a bare sweep over as much memory, in the same group.
 
 use std::hint::black_box;
 
@@ -13,27 +13,27 @@ use lads_kernels::{
     attention_scratch_len, keys_len, pack, packed_len,
 };
 
-/// Elements that are neither zero nor all the same.
+/// Returns `count` elements that are neither zero nor all the same.
 fn numbers(count: usize) -> Vec<f32> {
     (0..count)
         .map(|i| ((i * 37 % 101) as f32 - 50.0) / 50.0)
         .collect()
 }
 
-/// The sweep of a group, whose kernel has been measured.
+/// Measures a bare sweep over `bytes` in the group, after the group's kernel was measured.
 fn roofline(group: &mut BenchmarkGroup<'_, WallTime>, bytes: usize) {
     let sweep = Sweep::new(bytes);
     group.bench_function("sweep", |bencher| bencher.iter(|| sweep.read()));
 }
 
-/// A matrix in panels, where an image would have it.
+/// Packs a matrix in panels, as an image stores it.
 fn packed<T: Pod + Default>(format: WeightFormat, w: &[T], dims: [usize; 2]) -> Aligned {
     let mut panels = vec![T::default(); packed_len(format, dims)];
     pack(format, w, dims, &mut panels);
     Aligned::new(bytemuck::cast_slice(&panels))
 }
 
-/// One dense layer, in 32 and in 16 bits, for one row and for the two tokens of a control step.
+/// Measures one dense layer, in 32 and in 16 bits, for one row and for the two tokens of a control step.
 fn linear(criterion: &mut Criterion) {
     let isa = Isa::detect();
     for (k, n) in [(128, 128), (128, 384), (512, 128)] {
@@ -84,7 +84,7 @@ fn linear(criterion: &mut Criterion) {
     }
 }
 
-/// Two tokens after three hundred, four heads of 32.
+/// Measures attention of two tokens after three hundred, four heads of 32.
 fn attention(criterion: &mut Criterion) {
     let isa = Isa::detect();
     let (heads, head_dim, visible) = (4, 32, 301);

@@ -1,4 +1,4 @@
-"""What boards will need for a control step, without one: instructions by QEMU, cycles of the inner loops by llvm-mca.
+"""Estimates a control step on boards that are not at hand: instructions by QEMU, cycles of the inner loops by llvm-mca.
 
     lads compile models/kitchen.onnx --emit-c f32.c
     python3 benches/boards/measure.py steps f32=f32.c int8=int8.c    instructions of a step, per target and kernel
@@ -60,7 +60,7 @@ STEPS = [50, 150]
 
 
 def run(*command: str | Path, **options) -> str:
-    """The output of a command; if it fails, this program ends with what it wrote."""
+    """Returns the output of a command; if it fails, ends this program with what the command wrote."""
     done = subprocess.run([str(part) for part in command], capture_output=True, text=True, **options)
     if done.returncode:
         sys.exit(f"measure.py: {' '.join(map(str, command))}\n{done.stdout}{done.stderr}")
@@ -81,7 +81,7 @@ def save(key: str, value: dict) -> None:
 
 
 def steps(images: dict[str, Path]) -> None:
-    """Instructions of a control step: target, kernel, image."""
+    """Counts the instructions of a control step, by target, kernel and image."""
     found: dict[str, dict] = {}
     skipped = []
     with tempfile.TemporaryDirectory() as folder:
@@ -123,7 +123,7 @@ def steps(images: dict[str, Path]) -> None:
 
 
 def image_of(source: Path) -> tuple[str, int]:
-    """The symbol and the bytes of the image in a source of `lads compile --emit-c`."""
+    """Returns the symbol and the bytes of the image in a source of `lads compile --emit-c`."""
     with source.open() as lines:
         for line in lines:
             if declared := re.match(r"extern const unsigned char (\w+)\[(\d+)\];", line):
@@ -132,7 +132,7 @@ def image_of(source: Path) -> tuple[str, int]:
 
 
 def count(qemu: list[str], plugin: Path, program: Path, kernel: str) -> dict:
-    """Instructions of a mean step, and the bits of the actions of all steps."""
+    """Counts the instructions of a mean step, and returns the bits of the actions of all steps."""
     portable = ["portable"] if kernel == "portable" else []
     outputs = [run(*qemu, "-plugin", plugin, "-d", "plugin", program, str(n), *portable) for n in STEPS]
     totals = [int(re.search(r"instructions (\d+)", output)[1]) for output in outputs]
@@ -141,7 +141,7 @@ def count(qemu: list[str], plugin: Path, program: Path, kernel: str) -> dict:
 
 
 def loops() -> None:
-    """Cycles per 64 weights of the inner loops: core, kernel, rows."""
+    """Estimates the cycles per 64 weights of the inner loops, by core, kernel and rows."""
     mca = os.environ.get("LLVM_MCA", "llvm-mca")
     if missing(mca):
         return
@@ -168,7 +168,7 @@ def per_64(value: float, weights: int) -> float:
 
 
 def assembly() -> str:
-    """lads-kernels for aarch64, as an optimised build has it."""
+    """Compiles lads-kernels for aarch64 to assembly, as in an optimised build."""
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "kernels.s"
         cargo = os.environ.get("CARGO", "cargo")
@@ -187,7 +187,7 @@ BRANCH = re.compile(r"(?:b\.\w+|cbn?z\s+\w+,|tbn?z\s+\w+,\s*#\d+,)\s+(\.L\w+)$")
 
 
 def innermost(text: str) -> dict[tuple[str, int], tuple[int, list[str]]]:
-    """The loops of one block over panels: kernel and rows, and the weights that a round reads."""
+    """Finds the loops of one block over panels: kernel and rows, and the weights that a round reads."""
     best: dict[tuple[str, int], tuple[int, list[str]]] = {}
     function, label, body = "", "", []
     for line in text.splitlines():
@@ -210,7 +210,7 @@ def innermost(text: str) -> dict[tuple[str, int], tuple[int, list[str]]]:
 
 
 def classify(body: list[str]) -> tuple[tuple[str, int], int] | None:
-    """Kernel and rows of a loop over a panel, and its weights; nothing of other loops."""
+    """Returns kernel and rows of a loop over a panel, and its weights; None for other loops."""
     # LLVM writes some of them with the vectors' shape behind the name, GNU behind the registers.
     names = Counter(line.split()[0].split(".")[0] for line in body)
     names["ext"] = sum(names[name] for name in ("sshll", "sshll2", "sxtl", "sxtl2"))
@@ -235,13 +235,13 @@ def simulated(mca: str, model: str, body: list[str], rounds: int) -> str:
 
 
 def cycles(mca: str, model: str, body: list[str]) -> float:
-    """Cycles of a round, the first and the last ones taken off."""
+    """Returns the cycles of a round, without the first and the last rounds."""
     total = [int(re.search(r"Total Cycles:\s+(\d+)", simulated(mca, model, body, n))[1]) for n in (100, 300)]
     return (total[1] - total[0]) / 200
 
 
 def bound(mca: str, model: str, body: list[str]) -> float:
-    """Cycles for which the busiest unit of the core is taken by these instructions."""
+    """Returns the cycles for which the busiest unit of the core is taken by these instructions."""
     return float(re.search(r"Block RThroughput:\s+([\d.]+)", simulated(mca, model, body, 100))[1])
 
 
@@ -266,7 +266,7 @@ def table() -> None:
 
 
 def estimates(results: dict, names: list[str]) -> None:
-    """Time of a step with everything in the caches: its instructions, at the rate of the inner loop over two rows."""
+    """Estimates the time of a step with everything in the caches: its instructions, at the rate of the inner loop over two rows."""
     print("\n| core | board | clock [GHz] |" + "".join(f" {name} [us] |" for name in names) + "\n|---|---|---|" + "---|" * len(names))
     for core, (board, clock) in BOARDS.items():
         counted = results["steps"]["aarch64-unknown-linux-gnu"]["dotprod" if core in DOT else "neon"]

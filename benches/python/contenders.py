@@ -10,7 +10,7 @@ def policies():
 
 
 def limits(contract):
-    """The action's lowest and highest values."""
+    """Returns the action's lowest and highest values."""
     action = next(row for row in contract["channels"] if row["role"] == "action")
     return tuple([element[key] for element in action["elements"]] for key in ("min", "max"))
 
@@ -35,14 +35,14 @@ class Torch:
         self.net.instruct(self.net.words(self.instruction))
 
     def at(self, tokens):
-        """Goes back to a context of so many tokens."""
+        """Returns to a context of `tokens` tokens."""
         self.net.past = tokens
 
     def tokens(self):
         return self.net.past
 
     def step(self, observation, action, time, plan, decides):
-        """-> action, plan, its index or None."""
+        """Runs a control step -> action, plan, its index or None."""
         logits = self.net.step(observation, action, time)
         index = None
         if decides:
@@ -63,7 +63,8 @@ class Torch:
 
 
 class OpenVino:
-    """Keys and values are handed from call to call as tensors; the runtime allocates its outputs where a context is new to it."""
+    """OpenVINO as a contender: keys and values are handed from call to call as tensors; the runtime allocates its outputs where a context
+    is new to it."""
 
     def __init__(self, model, contract, instruction):
         import openvino

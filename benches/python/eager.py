@@ -1,4 +1,4 @@
-"""The policy in PyTorch, eagerly, from the weights inside a bundle: what a user runs who exports nothing.
+"""Runs the policy in PyTorch, eagerly, from the weights inside a bundle, as a user would who exports nothing.
 
 The transformer keeps its keys and values in tensors that are allocated once and written in place.
 """
@@ -11,7 +11,7 @@ from onnx import numpy_helper
 
 
 class Eager:
-    """All entries that a control loop needs. One thread, no gradients."""
+    """All entries that a control loop needs, in PyTorch. One thread, no gradients."""
 
     def __init__(self, model, contract):
         torch.set_num_threads(1)
@@ -40,7 +40,7 @@ class Eager:
         return F.layer_norm(x, scale.shape, scale, bias, 1e-5)
 
     def mask(self, new, past):
-        """A token sees the whole past and, of the new ones, those up to itself."""
+        """Returns the attention mask: a token sees the whole past and, of the new tokens, those up to itself."""
         if new == 1:
             return None
         if new not in self.masks:
@@ -60,7 +60,7 @@ class Eager:
         return self.linear(mixed.transpose(1, 2).reshape(1, new, -1), name + ".out")
 
     def transformer(self, tokens, cached=True):
-        """tokens [1, n, d] before the first layer norm -> [1, n, d]."""
+        """Runs the transformer: tokens [1, n, d] before the first layer norm -> [1, n, d]."""
         x = self.norm(tokens, "high_level.embed_norm")
         for number in range(self.layers):
             name = f"high_level.block.{number}"
@@ -71,11 +71,11 @@ class Eager:
         return x
 
     def logits(self, x):
-        """x [1, n, d] -> the logits of its last token, [M]."""
+        """Computes the logits [M] of the last token of x [1, n, d]."""
         return self.gemm(self.norm(x[:, -1], "high_level.norm"), "high_level.head")[0]
 
     def embed(self, x, name, time):
-        """x [n, k], time [n] -> [n, d]."""
+        """Embeds x [n, k] at positions `time` [n] -> [n, d]."""
         return self.gemm(x, f"high_level.embed_{name}") + self.weights["high_level.embed_timestep"][time]
 
     def observed(self, observation):
@@ -85,7 +85,7 @@ class Eager:
         return self.weights["instruction.words"][instruction, : self.lengths[instruction]]
 
     def instruct(self, words):
-        """words [L, E]: a new context."""
+        """Starts a new context with words [L, E]."""
         self.past = 0
         self.transformer(self.linear(words, "high_level.embed_word")[None])
 
@@ -97,7 +97,7 @@ class Eager:
         return self.logits(self.transformer(torch.cat(tokens)[None]))
 
     def recompute(self, words, observations, actions):
-        """The logits after words [L, E], observations [T, O] and actions [T - 1, A], from nothing."""
+        """Computes the logits after words [L, E], observations [T, O] and actions [T - 1, A], from nothing."""
         steps = len(observations)
         seen = self.embed(self.observed(observations), "observation", torch.arange(steps))
         done = self.embed(actions, "action", torch.arange(steps - 1))

@@ -1,4 +1,4 @@
-"""Control steps of policies that see images, beside ONNX Runtime on the same graph: one thread, hot, in turns.
+"""Measures control steps of policies that see images beside ONNX Runtime on the same graph: one thread, hot, in turns.
 
     cargo build --release -p lads-benches --bin images
     python benches/python/images.py target/release/images BUNDLE.onnx...
@@ -18,7 +18,7 @@ ROUNDS, SECONDS = 40, 0.25
 
 
 def session(path):
-    """-> a function that runs one step, on frames of the shapes that the graph says."""
+    """Returns a function that runs one step, on frames of the shapes that the graph states."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     found = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])

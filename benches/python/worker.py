@@ -1,4 +1,4 @@
-"""A contender in a process of its own: keeps to the protocol of the benchmark and measures itself.
+"""Runs a contender in a process of its own, which keeps to the protocol of the benchmark and measures itself.
 
 One JSON object per line in, one per line out. Deadlines are absolute. Anything that fails is a line with the key "error".
 """
@@ -32,7 +32,7 @@ class Worker:
         return self.observations[step % len(self.observations)]
 
     def walk(self, steps):
-        """-> plans, actions of the first steps."""
+        """Runs the first steps -> plans, actions."""
         policy = self.policy
         policy.frozen = False
         policy.instruct()
@@ -47,7 +47,7 @@ class Worker:
         return plans, actions
 
     def call(self, work, first, middle):
-        """-> the function to time, given the number of the call; it says the kind of call."""
+        """Returns the function to time, given the number of the call; it returns the kind of call."""
         policy = self.policy
         if work == "instruct":
             return lambda number: (policy.instruct(), "instruct")[1]
@@ -90,7 +90,7 @@ class Worker:
 
 
 def realtime(on):
-    """As the other contenders: SCHED_FIFO where it is granted."""
+    """Asks for SCHED_FIFO, like the other contenders; runs without it where it is not granted."""
     try:
         policy, priority = (os.SCHED_FIFO, 50) if on else (os.SCHED_OTHER, 0)
         os.sched_setscheduler(0, policy, os.sched_param(priority))

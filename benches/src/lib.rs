@@ -1,4 +1,4 @@
-//! Benchmarks of the runtime, and what its users would pick instead, as contenders of lads-pace.
+//! Benchmarks of the runtime and of the runtimes that its users would otherwise pick, as contenders of lads-pace.
 #![forbid(unsafe_code)]
 
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 pub mod peers;
 pub mod sweep;
 
-/// The bundle to measure: the kitchen policy that ships.
+/// Path of the bundle to measure: the kitchen policy that ships.
 pub fn bundle() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/kitchen.onnx")
 }

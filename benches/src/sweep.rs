@@ -1,4 +1,4 @@
-//! The least that reading some weights can cost: a bare sweep over the same bytes, with the widest vectors of the CPU.
+//! Measures the least that reading some weights can cost: a bare sweep over the same bytes, with the widest vectors of the CPU.
 //!
 //! Every kernel reads its weights once. What a kernel takes beyond this sweep over a block of the same size, in the same run, is
 //! not the memory's fault.
@@ -11,14 +11,14 @@
 use lads_host::Aligned;
 use pulp::{Arch, Simd, WithSimd};
 
-/// Memory of some size, where an image would lie too, and the machine's vectors.
+/// Memory to sweep over, where an image would lie too, and the machine's vectors.
 #[derive(Debug)]
 pub struct Sweep {
     words: Aligned,
     arch: Arch,
 }
 
-/// Vectors that are summed side by side: enough for the latency of an addition not to show.
+/// Number of vectors that are summed side by side: enough for the latency of an addition not to show.
 const CHAINS: usize = 8;
 
 struct Sum<'w>(&'w [f32]);
@@ -45,7 +45,7 @@ impl WithSimd for Sum<'_> {
 }
 
 impl Sweep {
-    /// Memory of `bytes`, rounded down to whole words.
+    /// Allocates memory of `bytes`, rounded down to whole words.
     pub fn new(bytes: usize) -> Self {
         Self {
             words: Aligned::new(bytemuck::cast_slice(&vec![
@@ -56,12 +56,12 @@ impl Sweep {
         }
     }
 
-    /// Bytes that one sweep reads.
+    /// Number of bytes that one sweep reads.
     pub fn bytes(&self) -> usize {
         self.words.as_bytes().len()
     }
 
-    /// Reads all of it; the sum of its words.
+    /// Reads all of the memory; returns the sum of its words.
     pub fn read(&self) -> f32 {
         self.arch
             .dispatch(Sum(bytemuck::cast_slice(self.words.as_bytes())))

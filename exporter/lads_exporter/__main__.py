@@ -1,4 +1,4 @@
-"""Demonstrations to a LADS policy to one ONNX file."""
+"""Command line: demonstrations to a policy to one ONNX file."""
 
 import argparse
 import hashlib
@@ -69,7 +69,7 @@ def _train(arguments):
 
 
 def _check_card(arguments, more):
-    """Refuses a bundle or card in the place of something that the card is made from."""
+    """Refuses a bundle or card at the path of something that the card is made from."""
     path = Path(arguments.output)
     results = [pair.rpartition("=")[2] for pair in arguments.beside]
     read = [arguments.results, *results, path.with_suffix(".notes.md")]

@@ -1,4 +1,4 @@
-"""Which free sentences a policy follows: how like a known instruction a sentence must be, calibrated on sentences that people wrote.
+"""Calibrates which free sentences a policy follows: how like a known instruction a sentence must be, on sentences that people wrote.
 
 The measure is `alignment`, the one of the runtime (runtime/core/src/similarity.rs): every word of the sentence is held against the word of the
 known instruction that is most like it, by the cosine, and the mean over the words counts; the end mark is left out. The table of sentences has
@@ -36,21 +36,21 @@ class Sentence:
 
 
 def alignment(sentence, known):
-    """How like a known instruction a sentence is, from -1 to 1; both are words [n, E]."""
+    """Computes the similarity of a sentence to a known instruction, from -1 to 1; both are words [n, E]."""
     directions = lambda words: words / np.maximum(np.linalg.norm(words, axis=1, keepdims=True), np.finfo(np.float32).tiny)
     spoken = lambda words: directions(np.asarray(words[:-1] if len(words) > 1 else words, np.float64))
     return float((spoken(sentence) @ spoken(known).T).max(1).mean())
 
 
 def nearest(words, known):
-    """Index of the known instruction that a sentence is most like (the first of equal ones), and how much."""
+    """Finds the known instruction that a sentence is most like: its index (the first of equal ones), and the similarity."""
     alike = [alignment(words, other) for other in known]
     index = int(np.argmax(np.round(alike, 6)))  # the last bits of a sum are no reason to prefer one
     return index, alike[index]
 
 
 def read_sentences(path, setting):
-    """The table of sentences of a setting's environment."""
+    """Reads the table of sentences of a setting's environment."""
     try:
         table = json.loads(Path(path).read_text(encoding="utf-8"))
         rows = [Sentence(row["known"], row["kind"], row["text"]) for row in table["sentences"]]
@@ -73,7 +73,7 @@ def read_sentences(path, setting):
 
 
 def best_threshold(similarities, known):
-    """Where the shares accepted of known and other sentences differ most, to three digits; the largest such threshold.
+    """Finds where the shares accepted of known and other sentences differ most, to three digits; the largest such threshold.
 
     Candidates lie half-way between neighbouring similarities, so that rounding decides about none of the sentences.
     """
@@ -91,7 +91,7 @@ def _share(accepted):
 
 
 def _halves(rows):
-    """Alternately one half and the other, within each kind."""
+    """Puts sentences alternately into one half and the other, within each kind."""
     seen, halves = {}, []
     for row in rows:
         seen[row.known, row.kind] = seen.get((row.known, row.kind), -1) + 1
@@ -100,7 +100,7 @@ def _halves(rows):
 
 
 def _held_out(rows, similarities, known):
-    """The shares of sentences that had no part in their threshold: of each half at the other's."""
+    """Computes the shares of sentences that had no part in their threshold: of each half at the other's."""
     halves, accepted, thresholds = _halves(rows), np.zeros(len(rows), bool), []
     for half in (0, 1):
         own = halves == half
@@ -110,7 +110,7 @@ def _held_out(rows, similarities, known):
 
 
 def summary(rows, similarities):
-    """Threshold and shares from the similarities alone: whole, of halves that had no part in it, and by kind."""
+    """Computes threshold and shares from the similarities alone: whole, of halves that had no part in it, and by kind."""
     similarities, known = np.asarray(similarities, np.float64), np.array([row.known for row in rows])
     threshold = best_threshold(similarities, known)
     accepted = similarities >= threshold
@@ -131,7 +131,7 @@ def summary(rows, similarities):
 
 
 def _left_out(setting, words, threshold):
-    """How many of the known instructions would be accepted if the table had none of their text."""
+    """Counts the known instructions that would be accepted if the table had none of their text."""
     splits = {}
     for row, own in zip(setting.instructions, words):
         others = [other for known, other in zip(setting.instructions, words) if known["text"] != row["text"]]
@@ -140,7 +140,7 @@ def _left_out(setting, words, threshold):
 
 
 def calibrate(setting, rows):
-    """The calibration of a setting on a table of sentences, as plain data."""
+    """Calibrates a setting on a table of sentences, as plain data."""
     config = setting.config
     texts = [row["text"] for row in setting.instructions]
     encoded = language.encode(config.language, [*texts, *(row.text for row in rows)])
@@ -176,7 +176,7 @@ def _texts_sha256(texts):
 
 
 def write(calibrated, path):
-    """As JSON, one line a sentence."""
+    """Writes a calibration as JSON, one line a sentence."""
     last = {key: value for key, value in calibrated.items() if key != "sentences"}
     rows = ",\n".join("  " + json.dumps(row, ensure_ascii=False) for row in calibrated["sentences"])
     head = json.dumps(last, indent=1, ensure_ascii=False).removesuffix("\n}")
@@ -184,7 +184,7 @@ def write(calibrated, path):
 
 
 def read(path):
-    """A calibration that `calibrate` wrote."""
+    """Reads a calibration that `calibrate` wrote."""
     try:
         calibrated = json.loads(Path(path).read_text(encoding="utf-8"))
         known = (calibrated["format"], calibrated["format_version"]) == (FORMAT, FORMAT_VERSION)
@@ -197,7 +197,8 @@ def read(path):
 
 
 def add(contract, calibrated):
-    """A contract with the calibration's `language.acceptance`, as a new object; refused where the calibration is of another policy's language."""
+    """Adds a calibration to a contract as `language.acceptance`, in a new object; refused where the calibration is of another policy's
+    language."""
     made_for, own = calibrated["language"], contract["language"]
     own = {"pooling": "none", **own}
     for key in _LANGUAGE:
@@ -222,13 +223,13 @@ def into(model, calibrated):
 
 
 def beside(output):
-    """The calibration that lies beside a bundle; `None` where there is none."""
+    """Reads the calibration beside a bundle; `None` where there is none."""
     path = Path(output).with_suffix(SUFFIX)
     return read(path) if path.is_file() else None
 
 
 def lines(calibrated):
-    """What people read of a calibration, in the command's output and in the model card, as Markdown."""
+    """Describes a calibration for people, in the command's output and in the model card, as Markdown."""
     chosen, held_out = calibrated["acceptance"], calibrated["held_out"]
     share = lambda value: f"{100 * value:.0f} %"
     rows = calibrated["kinds"]

@@ -22,7 +22,7 @@ LEAST_MARGIN = 1e-3  # what the clearest one must have else
 
 
 def describe(family, environment, instructions, encoded, provenance, layer=-1, pooling="none", **parts):
-    """The JSON object `lads.contract` of any family; `parts` are further fields, those that are None are left out.
+    """Makes the JSON object `lads.contract` of any family; `parts` are further fields, those that are None are left out.
 
     instructions: rows {id, text, sub_tasks, split}, none for a policy without.
     """
@@ -50,7 +50,7 @@ def describe(family, environment, instructions, encoded, provenance, layer=-1, p
 
 
 def contract(setting, encoded, provenance, exported):
-    """The contract of a trained policy."""
+    """Makes the contract of a trained policy."""
     config, environment = setting.config, setting.environment
     high = config.high_level
     return describe(
@@ -68,7 +68,7 @@ def contract(setting, encoded, provenance, exported):
 
 
 def flat_keys(found):
-    """The comma-separated keys that Isaac Lab and mjlab exports carry, at full precision; none for what is no vector."""
+    """Makes the comma-separated keys that Isaac Lab and mjlab exports carry, at full precision; none for what is not a vector."""
     action = contracts.action(found)["elements"]
     column = lambda rows, key, other="": ",".join(str(row.get(key, other)) for row in rows)
     keys = {
@@ -86,13 +86,13 @@ def flat_keys(found):
 
 
 def golden_tensors(rollout, instruction, channels):
-    """The tensors of a golden episode: {`channel.<name>`: [T, ...]}, what the policy did, and of which instruction."""
+    """Makes the tensors of a golden episode: {`channel.<name>`: [T, ...]}, what the policy did, and of which instruction."""
     tensors = {f"channel.{name}": rows for name, rows in channels.items()} | rollout.tensors()
     return tensors if instruction is None else tensors | {"instruction": np.array([instruction], np.int64)}
 
 
 def golden(model, candidates):
-    """The first candidate whose decisions are clear, or the clearest one, as safetensors bytes. `model` has its contract in it.
+    """Records the first candidate whose decisions are clear, or the clearest one, as safetensors bytes. `model` has its contract in it.
 
     A candidate is an instruction's index, None for a policy without, and {name of a channel: [T, ...]}, or the array of the one
     observation. An episode longer than the context is cut; a close decision would make the self-test depend on rounding.
@@ -128,7 +128,7 @@ def seal(model, found, candidates):
 
 
 def assemble(networks, setting, encoded, provenance, candidates):
-    """The complete, checked bundle. `candidates` yields (instruction index, observations) for the golden episode."""
+    """Makes the complete, checked bundle. `candidates` yields (instruction index, observations) for the golden episode."""
     networks.eval()
     exported = systems.of(setting.config).export(networks, setting, encoded)
     return seal(exported.model, contract(setting, encoded, provenance, exported), candidates)

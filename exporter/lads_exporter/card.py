@@ -1,4 +1,4 @@
-"""The model card: what the bundle was made from and by, and what it reached."""
+"""Writes the model card: what the bundle was made from and by, and what it reached."""
 
 import csv
 import json
@@ -21,7 +21,7 @@ SYSTEMS = {
 
 
 def read_results(path):
-    """A results file of lads-run."""
+    """Reads a results file of lads-run."""
     try:
         results = json.loads(Path(path).read_text(encoding="utf-8"))
         for split in results["splits"].values():
@@ -37,7 +37,7 @@ def _number(value):
 
 
 def _row(label, split):
-    """One line of a results table; rates without episodes are null in the file and a dash here."""
+    """Formats one line of a results table; rates without episodes are null in the file and a dash here."""
     k = " ".join(_number(value) for value in split["k_rate"])
     low, high = split["full_success_interval"]
     full = f"{_number(split['full_success'])} ({_number(low)}-{_number(high)})"
@@ -73,7 +73,7 @@ def _results(results, sha256, beside):
 
 
 def _curves(folder):
-    """First and last row of each stage."""
+    """Formats the first and last row of each stage's curves."""
     with open(Path(folder) / CURVES, encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     columns = ("loss", "bc", "align", "ce", "perplexity", "val_bc", "val_ce", "val_accuracy")
@@ -86,14 +86,14 @@ def _curves(folder):
 
 
 def free_sentences(calibrated):
-    """The card's section on sentences outside the table."""
+    """Writes the card's section on sentences outside the table."""
     if calibrated is None:
         return ["", "## Free sentences", "", "Not calibrated: sentences outside the table are refused unless the caller insists."]
     return ["", "## Free sentences", "", *acceptance.lines(calibrated)]
 
 
 def _plans(summary):
-    """How the plans are used, where there are any."""
+    """Describes how the plans are used, where there are any."""
     if "codebook_size" in summary:
         share = summary["perplexity"] / summary["codebook_size"]
         return [f"- codebook: perplexity {summary['perplexity']:.1f} of {summary['codebook_size']} over the dataset ({share:.0%}), {summary['revived']} codes revived"]
@@ -103,7 +103,8 @@ def _plans(summary):
 
 
 def write(folder, saved, sha256, results=None, beside=(), notes="", calibrated=None):
-    """The card as Markdown. `folder` is the run's, `saved` its checkpoint, `notes` what a person has to say, `calibrated` which sentences it follows."""
+    """Writes the card as Markdown. `folder` is the run's, `saved` its checkpoint, `notes` what a person has to say, `calibrated` which
+    sentences it follows."""
     summary = json.loads((Path(folder) / SUMMARY).read_text(encoding="utf-8"))
     tables, environment, _ = saved["identity"]["tables"]
     steps = ", ".join(f"{name} {count} ({summary['seconds'][name]:.0f} s)" for name, count in summary["steps"].items())

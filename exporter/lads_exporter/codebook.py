@@ -11,12 +11,12 @@ from torch import nn
 
 
 def nearest(latents, codes):
-    """latents [N, D], codes [M, D] -> index [N] of the nearest code by squared distance."""
+    """Finds the nearest code by squared distance: latents [N, D], codes [M, D] -> index [N]."""
     return (latents[:, None] - codes[None]).square().sum(-1).argmin(-1)
 
 
 def kmeans(points, count, iterations=25):
-    """k-means with k-means++ seeding: points [N, D] -> centres [count, D], members [count]."""
+    """Runs k-means with k-means++ seeding: points [N, D] -> centres [count, D], members [count]."""
     centres = points[torch.randint(len(points), (1,))]
     for _ in range(count - 1):
         distance = torch.cdist(points, centres).min(1).values.square() + 1e-8
@@ -30,7 +30,7 @@ def kmeans(points, count, iterations=25):
 
 
 class Codebook(nn.Module):
-    """M codes of D elements. Until `start` was called, latents pass through unquantised."""
+    """Codebook of M codes of D elements. Until `start` was called, latents pass through unquantised."""
 
     def __init__(self, config):
         super().__init__()
@@ -68,7 +68,7 @@ class Codebook(nn.Module):
             self.revived += int(dead.sum())
 
     def forward(self, latents):
-        """latents [N, D] -> plans [N, D] (straight-through), index [N], commitment loss (beta included)."""
+        """Quantises latents [N, D] -> plans [N, D] (straight-through), index [N], commitment loss (beta included)."""
         if not self.started:
             return latents, torch.zeros(len(latents), dtype=torch.long, device=latents.device), latents.new_zeros(())
         index = nearest(latents.detach(), self.codes)
@@ -79,7 +79,7 @@ class Codebook(nn.Module):
 
 
 def perplexity(index, size):
-    """exp of the entropy of the use of the codes: `size` when all are used alike, 1 when one dominates."""
+    """Computes exp of the entropy of the use of the codes: `size` when all are used alike, 1 when one dominates."""
     share = torch.bincount(index.flatten(), minlength=size).double()
     share = share / share.sum()
     return float(torch.exp(-(share * share.clamp(min=1e-12).log()).sum()))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 class UserError(Exception):
-    """Something the user can put right; ends the command with this one line and exit code 2."""
+    """An error that the user can put right; ends the command with this one line and exit code 2."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,8 @@ class Config:
 
     @property
     def period(self):
-        """Control steps from one plan to the next: a chunk of H states has H - 1 actions, and what has no plan or one at each step has 1."""
+        """Number of control steps from one plan to the next: a chunk of H states has H - 1 actions, and what has no plan or one at each
+        step has 1."""
         return {"skilldiffuser": self.encoder.horizon - 1, "lcsd": 1, "lang_dt": 1}.get(self.system.kind, self.encoder.horizon)
 
 
@@ -226,7 +227,7 @@ def _build(kind, table, where):
 
 
 def find(path):
-    """The file itself, or the one of that name beside the package (so `configs/kitchen.toml` works anywhere)."""
+    """Finds a file by its path, or the one of that name beside the package (so `configs/kitchen.toml` works anywhere)."""
     path = Path(path)
     beside = Path(__file__).resolve().parent.parent / path
     for candidate in (path, beside):
@@ -243,7 +244,7 @@ def _parse(path, parser):
 
 
 def read_toml(path):
-    """A TOML file as a table."""
+    """Reads a TOML file as a table."""
     return _parse(find(path), tomllib.loads)
 
 
@@ -284,7 +285,7 @@ def from_tables(table, environment, instructions, where):
     steps, period = config.high_level.context_steps, config.period
     if period < 1 or steps < 1 or steps % period:
         raise UserError(
-            f"{where}: high_level.context_steps = {steps} is no multiple of the plan period of {period}"
+            f"{where}: high_level.context_steps = {steps} is not a multiple of the plan period of {period}"
             f" (encoder.horizon = {config.encoder.horizon}): where the context starts anew,"
             " a plan would begin off the grid that the policy was trained on"
         )
@@ -301,12 +302,12 @@ def from_tables(table, environment, instructions, where):
     known = {row["id"] for row in rows}
     for name in config.data.weights:
         if name not in known:
-            raise UserError(f"data.weights names {name!r}, which is no instruction id of {config.instructions}")
+            raise UserError(f"data.weights names {name!r}, which is not an instruction id of {config.instructions}")
     return Setting(config, environment, rows, [table, environment, instructions])
 
 
 def layered(table, over):
-    """A table with the values of another in the place of its own; tables within it are layered, [system] is replaced."""
+    """Layers a table over another: its values replace the other's; tables within it are layered, [system] is replaced."""
     both = {key: layered(table[key], value) for key, value in over.items() if key != "system" and isinstance(value, dict) and isinstance(table.get(key), dict)}
     return table | over | both
 

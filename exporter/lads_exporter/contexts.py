@@ -1,4 +1,4 @@
-"""What the transformers over whole histories are trained on: words as they are heard, and trajectories cut where the controller restarts.
+"""Training inputs of the transformers over whole histories: word embeddings, and trajectories cut where the controller restarts.
 
 A *mark* stands at every control step of an episode: at least 0 where there is something to learn and -1 where there is not. Systems
 give what they like as marks (codes, or places of targets) and get them back in the rows of the cut contexts.
@@ -18,7 +18,8 @@ class Contexts:
         self.endings = Endings(setting, corpus.device)
 
     def take(self, episodes, marks, training):
-        """marks [B, T] -> words (R tensors), marks [R, T'], observations [R, T', O], executed [R, T', A]; R contexts of at most `context_steps`."""
+        """Cuts the episodes: marks [B, T] -> words (R tensors), marks [R, T'], observations [R, T', O], executed [R, T', A]; R contexts of
+        at most `context_steps`."""
         corpus = self.corpus
         length = int(corpus.lengths[episodes].max())
         at = episodes.to(corpus.device)
@@ -27,7 +28,8 @@ class Contexts:
         return self._cut(words, marks, observations, executed)
 
     def places(self, episodes, rows=None):
-        """Marks that name each step: row * T + step, [B, T]; -1 beyond an episode's end. A row is the episode itself, or what `rows` says."""
+        """Makes marks that name each step: row * T + step, [B, T]; -1 beyond an episode's end. A row is the episode itself, or what `rows`
+        says."""
         steps = torch.arange(self.corpus.steps)
         named = (episodes if rows is None else rows)[:, None] * self.corpus.steps + steps
         return torch.where(steps < self.corpus.lengths[episodes][:, None], named, -1).to(self.corpus.device)
@@ -46,7 +48,7 @@ class Contexts:
         return words, marks[kept], observations[kept], executed[kept]
 
     def instructions(self, episodes, marks, training):
-        """The words of each episode's instruction and its marks; in training, some with another ending."""
+        """Returns the words of each episode's instruction and its marks; in training, some with another ending."""
         words = [self.corpus.words[i] for i in self.corpus.instruction[episodes]]
         if not training:
             return words, marks
@@ -61,7 +63,7 @@ class Contexts:
         return [self.some_words(row) for row in words], marks
 
     def some_words(self, words):
-        """The words, disturbed, less a random few; the last token ([SEP]) always stays."""
+        """Disturbs the words and leaves out a random few; the last token ([SEP]) always stays."""
         rate, noise = self.config.data.word_dropout, self.config.data.word_noise
         if noise > 0:
             words = words + noise * words.square().mean().sqrt() * torch.randn_like(words)

@@ -46,13 +46,13 @@ def array(name, role, shape, dtype="f32", **more):
 
 
 def element(row):
-    """What a contract keeps of a row of an environment file."""
+    """Takes what a contract keeps from a row of an environment file."""
     keep = ("name", "unit", "min", "max", "joint", "interface", "scale", "offset", "physical_unit")
     return {key: row[key] for key in keep if key in row}
 
 
 def channels(environment, words=None, noise=None, segment=None):
-    """The channels of a policy on one observation vector.
+    """Lists the channels of a policy on one observation vector.
 
     words: [L, E] of an instruction; noise: the shape of one draw; segment: the steps that a trajectory encoder reads.
     """
@@ -70,15 +70,15 @@ def channels(environment, words=None, noise=None, segment=None):
 
 
 def properties(model):
-    """The metadata of an ONNX model."""
+    """Returns the metadata of an ONNX model."""
     return {row.key: row.value for row in model.metadata_props}
 
 
 def of(model, path="the model"):
-    """The checked contract of an ONNX model; `path` is what a refusal calls it."""
+    """Returns the checked contract of an ONNX model; `path` is its name in errors."""
     text = properties(model).get(KEY)
     if text is None:
-        raise UserError(f"{path}: no contract in its metadata; it is no bundle of this exporter")
+        raise UserError(f"{path}: no contract in its metadata; it is not a bundle of this exporter")
     try:
         found = json.loads(text)
         version = found["version"]
@@ -91,17 +91,17 @@ def of(model, path="the model"):
 
 
 def of_role(contract, role):
-    """All channels of a role, in order."""
+    """Returns all channels of a role, in order."""
     return [row for row in contract["channels"] if row["role"] == role]
 
 
 def action(contract):
-    """The action channel."""
+    """Returns the action channel."""
     return of_role(contract, "action")[0]
 
 
 def observation(contract):
-    """The only observation channel of a policy that has one vector."""
+    """Returns the only observation channel of a policy that has one vector."""
     found = of_role(contract, "observation")
     if len(found) != 1 or "elements" not in found[0]:
         raise UserError(f"the policy observes {', '.join(row['name'] for row in found)}, not one vector")
@@ -109,29 +109,29 @@ def observation(contract):
 
 
 def limits(channel):
-    """The limits of a channel -> low, high: a number for each element of a vector, or one for all."""
+    """Returns the limits of a channel -> low, high: a number for each element of a vector, or one for all."""
     rows = channel.get("elements") or [channel]
     return tuple([row[key] for row in rows] for key in ("min", "max"))
 
 
 def words(contract):
-    """The shape [L, E] of an instruction, or None where the policy has no instructions."""
+    """Returns the shape [L, E] of an instruction, or None where the policy has no instructions."""
     found = of_role(contract, "instruction")
     return found[0]["shape"] if found else None
 
 
 def period(contract):
-    """Control steps from one plan to the next; 1 where a plan is made at every step or there are none."""
+    """Returns the control steps from one plan to the next; 1 where a plan is made at every step or there are none."""
     return contract["family"].get("horizon", 1)
 
 
 def rule(contract):
-    """How a plan is decided: `argmax`, `sample`, `mean`, or None where none is."""
+    """Returns the rule that decides a plan: `argmax`, `sample`, `mean`, or None where none is decided."""
     return contract["family"].get("decision", {}).get("rule")
 
 
 def splits(contract):
-    """What an evaluation asks of each instruction: {id, text, sub_tasks, split}."""
+    """Lists what an evaluation asks of each instruction: {id, text, sub_tasks, split}."""
     rows = contract.get("evaluation", {}).get("instructions", [])
     return [{**known, **asked} for known, asked in zip(contract.get("instructions", []), rows, strict=True)]
 
@@ -158,7 +158,7 @@ def _distinct(rows, key, field, where):
 
 def _range(row, field, where):
     low, high = row.get("min"), row.get("max")
-    _need(_number(low) and _number(high) and low < high, where, f"`{field}` has limits {low} to {high}, which is no range")
+    _need(_number(low) and _number(high) and low < high, where, f"`{field}` has limits {low} to {high}, which is not a range")
 
 
 def _channel(row, where):
@@ -209,7 +209,7 @@ def _family(found, where):
         if key in FAMILIES[kind]:
             given = family[key].get("rule")
             _need(given in rules[key], where, f"`family.{key}.rule` is {given!r}; known: {', '.join(rules[key])}")
-            _need(type(family[key].get("seed")) is int, where, f"`family.{key}.seed` is no whole number")
+            _need(type(family[key].get("seed")) is int, where, f"`family.{key}.seed` is not a whole number")
 
 
 def _states(found, where):
@@ -221,7 +221,7 @@ def _states(found, where):
         if row.get("kind") == "ring":
             _positive(row, ["rows"], where)
             sources = [one["name"] for one in of_role(found, "observation")]
-            _need(row.get("source") in (None, *sources), where, f"`{field}.source` {row.get('source')!r} is no observation channel")
+            _need(row.get("source") in (None, *sources), where, f"`{field}.source` {row.get('source')!r} is not an observation channel")
             _need(row.get("fill") in ("first", "zero"), where, f"`{field}.fill` is {row.get('fill')!r}; known: first, zero")
         else:
             _need(row.get("kind") == "plain", where, f"`{field}.kind` is {row.get('kind')!r}; known: plain, ring")

@@ -1,4 +1,4 @@
-"""A dataset as padded tensors on one device, with the samplers that training draws from.
+"""Loads a dataset as padded tensors on one device, with the samplers that training draws from.
 
 Shapes: E episodes, T the longest episode plus H (so that every window of H steps can be sliced).
 Observations are normalised with the statistics of the training episodes.
@@ -16,7 +16,7 @@ POOL = 8  # batches of similar length are cut from a pool of this many
 
 @dataclass(frozen=True)
 class Segments:
-    """N windows of H steps; `valid` [N, H] is False beyond a trajectory's end."""
+    """Windows of H steps, N of them; `valid` [N, H] is False beyond a trajectory's end."""
 
     observations: torch.Tensor  # [N, H, O]
     actions: torch.Tensor  # [N, H, A] the labels
@@ -35,7 +35,7 @@ class Segments:
 
 class Corpus:
     def __init__(self, dataset, setting, encoded, device):
-        """`encoded`: the instructions that the dataset's episodes point to."""
+        """Loads a dataset; `encoded` are the instructions that its episodes point to."""
         config = setting.config
         self.horizon, self.device = config.encoder.horizon, device
         count = len(dataset)
@@ -79,20 +79,20 @@ class Corpus:
         return out.to(self.device)
 
     def shown(self, episodes, steps):
-        """Normalised observations at (episode, step): as recorded, or the clean state with fresh noise."""
+        """Returns normalised observations at (episode, step): as recorded, or the clean state with fresh noise."""
         if self.states is None:
             return self.observations[episodes, steps]
         states = self.states[episodes, steps]
         return states + self.noise * (2 * torch.rand_like(states) - 1)
 
     def draw(self, batch, generator):
-        """`batch` training episodes by weight."""
+        """Draws `batch` training episodes by weight."""
         weights = self.weights[self.train]
         chosen = torch.multinomial(weights, batch, replacement=batch > len(weights), generator=generator)
         return self.train[chosen]
 
     def draw_alike(self, batch, step, generator_of):
-        """As `draw`, but of similar length: one of the batches of a pool sorted by length, each used once."""
+        """Draws `batch` training episodes by weight, of similar length: one of the batches of a pool sorted by length, each used once."""
         pool = self.draw_pool(batch, generator_of(step // POOL))
         order = torch.randperm(POOL, generator=generator_of(-1 - step // POOL))
         return pool[order[step % POOL]]
@@ -102,7 +102,8 @@ class Corpus:
         return drawn[self.lengths[drawn].argsort(stable=True)].view(POOL, batch)
 
     def draw_transitions(self, batch, generator):
-        """`batch` single steps of the training episodes by weight: episode, step, and the start of a window of H steps that it lies in."""
+        """Draws `batch` single steps of the training episodes by weight: episode, step, and the start of a window of H steps that it lies
+        in."""
         points = torch.rand(batch, generator=generator, dtype=torch.double) * self.cumulative[-1]
         drawn = torch.searchsorted(self.cumulative, points).clamp(max=len(self.transition_steps) - 1)
         episodes, steps = self.transition_episodes[drawn], self.transition_steps[drawn]
@@ -128,14 +129,14 @@ class Corpus:
         return Segments(*tensors, lengths, rows.to(self.device), steps[:, 0], places.to(self.device), self.shown(*at))
 
     def every_window(self, episodes):
-        """The windows that start at each step of the episodes, one episode after the other."""
+        """Yields the windows that start at each step of the episodes, one episode after the other."""
         lengths = self.lengths[episodes]
         rows = torch.arange(len(episodes)).repeat_interleave(lengths)
         starts = torch.cat([torch.arange(length) for length in lengths.tolist()])
         return self._windows(episodes[rows], starts, rows, starts)
 
     def codes(self, encode, episodes):
-        """The code of the window that starts at each step of the episodes, [B, T], -1 beyond an episode's end."""
+        """Computes the code of the window that starts at each step of the episodes, [B, T], -1 beyond an episode's end."""
         return self.of_windows(encode, episodes, torch.full((len(episodes), self.steps), -1, dtype=torch.long))
 
     @torch.no_grad()

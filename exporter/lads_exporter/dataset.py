@@ -1,4 +1,4 @@
-"""Demonstrations from a file: the project's safetensors layout, or D4RL's kitchen HDF5.
+"""Reads demonstrations from a file: the project's safetensors layout, or D4RL's kitchen HDF5.
 
 A `Dataset` holds whole episodes of seen instructions only; an episode labelled with an unseen
 instruction is refused (safetensors) or left out and counted (D4RL), so the split stays what it says.
@@ -21,7 +21,7 @@ _WIDTHS = {"observations": "O", "actions": "A", "executed": "A", "states": "O"}
 
 @dataclass(frozen=True)
 class Dataset:
-    """Rows of all episodes one after the other; episode e is rows offsets[e] to offsets[e + 1]."""
+    """Demonstrations as rows of all episodes one after the other; episode e is rows offsets[e] to offsets[e + 1]."""
 
     observations: np.ndarray  # [T, O] as the policy sees them
     states: np.ndarray | None  # [T, O] without observation noise, where the file has them
@@ -64,7 +64,7 @@ def sha256(path):
 
 
 def _check(dataset, path, setting):
-    """What every reader must have established: shapes, finite values, a usable split."""
+    """Checks what every reader must have established: shapes, finite values, a usable split."""
     sizes = {"O": setting.observation_len, "A": setting.action_len}
     total = int(dataset.offsets[-1])
     for name, width in _WIDTHS.items():
@@ -90,7 +90,7 @@ def _check(dataset, path, setting):
 
 
 def _longest(setting):
-    """What bounds the length of an episode: {key of the configuration: control steps}."""
+    """Returns what bounds the length of an episode: {key of the configuration: control steps}."""
     config = setting.config
     longest = {"alignment.segments": config.alignment.segments * config.encoder.horizon}
     if config.beyond_context == "refuse":
@@ -141,7 +141,7 @@ def _read_safetensors(path, setting):
 
 
 def _completed(states, sub_tasks, radius):
-    """The names of the sub-tasks whose goal the states [T, O] come within `radius` of, in order of completion."""
+    """Lists the names of the sub-tasks whose goal the states [T, O] come within `radius` of, in order of completion."""
     first = {}
     for task in sub_tasks:
         distance = np.linalg.norm(states[:, task["indices"]] - np.array(task["goal"]), axis=1)
@@ -152,7 +152,7 @@ def _completed(states, sub_tasks, radius):
 
 
 def _read_d4rl(path, setting):
-    """D4RL kitchen: rows of 30 observations (and 30 goals, dropped); an episode ends at a terminal or a time-out.
+    """Reads D4RL's kitchen: rows of 30 observations (and 30 goals, dropped); an episode ends at a terminal or a time-out.
 
     Each episode is labelled with the seen instruction that names just the sub-tasks completed in it.
     """

@@ -1,4 +1,4 @@
-"""Other endings for instructions: what is asked for later cannot matter yet.
+"""Makes other endings for instructions: what is asked for later cannot matter yet.
 
 An instruction names its sub-tasks in the order in which they are done, joined by " and ". While the first
 phrases are carried out the later ones may be any others: the plan does not depend on them. So in training
@@ -18,7 +18,8 @@ JOIN = " and "
 
 
 def texts(instructions, variants, seed=0):
-    """Instructions -> {(index of a seen one among all, phrases kept): other texts with the same first phrases}."""
+    """Makes the texts of other endings: instructions -> {(index of a seen one among all, phrases kept): other texts with the same first
+    phrases}."""
     seen = {index: row["text"].split(JOIN) for index, row in enumerate(instructions) if row["split"] == "seen"}
     phrases = sorted({phrase for row in seen.values() for phrase in row})
     real = {row["text"] for row in instructions}
@@ -36,7 +37,7 @@ def texts(instructions, variants, seed=0):
 
 
 class Endings:
-    """The word embeddings of the other texts, drawn at random for a trajectory."""
+    """Word embeddings of instructions with other endings, drawn at random for a trajectory."""
 
     def __init__(self, setting, device):
         data = setting.config.data
@@ -49,7 +50,7 @@ class Endings:
         self.words = {key: [words[text] for text in group] for key, group in made.items()}
 
     def draw(self, instruction, length):
-        """Words of another ending and the number of first steps that count, or None: the real instruction."""
+        """Draws words of another ending and the number of first steps that count, or None for the real instruction."""
         kept = int(torch.randint(1, max(2, self.phrases[instruction]), ()))
         group = self.words.get((instruction, kept))
         if group is None or torch.rand(()) >= self.rate:

@@ -1,4 +1,4 @@
-"""A long made-up episode of a bundle and what its twin did, as a file that a test of another runtime replays.
+"""Records a long made-up episode of a bundle and what its twin did, as a file that a test of another runtime replays.
 
 One safetensors file, T control steps; every tensor is of T rows:
 
@@ -33,7 +33,7 @@ TRIES = 60
 
 
 def events(contract, steps):
-    """[T]: two instructions by turns, and resets."""
+    """Makes the events [T] of an episode: two instructions by turns, and resets."""
     found = np.full(steps, NOTHING, np.int64)
     turns = (0, int(0.33 * steps), int(0.64 * steps), int(0.93 * steps))
     known = len(contract.get("instructions", []))
@@ -56,7 +56,7 @@ def play(model, channels, happens, noise=None):
 
 
 def tensors(model, steps, seed):
-    """-> the tensors of an episode whose selections are all clear, its smallest margin."""
+    """Makes the tensors of an episode whose selections are all clear -> tensors, its smallest margin."""
     contract = contracts.of(model)
     happens = events(contract, steps)
     best = 0.0

@@ -68,11 +68,11 @@ class Entry:
         return self.graph.constant(f"constants/{name}", np.float32(value))
 
     def gemm(self, x, weight, bias, out):
-        """x [m, k] times weight [n, k] (as PyTorch stores it) transposed, plus bias."""
+        """Multiplies x [m, k] by weight [n, k] (as PyTorch stores it) transposed, plus bias."""
         return self.op("Gemm", [x, weight, bias], out, transB=1)
 
     def linear(self, x, name, module, out):
-        """y = xW + b for x of any rank; the weight is stored [k, n]."""
+        """Computes y = xW + b for x of any rank; the weight is stored [k, n]."""
         product = self.op("MatMul", [x, self.weight(name + ".weight", module.weight.T)], out + ".product")
         return self.op("Add", [product, self.weight(name + ".bias", module.bias)], out)
 
@@ -81,7 +81,7 @@ class Entry:
         return self.op("LayerNormalization", [x, scale, bias], out, axis=-1, epsilon=LAYER_NORM_EPSILON)
 
     def centred(self, observation, normalizer, out):
-        """observation - mean; the division by std is folded into the weights that follow."""
+        """Subtracts the mean from the observation; the division by std is folded into the weights that follow."""
         return self.op("Sub", [observation, self.weight("observation_mean", normalizer.mean)], out)
 
 
@@ -95,7 +95,7 @@ def double(tensor):
 
 
 def fold_std(weight, normalizer):
-    """weight [n, O + rest] on normalised observations -> the same map on centred ones."""
+    """Folds the standard deviation into weights: weight [n, O + rest] on normalised observations -> the same map on centred ones."""
     folded = double(weight)
     observations = len(normalizer.std)
     folded[:, :observations] /= double(normalizer.std)
@@ -103,7 +103,7 @@ def fold_std(weight, normalizer):
 
 
 def instruction_lookup(graph, words, lengths):
-    """words [I, L, E] zero padded, lengths [I]."""
+    """Adds the instruction table: words [I, L, E] zero padded, lengths [I]."""
     entry = Entry(graph, "instruction/lookup")
     index = entry.input("id", [1], TensorProto.INT64)
     entry.op("Gather", [entry.weight("instruction.words", words), index], "words", axis=0)
@@ -113,7 +113,7 @@ def instruction_lookup(graph, words, lengths):
 
 
 class Transformer:
-    """A level's transformer over `new` tokens, with or without a cache of past keys and values."""
+    """Nodes of a level's transformer over `new` tokens, with or without a cache of past keys and values."""
 
     def __init__(self, entry, policy, new, cached, level="high_level"):
         self.entry, self.policy, self.new, self.cached, self.level = entry, policy, new, cached, level
@@ -148,7 +148,7 @@ class Transformer:
         return entry.op("Add", [x, down], name + ".sum")
 
     def run(self, x, record_only=False):
-        """All blocks over tokens [1, new, d] -> the last token's row [1, d] after the final norm, None when only recording."""
+        """Runs all blocks over tokens [1, new, d] -> the last token's row [1, d] after the final norm, None when only recording."""
         last = len(self.policy.blocks) - 1
         for number in range(last + 1):
             x = self.block(x, number, record_only=record_only and number == last)
@@ -159,7 +159,7 @@ class Transformer:
         return self.entry.layer_norm(x, f"{self.level}.norm", self.policy.norm, "state_normed")
 
     def _to_heads(self, rows, out, number):
-        """[1, new, hidden] -> [1, heads, new, head_dim]. Without a cache, new keys and values are the present ones."""
+        """Splits [1, new, hidden] into heads [1, heads, new, head_dim]. Without a cache, new keys and values are the present ones."""
         if not self.cached and not out.endswith("query"):
             out = f"present.{number}.{out.rsplit('.', 1)[1]}"
         split = self.entry.op("Reshape", [rows, self.split_heads], out + ".split")
@@ -182,7 +182,7 @@ class Transformer:
         return self.entry.op("Mul", [product, self.scale], out)
 
     def _attend(self, heads, present, number, name):
-        """Scores against the past and against the new keys apart: only the new block needs the causal mask."""
+        """Computes attention with separate scores against the past and against the new keys: only the new block needs the causal mask."""
         entry = self.entry
         scores = self._scores(heads["query"], heads["key"], name + ".scores_new")
         if self.new > 1:
@@ -198,7 +198,8 @@ class Transformer:
 
 
 def high_level_instruct(graph, policy, words_len):
-    """Keys and values of all word rows; causal, so rows beyond an instruction's length change none before them."""
+    """Adds `high_level/instruct`: keys and values of all word rows; causal, so rows beyond an instruction's length change none before
+    them."""
     entry = Entry(graph, "high_level/instruct")
     words = entry.input("words", [1, words_len, policy.embed_word.in_features])
     x = entry.linear(words, "high_level.embed_word", policy.embed_word, "word_tokens")
@@ -207,7 +208,8 @@ def high_level_instruct(graph, policy, words_len):
 
 
 def high_level_state(graph, policy, normalizer, first=False, previous=None):
-    """The nodes of `high_level/start` or `high_level/step` up to the state token -> the entry, its row [1, d], the observation's embedding.
+    """Adds the nodes of `high_level/start` or `high_level/step` up to the state token -> the entry, its row [1, d], the observation's
+    embedding.
 
     previous: the name of the input for the previous action; without it the history is of observations only.
     """
@@ -228,26 +230,26 @@ def high_level_state(graph, policy, normalizer, first=False, previous=None):
 
 
 def head(entry, x, module, out, name="high_level.head"):
-    """A linear output of a row [1, d]."""
+    """Adds a linear output of a row [1, d]."""
     entry.gemm(x, entry.weight(name + ".weight", module.weight), entry.weight(name + ".bias", module.bias), out)
     entry.output(out, [1, module.out_features])
 
 
 def high_level_step(graph, policy, normalizer, first, out="logits", previous="action"):
-    """`high_level/start` (first: the observation only) and `high_level/step` (previous action, then observation)."""
+    """Adds `high_level/start` (first: the observation only) and `high_level/step` (previous action, then observation)."""
     entry, x, _ = high_level_state(graph, policy, normalizer, first, previous)
     head(entry, x, policy.head, out)
 
 
 def observed_token(entry, observation, policy, normalizer, time, level="high_level"):
-    """The token of an observation in raw units."""
+    """Makes the token of an observation in raw units."""
     centred = entry.centred(observation, normalizer, "observation_centred")
     folded = fold_std(policy.embed_observation.weight, normalizer)
     return token(entry, centred, policy.embed_observation, time, "observation", folded, level)
 
 
 def token(entry, x, module, time, name, weight=None, level="high_level"):
-    """x [1, k] -> token [1, 1, d]: linear embedding plus the row `time` = (table, index)."""
+    """Makes a token: x [1, k] -> [1, 1, d], linear embedding plus the row `time` = (table, index)."""
     weight = entry.weight(f"{level}.embed_{name}.weight", module.weight if weight is None else weight)
     embedded = entry.gemm(x, weight, entry.weight(f"{level}.embed_{name}.bias", module.bias), name + "_embedded")
     row = entry.op("Gather", list(time), name + "_time", axis=0)
@@ -263,7 +265,7 @@ def codebook_lookup(graph, codes):
 
 
 def low_level_act(graph, policy, normalizer):
-    """The MLP with batch norm folded into the linear layer before it."""
+    """Adds the low level's MLP with batch norm folded into the linear layer before it."""
     entry = Entry(graph, "low_level/act")
     observations = len(normalizer.mean)
     observation = entry.input("observation", [1, observations])
@@ -287,7 +289,7 @@ def low_level_act(graph, policy, normalizer):
 
 
 def trajectory_encode(graph, encoder, codes, normalizer, horizon):
-    """A whole segment of H steps to its latent and, where there are codes, the index of the nearest one."""
+    """Adds the trajectory encoder: a whole segment of H steps to its latent and, where there are codes, the index of the nearest one."""
     entry = Entry(graph, "trajectory_encoder/encode")
     observation_len, hidden = len(normalizer.mean), encoder.lstm.hidden_size
     observations = entry.input("observations", [1, horizon, observation_len])
@@ -322,7 +324,7 @@ def trajectory_encode(graph, encoder, codes, normalizer, horizon):
 
 
 def nearest_code(entry, latent, codes):
-    """The index of the code nearest to a latent [1, D]."""
+    """Computes the index of the code nearest to a latent [1, D]."""
     offset = entry.op("Sub", [latent, entry.weight("codebook", codes)], "offset")
     square = entry.op("Mul", [offset, offset], "offset_squared")
     distance = entry.op("ReduceSum", [square, entry.integers("axis_one", [1])], "distance", keepdims=0)
@@ -331,7 +333,7 @@ def nearest_code(entry, latent, codes):
 
 
 def known_instructions(graph, policy, encoded):
-    """The table of instructions, and the entry that puts one into the high level's context."""
+    """Adds the table of instructions, and the entry that puts one into the high level's context."""
     words = np.zeros((len(encoded.instructions), encoded.max_words, encoded.dim), np.float32)
     for row, instruction in enumerate(encoded.instructions):
         words[row, : len(instruction.words)] = instruction.words
@@ -341,7 +343,7 @@ def known_instructions(graph, policy, encoded):
 
 
 def build(lads, encoded, horizon):
-    """All entries of one policy as one checked ONNX model, without metadata."""
+    """Builds all entries of one policy as one checked ONNX model, without metadata."""
     graph = Graph()
     codes = to_numpy(lads.codebook.codes)
     known_instructions(graph, lads.high_level, encoded)

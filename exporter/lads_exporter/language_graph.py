@@ -1,4 +1,4 @@
-"""The language encoder as files for hosts without Python, so that a policy can be told sentences outside its table.
+"""Exports the language encoder as files for hosts without Python, so that a policy can follow sentences outside its table.
 
 A folder of three files: `encoder.onnx` (input `encoder/ids` [n] int64, the tokens of one sentence; output `encoder/hidden`
 [layers + 1, n, E] float32, the embeddings and then every layer's output), `tokenizer.json`, and `manifest.json` with the sha256 of both and
@@ -28,7 +28,7 @@ CHECKED = ("shut the cupboard", "Move the white mug to the left, then turn the f
 
 
 def cache_folder():
-    """$LADS_CACHE, else lads in $XDG_CACHE_HOME or ~/.cache; `lads-run` looks in the same place."""
+    """Returns the encoder's cache folder: $LADS_CACHE, else lads in $XDG_CACHE_HOME or ~/.cache; `lads-run` looks in the same place."""
     own, shared = os.environ.get("LADS_CACHE"), os.environ.get("XDG_CACHE_HOME")
     return Path(own) if own else (Path(shared) if shared else Path.home() / ".cache") / "lads"
 
@@ -39,7 +39,7 @@ def default_folder(encoder):
 
 @dataclass(frozen=True)
 class _Block:
-    """The modules of one layer, whatever the model calls them."""
+    """Modules of one layer, by names that do not depend on the model."""
 
     query: object
     key: object
@@ -77,7 +77,7 @@ def _blocks(encoder, model):
 
 
 class _Network:
-    """BERT or DistilBERT node by node, for one sentence without padding."""
+    """Nodes of BERT or DistilBERT, for one sentence without padding."""
 
     def __init__(self, model, blocks):
         self.model, self.blocks = model, blocks
@@ -92,7 +92,7 @@ class _Network:
         return entry.op("LayerNormalization", [x, scale, bias], out, axis=-1, epsilon=module.eps)
 
     def embed(self):
-        """Words and positions (BERT: of the first sentence's type), normalised."""
+        """Embeds words and positions (BERT: of the first sentence's type), normalised."""
         entry, tables = self.entry, self.model.embeddings
         words = entry.op("Gather", [entry.weight("words", tables.word_embeddings.weight), self.ids], "words", axis=0)
         places = to_numpy(tables.position_embeddings.weight)
@@ -105,7 +105,7 @@ class _Network:
         return self.layer_norm(summed, "norm", tables.LayerNorm, "layer.0")
 
     def heads(self, x, name, module):
-        """[n, E] -> [heads, n, E / heads]."""
+        """Splits [n, E] into heads [heads, n, E / heads]."""
         entry = self.entry
         rows = entry.linear(x, name, module, name + ".rows")
         shape = entry.integers("split_heads", [0, self.heads_len, self.hidden // self.heads_len])
@@ -123,7 +123,7 @@ class _Network:
         return entry.linear(mixed, name + ".out", block.out, name + ".attended")
 
     def gelu(self, x, name):
-        """x/2 (1 + erf(x / sqrt 2))."""
+        """Computes GELU: x/2 (1 + erf(x / sqrt 2))."""
         entry, constant = self.entry, lambda key, value: self.graph.constant(f"constants/{key}", np.float32(value))
         part = entry.op("Erf", [entry.op("Mul", [x, constant("root_half", 0.5**0.5)], name + ".scaled")], name + ".erf")
         part = entry.op("Add", [part, constant("one", 1.0)], name + ".raised")
@@ -150,7 +150,7 @@ class _Network:
 
 
 def _compare(data, tokenizer, model):
-    """Largest difference from PyTorch over a few sentences of different scripts and lengths."""
+    """Computes the largest difference from PyTorch over a few sentences of different scripts and lengths."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
@@ -164,7 +164,7 @@ def _compare(data, tokenizer, model):
 
 
 def _tokenizer_json(tokenizer):
-    """The tokeniser alone: no padding, and no cutting, which would lose words without a message."""
+    """Returns the tokeniser alone: no padding, and no cutting, which would lose words without a message."""
     backend = tokenizer.backend_tokenizer
     backend.no_padding()
     backend.no_truncation()
@@ -186,7 +186,7 @@ def is_whole(folder, sha256=None):
 
 
 def _replace(folder, files):
-    """All files into a folder beside, which then takes the folder's place."""
+    """Writes all files into a folder beside, which then takes the folder's place."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as scratch:
         new, old = Path(scratch) / "new", Path(scratch) / "old"

@@ -37,7 +37,7 @@ SUB_TASKS = {
 
 
 class LorelTable:
-    """`lorel-table`, version 1; `reset` and `step` return the 15 positions."""
+    """The environment `lorel-table`, version 1; `reset` and `step` return the 15 positions."""
 
     ID, VERSION = "lorel-table", "1"
     SUB_TASKS = list(SUB_TASKS)
@@ -83,7 +83,7 @@ class LorelTable:
 
     @staticmethod
     def max_steps(split):
-        """Control steps of an episode of an instruction in this split."""
+        """Returns the control steps of an episode of an instruction in this split."""
         return 40 if split.startswith("composite") else 20
 
     def reset(self, entropy, commanded=()):
@@ -135,7 +135,7 @@ class LorelTable:
         return self.data.qpos.copy()
 
     def close(self):
-        """Nothing to close."""
+        """Does nothing: the environment holds nothing that must be closed."""
 
     def succeeded(self, commanded):
         """Whether all sub-tasks hold now, relative to the start."""

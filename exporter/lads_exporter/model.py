@@ -15,7 +15,7 @@ from .codebook import Codebook
 
 
 class Normalizer(nn.Module):
-    """(observation - mean) / std, with the statistics of the dataset."""
+    """Normalises observations as (observation - mean) / std, with the statistics of the dataset."""
 
     def __init__(self, observation_len):
         super().__init__()
@@ -42,7 +42,7 @@ class Dropout(nn.Module):
 
 
 def attend(q, k, v, mask, step=1):
-    """Masked attention: q [B, h, R, d], k and v [B, h, S, d], mask [B, 1, R, S] added to the scores.
+    """Computes masked attention: q [B, h, R, d], k and v [B, h, S, d], mask [B, 1, R, S] added to the scores.
 
     In two blocks of queries, each against the keys up to its last row: a quarter of the square is never computed,
     and in bfloat16 on a CPU this takes less than half the time of the fused operator. On a GPU too: there, trainings
@@ -62,7 +62,7 @@ def attend(q, k, v, mask, step=1):
 
 
 class Block(nn.Module):
-    """One pre-norm transformer block."""
+    """A pre-norm transformer block."""
 
     def __init__(self, hidden, heads, dropout):
         super().__init__()
@@ -76,7 +76,7 @@ class Block(nn.Module):
         self.drop = Dropout(dropout)
 
     def forward(self, x, mask, rows=slice(None)):
-        """x [B, S, d], mask [B, 1, S, S] -> the outputs of `rows` only, [B, R, d]."""
+        """Runs the block: x [B, S, d], mask [B, 1, S, S] -> the outputs of `rows` only, [B, R, d]."""
         batch, tokens, hidden = x.shape
         qkv = self.qkv(self.norm1(x)).view(batch, tokens, 3, self.heads, hidden // self.heads)
         q, k, v = (row.contiguous() for row in qkv.permute(2, 0, 3, 1, 4))
@@ -86,7 +86,7 @@ class Block(nn.Module):
 
 
 def start_weights(transformer):
-    """Weights of all linear layers and tables N(0, 0.02), biases 0."""
+    """Initialises weights of all linear layers and tables from N(0, 0.02), biases with 0."""
     for module in transformer.modules():
         if isinstance(module, (nn.Linear, nn.Embedding)):
             nn.init.normal_(module.weight, 0.0, 0.02)
@@ -95,7 +95,7 @@ def start_weights(transformer):
 
 
 class HighLevelPolicy(nn.Module):
-    """pi_h: a causal transformer over words, states and actions; plan logits at every state token (equation 8).
+    """High level pi_h: a causal transformer over words, states and actions; plan logits at every state token (equation 8).
 
     Without an `action_len` the history is of states only, as LISA's.
     """
@@ -115,7 +115,7 @@ class HighLevelPolicy(nn.Module):
         start_weights(self)
 
     def forward(self, words, observations, actions=None):
-        """words: B tensors [L_i, E]; observations [B, T, O]; actions [B, T, A], or None -> logits [B, T, M].
+        """Computes the plans' logits: words: B tensors [L_i, E]; observations [B, T, O]; actions [B, T, A], or None -> logits [B, T, M].
 
         Each sequence is its words, then s_0, a_0, s_1, a_1, ...; shorter instructions are padded at the front
         and the padding is masked, so that state tokens stand in the same rows throughout a batch. Shorter
@@ -139,7 +139,7 @@ class HighLevelPolicy(nn.Module):
 
     @staticmethod
     def _mask(padding, tokens, device):
-        """Added to the scores: large and negative for later tokens and for the padding before the words."""
+        """Makes the mask that is added to the scores: large and negative for later tokens and for the padding before the words."""
         column = torch.arange(tokens, device=device)
         hidden = column > column[:, None]
         if any(padding):
@@ -148,7 +148,7 @@ class HighLevelPolicy(nn.Module):
 
 
 class LowLevelPolicy(nn.Module):
-    """pi_l: an MLP from observation and plan to action; batch norm on all layers but the first and the last.
+    """Low level pi_l: an MLP from observation and plan to action; batch norm on all layers but the first and the last.
 
     For states the paper's linear observation encoder and the first layer are one linear map; they are one here.
     """
@@ -163,7 +163,7 @@ class LowLevelPolicy(nn.Module):
         self.last = nn.Linear(hidden, action_len)
 
     def forward(self, observations, plans):
-        """observations [N, O], plans [N, D] -> actions [N, A]."""
+        """Computes the actions: observations [N, O], plans [N, D] -> actions [N, A]."""
         x = F.leaky_relu(self.first(torch.cat([observations, plans], -1)), self.slope)
         for linear, norm in zip(self.middle, self.norms):
             x = F.leaky_relu(norm(linear(x)), self.slope)
@@ -171,7 +171,7 @@ class LowLevelPolicy(nn.Module):
 
 
 class TrajectoryEncoder(nn.Module):
-    """q: an LSTM over the encoded (s, a) of a segment, then a 3-layer MLP to the latent (before quantisation).
+    """Trajectory encoder q: an LSTM over the encoded (s, a) of a segment, then a 3-layer MLP to the latent (before quantisation).
 
     It may be shown the first `observed` elements of the observation only, for instance the robot's joints: then
     a plan says how the robot moves, whatever was done before. Or it may be shown the changes since the segment's first
@@ -190,7 +190,7 @@ class TrajectoryEncoder(nn.Module):
         )
 
     def input_weights(self):
-        """The two linear encoders multiplied into the LSTM's input weights: weight [4h, O+A], bias [4h]."""
+        """Multiplies the two linear encoders into the LSTM's input weights: weight [4h, O+A], bias [4h]."""
         on_observation, on_action = self.lstm.weight_ih_l0.chunk(2, 1)
         from_observation = on_observation @ (self.embed_observation.weight * self.shown)
         weight = torch.cat([from_observation, on_action @ self.embed_action.weight], 1)
@@ -198,7 +198,7 @@ class TrajectoryEncoder(nn.Module):
         return weight, bias
 
     def forward(self, observations, actions, lengths):
-        """observations [N, H, O], actions [N, H, A], lengths [N] (valid steps, at least 1) -> latents [N, D]."""
+        """Encodes segments: observations [N, H, O], actions [N, H, A], lengths [N] (valid steps, at least 1) -> latents [N, D]."""
         if self.relative:
             observations = observations - observations[:, :1]
         weight, bias = self.input_weights()
@@ -211,7 +211,7 @@ class TrajectoryEncoder(nn.Module):
 
 
 class Alignment(nn.Module):
-    """The projectors phi and psi and the contrastive loss of equations 10, 25 and 26."""
+    """Semantic alignment: the projectors phi and psi and the contrastive loss of equations 10, 25 and 26."""
 
     def __init__(self, config, plan_len, sentence_dim):
         super().__init__()
@@ -232,7 +232,7 @@ class Alignment(nn.Module):
         )
 
     def forward(self, plans, valid, sentences, instruction):
-        """plans [B, S, D], valid [B, S], sentences [B, E], instruction [B] -> loss.
+        """Computes the contrastive loss: plans [B, S, D], valid [B, S], sentences [B, E], instruction [B] -> loss.
 
         Trajectories with the same instruction are neither positive nor negative to each other.
         """
@@ -250,7 +250,7 @@ class Alignment(nn.Module):
         return F.cross_entropy(logits, itself) + F.cross_entropy(logits.T, itself)
 
     def some(self, valid):
-        """Leaves out a random share of each sequence's plans, so that every plan alone has to tell of the instruction."""
+        """Leaves out a random share of each sequence's plans, so that every plan alone has to identify the instruction."""
         draw = torch.rand(valid.shape, device=valid.device).masked_fill(~valid, -1.0)
         last = draw == draw.max(1, keepdim=True).values  # no sequence becomes empty
         return valid & ((draw >= self.segment_dropout) | last)
@@ -260,7 +260,7 @@ class Lads(nn.Module):
     """All networks of one policy. `forward` is not defined: the parts are trained and exported separately."""
 
     def __init__(self, setting, encoded, head=None):
-        """head: the high level's outputs, if they are no logits over the codes."""
+        """Makes the networks; `head` is the number of the high level's outputs, if they are not logits over the codes."""
         super().__init__()
         config, o, a = setting.config, setting.observation_len, setting.action_len
         encoder = config.encoder

@@ -1,4 +1,4 @@
-"""Standard normal random numbers with the bits of the runtime's: runtime/core/src/normal.rs in numpy.
+"""Draws standard normal random numbers with the same bits as the runtime: runtime/core/src/normal.rs in numpy.
 
 PCG64 gives 52 bits k, these the uniform number u = (2k + 1) / 2^53, and the inverse of the normal distribution function (Wichura's
 AS 241, PPND16) the result, rounded to float32. Every step is an operation of float64 that IEEE 754 rounds correctly, in the
@@ -35,7 +35,8 @@ FAR = (
 
 
 def ln(x):
-    """Natural logarithm of normal positive float64, within one unit in the last place: FreeBSD's e_log.c (Sun Microsystems)."""
+    """Computes the natural logarithm of normal positive float64, within one unit in the last place: FreeBSD's e_log.c (Sun
+    Microsystems)."""
     one, root_half = np.uint64(0x3FF << 52), np.uint64(0x3FE6A09E << 32)
     shifted = x.view(np.uint64) + (one - root_half)
     k = (shifted >> np.uint64(52)).astype(np.float64) - 1023
@@ -59,7 +60,7 @@ def _polynomial(x, coefficients):
 
 
 def quantile(u):
-    """The float64 below which a standard normal number lies with probability u [N], multiples of 2^-53 between 0 and 1."""
+    """Computes the float64 below which a standard normal number lies with probability u [N], multiples of 2^-53 between 0 and 1."""
     q = u - 0.5
     root = np.sqrt(-ln(np.where(q < 0.0, u, 1.0 - u)))
     sign = np.copysign(1.0, q)
@@ -76,7 +77,7 @@ def quantile(u):
 
 
 class Normals:
-    """The runtime's stream of a seed, 0 to 2^64 - 1, from its beginning."""
+    """Stream of the runtime's normals for a seed, 0 to 2^64 - 1, from its beginning."""
 
     def __init__(self, seed):
         # Not a number of numpy, whose arithmetic ends at 64 bits.
@@ -91,7 +92,7 @@ class Normals:
         }
 
     def draw(self, *shape):
-        """The stream's next numbers, float32 of this shape, the last index fastest."""
+        """Draws the stream's next numbers, float32 of this shape, the last index fastest."""
         digits = self._bits.random_raw(int(np.prod(shape, dtype=int))) >> np.uint64(12)
         # As digits of a number in [1, 2), of which 1 - 2^-53 is taken away; the difference is exact.
         u = (np.uint64(0x3FF << 52) | digits).view(np.float64) - (1.0 - 2.0**-53)

@@ -19,10 +19,10 @@ NOISE = {"none": (0.0, 0.0), "v0": (0.1, 0.1), "v1": (0.01, 0.0005)}
 
 
 class Noise:
-    """Stands in for the official environment's generator: hands out our stream's 30 numbers per observation.
+    """Replaces the official environment's generator: hands out our stream's 30 numbers per observation.
 
     The official environment draws four times per observation: robot positions, robot velocities, object positions, object velocities.
-    Ours draws the 30 positions at once; velocities are no part of our observation and get no noise. `object_scale` turns the amplitudes
+    Ours draws the 30 positions at once; velocities are not part of our observation and get no noise. `object_scale` turns the amplitudes
     that FrankaKitchen-v1 gives the objects into ours.
     """
 
@@ -57,7 +57,7 @@ def joint_qvel(model, data, name):
 
 
 def positions(observation):
-    """The 30 positions of the official 59 numbers."""
+    """Takes the 30 positions out of the official 59 numbers."""
     return np.concatenate([observation["observation"][:9], observation["observation"][18:39]])
 
 
@@ -102,7 +102,7 @@ class OfficialKitchen:
         }
 
     def max_steps(self, split):
-        """Control steps of an episode, the same in every split."""
+        """Returns the control steps of an episode, the same in every split."""
         return self.MAX_STEPS
 
     def reset(self, entropy, commanded=()):
@@ -113,7 +113,7 @@ class OfficialKitchen:
         return positions(observation)
 
     def step(self, action):
-        """-> observation [30]; `completions` maps a sub-task to the first step, from 1, after which it was done."""
+        """Executes an action -> observation [30]; `completions` maps a sub-task to the first step, from 1, after which it was done."""
         observation, _, _, _, info = self.official.step(action)
         self.steps += 1
         for task in sorted(info["step_task_completions"], key=SUB_TASKS.index):
@@ -125,7 +125,7 @@ class OfficialKitchen:
         return all(task in self.completions for task in commanded)
 
     def state(self):
-        """The noise-free quantities of the observation [30]."""
+        """Noise-free quantities of the observation [30]."""
         return self.official.data.qpos.copy()
 
     def close(self):

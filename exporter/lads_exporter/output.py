@@ -1,4 +1,4 @@
-"""Files that the exporter's commands write: whole or not at all, and never over what is read.
+"""Writes the files of the exporter's commands: whole or not at all, and never over what is read.
 
 A symbolic link is followed, so that what it leads to is replaced in its own folder; a device or a FIFO is written into.
 """
@@ -12,7 +12,7 @@ from .config import UserError
 
 
 def check_apart(inputs, outputs):
-    """Refuses an output that is an input or another output; devices may stand in more than one place."""
+    """Refuses an output that is an input or another output; devices may be named more than once."""
     taken = [(path, "is read") for path in inputs if path]
     for path in outputs:
         for other, what in taken:

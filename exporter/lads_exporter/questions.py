@@ -1,4 +1,4 @@
-"""What a reference records beside its rollouts, so that more than actions can be compared: contract, logits, encodings, noise.
+"""Adds to a reference what it records beside its rollouts, so that more than actions can be compared: contract, logits, encodings, noise.
 
 All of it is computed from the traces, whose observations and executed actions are asked again: the logits of every decision,
 the plan that the trajectory encoder sees in every whole segment, and what float noise on all weights does to the reference's own
@@ -34,7 +34,7 @@ def _numbers(text, kind, columns):
 
 
 def _traced(rows):
-    """(index of the instruction, episode) of every trace."""
+    """Yields (index of the instruction, episode) of every trace."""
     return [(index, row) for index, instruction in enumerate(rows) for row in instruction["episodes"] if "trace" in row]
 
 
@@ -51,7 +51,7 @@ def _ask(policy, index, episode):
 
 
 def _disturbed(acting, generator):
-    """The same networks, each weight off by noise."""
+    """Copies the networks, with noise on each weight."""
     other = copy.deepcopy(acting)
     for module in (other.normalizer, other.high_level, other.low_level):
         for value in module.state_dict().values():
@@ -62,13 +62,13 @@ def _disturbed(acting, generator):
 
 
 def _half_range(difference):
-    """The largest of differences once the constant is taken off that makes it smallest."""
+    """Computes the largest of differences once the constant is subtracted that makes it smallest."""
     return float(difference.max() - difference.min()) / 2
 
 
 @torch.no_grad()
 def float_noise(policy, rows):
-    """What noise on all weights does to a policy's answers -> the largest differences of an action and of a logit."""
+    """Measures the effect of noise on all weights on a policy's answers -> the largest differences of an action and of a logit."""
     generator = torch.Generator().manual_seed(0)
     largest = {"relative": NOISE, "action": 0.0, "logit": 0.0}
     answers = {id(episode): _ask(policy, index, episode) for index, episode in _traced(rows)}
@@ -91,7 +91,7 @@ def float_noise(policy, rows):
 
 
 class Encoder:
-    """The trajectory encoder of a bundle, out of its initializers, in PyTorch."""
+    """Trajectory encoder of a bundle in PyTorch, made from its initializers."""
 
     def __init__(self, model, acting):
         named = {row.name.removeprefix("weights/"): torch.from_numpy(numpy_helper.to_array(row).copy()) for row in model.graph.initializer}
@@ -109,7 +109,8 @@ class Encoder:
 
     @torch.no_grad()
     def plans(self, observations, actions):
-        """[n, H, O], [n, H, A] -> nearest code [n], and by how much farther the second is, relative to the nearest's squared distance."""
+        """Encodes segments [n, H, O], [n, H, A] -> nearest code [n], and by how much farther the second is, relative to the nearest's
+        squared distance."""
         observations, actions = torch.from_numpy(observations.copy()), torch.from_numpy(actions.copy())
         shown = observations - (observations[:, :1] if self.relative else self.mean)
         start = torch.zeros(1, len(shown), self.hidden)

@@ -1,4 +1,4 @@
-"""Policies with random weights, through the same code as trained ones: for tests of the compiler and the runtime."""
+"""Makes LADS policies with random weights, through the same code as trained ones: for tests of the compiler and the runtime."""
 
 import numpy as np
 import torch
@@ -8,7 +8,7 @@ from .model import Lads
 
 
 def draw_weights(module, generator):
-    """Weights of healthy size everywhere, so that every token and every term matters in the outputs."""
+    """Draws weights of healthy size everywhere, so that every token and every term matters in the outputs."""
     draw = lambda tensor: torch.randn(tensor.shape, generator=generator)
     with torch.no_grad():
         for name, value in module.named_parameters():
@@ -21,7 +21,7 @@ def draw_weights(module, generator):
 
 
 def place_normalizer(normalizer, rows):
-    """Statistics of observations that fill a good part of their limits."""
+    """Sets statistics of observations that fill a good part of their limits."""
     centre, half = _limits(*([row[key] for row in rows] for key in ("min", "max")))
     normalizer.mean.copy_(torch.from_numpy(centre + 0.1 * half))
     normalizer.std.copy_(torch.from_numpy(0.3 * half))
@@ -33,7 +33,7 @@ def _limits(low, high):
 
 
 def randomize(lads, setting, seed):
-    """Random weights for a LADS policy."""
+    """Sets random weights of a LADS policy."""
     generator = torch.Generator().manual_seed(seed)
     draw = lambda tensor: torch.randn(tensor.shape, generator=generator)
     draw_weights(lads, generator)
@@ -49,7 +49,7 @@ def randomize(lads, setting, seed):
 
 
 def wave(low, high, steps, seed):
-    """Smooth made-up values [steps, n] well inside the limits."""
+    """Makes smooth values [steps, n] well inside the limits."""
     centre, half = _limits(low, high)
     rng = np.random.default_rng(seed)
     phase, speed = rng.uniform(0, 2 * np.pi, len(centre)), rng.uniform(0.01, 0.2, len(centre))
@@ -58,13 +58,13 @@ def wave(low, high, steps, seed):
 
 
 def observations(setting, steps, seed):
-    """Smooth made-up observations [steps, O] well inside the limits."""
+    """Makes smooth observations [steps, O] well inside the limits."""
     rows = setting.environment["observation"]
     return wave(*([row[key] for row in rows] for key in ("min", "max")), steps, seed)
 
 
 def channels(contract, steps, seed):
-    """Made-up observations for every channel of a contract: {name: [steps, ...]}."""
+    """Makes observations for every channel of a contract: {name: [steps, ...]}."""
     found = {}
     for number, row in enumerate(contracts.of_role(contract, "observation")):
         low, high = contracts.limits(row)
@@ -82,7 +82,7 @@ def _size(row):
 
 
 def export(setting, encoded, seed, steps=None):
-    """A bundle with random weights and a golden episode of so many control steps, or over the whole context."""
+    """Makes a bundle with random weights and a golden episode of so many control steps, or over the whole context."""
     torch.manual_seed(seed)
     lads = Lads(setting, encoded)
     randomize(lads, setting, seed)

@@ -1,4 +1,4 @@
-"""Reference rollouts: the PyTorch policy in the official environment, for `lads-run verify` to compare with.
+"""Makes reference rollouts: the PyTorch policy in the official environment, for `lads-run verify` to compare with.
 
 What is independent of what is verified: the network runs as in training, in PyTorch, as a full-sequence forward over the
 whole history at every decision (no KV cache, no ONNX graph, no compiler, no Rust); the physics, the observations and the
@@ -36,7 +36,7 @@ PURPOSE_ROLES = ("observation", "action")
 
 
 def purpose_sha256(contract):
-    """Hash of what the contract says the policy is for: equal for two policies that can be compared.
+    """Hashes what the contract says the policy is for: equal for two policies that can be compared.
 
     Canonical form: `{key value ...}` with sorted keys, `[value ...]`, texts as `"bytes:UTF-8`, numbers as the 16 hexadecimal
     digits of their IEEE 754 double, `true`, `false` and `null`; no separators, so that nothing depends on how a number is
@@ -76,7 +76,7 @@ class FullSequencePolicy:
     """The policy as in training: at a decision the transformer reads the words and the whole history from its beginning."""
 
     def __init__(self, acting, contract, words):
-        """words: one tensor [L, E] per instruction."""
+        """Makes the policy; `words` is one tensor [L, E] per instruction."""
         self.acting, self.contract, self.words = acting, contract, words
         self.low, self.high = (torch.tensor(side, dtype=torch.float32) for side in contracts.limits(contracts.action(contract)))
 
@@ -88,7 +88,7 @@ class FullSequencePolicy:
 
     @torch.no_grad()
     def act(self, observation):
-        """observation [O] float32 -> action [A] float32, clipped to the contract's limits."""
+        """Acts on observation [O] float32 -> action [A] float32, clipped to the contract's limits."""
         if len(self.observations) == self.contract["context"]["steps"]:
             if self.contract["context"]["beyond"] != "restart":
                 raise config.UserError("an episode is longer than the policy's context, and its contract says to refuse")
@@ -116,7 +116,7 @@ class FullSequencePolicy:
 
 
 def episode(policy, environment, entropy, instruction, known, traced):
-    """One episode as a JSON object; it ends when the instruction is carried out or its split's steps are up."""
+    """Runs one episode -> a JSON object; it ends when the instruction is carried out or its split's steps are up."""
     policy.start(instruction)
     commanded, most = known["sub_tasks"], environment.max_steps(known["split"])
     observation = environment.reset(entropy, commanded)
@@ -149,7 +149,7 @@ def episode(policy, environment, entropy, instruction, known, traced):
 
 
 def _words(model, contract):
-    """One tensor [L, E] per instruction, where they come from, and the largest difference to the bundle's table."""
+    """Encodes the instructions -> one tensor [L, E] each, where they come from, and the largest difference to the bundle's table."""
     stored = {row.name: onnx.numpy_helper.to_array(row) for row in model.graph.initializer if "instruction." in row.name}
     table, lengths = stored["weights/instruction.words"], stored["constants/instruction.lengths"]
     rows = [torch.from_numpy(table[index, :length].copy()) for index, length in enumerate(lengths)]
@@ -187,7 +187,7 @@ def _acting(model, contract, run):
 
 
 class Progress:
-    """Finished episodes, one JSON line each under a heading that says of what, in a file beside the output."""
+    """File of finished episodes beside the output, one JSON line each under a heading that says of what."""
 
     def __init__(self, output, heading):
         self.path = Path(f"{output}.progress")
@@ -217,7 +217,7 @@ class Progress:
 
 
 def _text(head, instructions):
-    """JSON with one line per episode."""
+    """Formats JSON with one line per episode."""
     dump = lambda value: json.dumps(value, ensure_ascii=False)
     lines = ["{"]
     lines += [f" {dump(key)}: {dump(value)}," for key, value in head.items()]

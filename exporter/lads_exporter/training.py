@@ -1,4 +1,4 @@
-"""Training a system: a run is a folder with a checkpoint, the curves, and at the end a summary.
+"""Trains a system: a run is a folder with a checkpoint, the curves, and at the end a summary.
 
 Which stages there are and what each minimises is the system's (`systems`). Every step seeds the random numbers with (seed, stage, step): a
 resumed run does what an uninterrupted one would have done. An interrupt finishes the step at hand, writes a checkpoint and stops.
@@ -34,7 +34,8 @@ COLUMNS = ("stage", "step", "learning_rate", "ms_per_step", "loss", "bc", "commi
 
 @contextmanager
 def _matmul_precision(name):
-    """"medium" lets matrix products round their inputs to bfloat16 where that is faster; sums stay in float32."""
+    """Sets the precision of matrix products for a while: "medium" lets matrix products round their inputs to bfloat16 where that is faster;
+    sums stay in float32."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision(name)
     try:
@@ -44,7 +45,7 @@ def _matmul_precision(name):
 
 
 class Stage:
-    """One stage: the parameters that it trains, and their optimiser."""
+    """A stage of training: the parameters that it trains, and their optimiser."""
 
     def __init__(self, name, trainer):
         self.name, self.trainer, self.system = name, trainer, trainer.system
@@ -57,7 +58,7 @@ class Stage:
         self.system.begin(name)
 
     def learning_rate(self, step):
-        """Linear warm-up, then a cosine down to `final` of the rate."""
+        """Computes the learning rate: linear warm-up, then a cosine down to `final` of the rate."""
         s = self.settings
         cosine = 0.5 * (1 + math.cos(math.pi * step / s.steps))
         return s.learning_rate * min(1.0, (step + 1) / s.warmup) * (s.final + (1 - s.final) * cosine)
@@ -69,7 +70,7 @@ class Stage:
         return self.system.validate(self.name)
 
     def advance(self, step):
-        """One optimiser step; returns the parts of the loss as numbers."""
+        """Runs one optimiser step; returns the parts of the loss as numbers."""
         torch.manual_seed(self.trainer.seed_of(self.name, "step", step))
         self.trainer.networks.eval()
         for module in self.modules:
@@ -89,7 +90,7 @@ class Stage:
 
 
 class Trainer:
-    """A run: a folder with a checkpoint, the curves and at the end a summary."""
+    """A training run: a folder with a checkpoint, the curves and at the end a summary."""
 
     def __init__(self, setting, dataset, encoded, out, device, seed):
         self.setting, self.config, self.out, self.seed = setting, setting.config, Path(out), seed
@@ -241,7 +242,7 @@ class Trainer:
 
 
 def golden_candidates(dataset, episodes, setting, most=24):
-    """Held-out episodes one of which will be the bundle's golden episode: (instruction index, observations [T, O])."""
+    """Yields held-out episodes one of which will be the bundle's golden episode: (instruction index, observations [T, O])."""
     index = dataset.instruction
     if dataset.texts is not None:  # those whose label is an instruction of the bundle
         known = [row["text"] for row in setting.instructions]
@@ -256,7 +257,7 @@ def _short(validation):
 
 
 def _read(path, device="cpu"):
-    """A checkpoint's contents."""
+    """Reads a checkpoint's contents."""
     try:
         saved = torch.load(path, map_location=device, weights_only=True)
     except (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError) as error:
@@ -267,7 +268,7 @@ def _read(path, device="cpu"):
 
 
 def load_run(folder, *over):
-    """A finished run's checkpoint and its setting; `over` are files of a system's values to export it with."""
+    """Loads a finished run's checkpoint and its setting; `over` are files of a system's values to export it with."""
     path = Path(folder) / CHECKPOINT
     if not path.is_file():
         raise UserError(f"no run in {folder}: {path} does not exist; train one first (make train)")

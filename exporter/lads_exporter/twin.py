@@ -23,12 +23,12 @@ PREVIOUS = ("action", "previous_action")
 
 
 def entries(model):
-    """The names of all entries of a bundle, in the order of their outputs."""
+    """Lists the names of all entries of a bundle, in the order of their outputs."""
     return list(dict.fromkeys(value.name.rsplit("/", 1)[0] for value in model.graph.output))
 
 
 def extract(model, entry):
-    """One entry of a bundle as a model of its own."""
+    """Extracts one entry of a bundle as a model of its own."""
     names = lambda values: [value.name for value in values if value.name.startswith(entry + "/")]
     return Extractor(model).extract_model(names(model.graph.input), names(model.graph.output))
 
@@ -47,7 +47,7 @@ class Entry:
         self.inputs, self.outputs = local(self.session.get_inputs()), local(self.session.get_outputs())
 
     def __call__(self, **inputs):
-        """Local names to arrays -> local names to arrays."""
+        """Runs the entry: local names to arrays -> local names to arrays."""
         return self.run(inputs)
 
     def run(self, inputs):
@@ -56,7 +56,7 @@ class Entry:
 
 
 class Recorded:
-    """Noise that was drawn before: draws are handed out in their order."""
+    """Source of noise that was drawn before: draws are handed out in their order."""
 
     def __init__(self, draws):
         self.draws = np.asarray(draws, np.float32).ravel()
@@ -69,14 +69,14 @@ class Recorded:
 
 
 class Zero:
-    """No noise: the mean plan, or denoising without chance."""
+    """Source of zeros: the mean plan, or denoising without chance."""
 
     def draw(self, count):
         return np.zeros(count, np.float32)
 
 
 def noise_source(contract):
-    """What the contract says that noise comes from: seeded normals, or zeros. None for a policy without noise."""
+    """Makes the source of noise that the contract names: seeded normals, or zeros. None for a policy without noise."""
     if not contracts.of_role(contract, "noise"):
         return None
     family = contract["family"]
@@ -87,7 +87,7 @@ def noise_source(contract):
 
 
 class _State:
-    """A state's value, what clears it, and for a ring its valid rows, oldest first."""
+    """Value of a state, what clears it, and for a ring its valid rows, oldest first."""
 
     def __init__(self, shape, scope="episode", ring=0, fill="zero"):
         self.shape, self.scope, self.ring, self.fill = shape, scope, ring, fill
@@ -101,7 +101,7 @@ class _State:
         self.rows = [*self.rows, row.reshape(self.shape)][-self.ring :]
 
     def window(self):
-        """[ring, width], oldest first."""
+        """Returns the ring's window [ring, width], oldest first."""
         missing = self.ring - len(self.rows)
         pad = self.rows[0] if self.fill == "first" and self.rows else np.zeros(self.shape, np.float32)
         return np.stack([pad] * missing + self.rows)
@@ -111,7 +111,8 @@ class Twin:
     """A policy as its controller runs it: `set_instruction`, `reset`, `step`, and `executed` where another action was taken."""
 
     def __init__(self, model, noise=None):
-        """model: a bundle as ONNX; noise: an object whose `draw(n)` gives n float32 numbers, else the contract's own source."""
+        """Makes a twin; model: a bundle as ONNX; noise: an object whose `draw(n)` gives n float32 numbers, else the contract's own
+        source."""
         self.contract = contracts.of(model)
         self.family = self.contract["family"]
         self.entries = {name: Entry(model, name) for name in entries(model)}
@@ -127,7 +128,7 @@ class Twin:
         self._begin(("instruction", "episode"))
 
     def _states(self):
-        """States of the contract, and for families every name that an entry reads and none of the controller's own is."""
+        """Makes the states of the contract, and for families every name that an entry reads and none of the controller's own is."""
         found = {}
         for row in self.contract.get("states", []):
             scope = row.get("cleared_by", "episode")
@@ -146,7 +147,7 @@ class Twin:
         return found
 
     def set_instruction(self, instruction):
-        """instruction: an index of the contract's, or words [n, E]. A new episode begins."""
+        """Sets an instruction: an index of the contract's, or words [n, E]. A new episode begins."""
         if "instruction/lookup" not in self.entries:
             raise UserError("the policy has no instructions")
         if np.ndim(instruction) == 0:
@@ -162,7 +163,7 @@ class Twin:
         self._begin(("instruction", "episode"))
 
     def reset(self):
-        """A new episode under the same instruction. The stream of noise goes on."""
+        """Starts a new episode under the same instruction. The stream of noise goes on."""
         self._begin(("episode",))
 
     def _begin(self, scopes):
@@ -170,7 +171,7 @@ class Twin:
         self._restart(scopes)
 
     def _restart(self, scopes=("episode",)):
-        """The context begins anew: words stay, and so do the last action, the stream of noise and the selected index."""
+        """Restarts the context: words stay, and so do the last action, the stream of noise and the selected index."""
         self.timestep = 0
         self.caches = {"high_level": dict(self.words)}
         for state in self.states.values():
@@ -178,11 +179,12 @@ class Twin:
                 state.clear()
 
     def executed(self, action):
-        """Another action than the last step's was executed."""
+        """Sets the action that was really executed, where it was not the last step's."""
         self.previous = np.asarray(action, np.float32).reshape(self.previous.shape)
 
     def step(self, channels):
-        """channels: name -> array of the channel's shape, or the array itself where there is one -> action [A], selected index or None."""
+        """Runs a control step; channels: name -> array of the channel's shape, or the array itself where there is one -> action [A],
+        selected index or None."""
         if not isinstance(channels, dict):
             channels = {contracts.observation(self.contract)["name"]: channels}
         if self.timestep == self.steps:
@@ -207,16 +209,16 @@ class Twin:
 
     @property
     def decides(self):
-        """Whether a plan is made at this step."""
+        """Returns whether a plan is made at this step."""
         return self.timestep % self.period == 0
 
     @property
     def logits(self):
-        """The logits [M] that the last selection was made from."""
+        """Returns the logits [M] that the last selection was made from."""
         return self.states["logits"].value.ravel()
 
     def select(self):
-        """The plan in force becomes the one with the largest logit, the first of equal ones."""
+        """Selects the plan with the largest logit, the first of equal ones."""
         self.index, self.fresh = int(self.logits.argmax()), True
 
     def clear(self, level):
@@ -224,7 +226,7 @@ class Twin:
         self.caches.pop(level, None)
 
     def run(self, name, number=0, ring=None):
-        """Runs an entry and takes its outputs over. `number` is the pass of a repeated call, `ring` the state that it walks along."""
+        """Runs an entry and stores its outputs. `number` is the pass of a repeated call, `ring` the state that it walks along."""
         entry = self.entries[name]
         cache = self.caches.setdefault(name.split("/")[0], {})
         inputs = {port: self._input(port, shape, cache, number, ring) for port, shape in entry.inputs.items()}
@@ -347,7 +349,7 @@ SCHEDULES = {
 
 
 class Rollout:
-    """What a policy did on given observations: arrays over the steps."""
+    """Record of what a policy did on given observations: arrays over the steps."""
 
     def __init__(self, twin):
         self.twin, self.count = twin, _len_of_noise(twin.contract)
@@ -366,11 +368,11 @@ class Rollout:
 
     @property
     def margin(self):
-        """The smallest lead of the best over the second best logit at any selection."""
+        """Returns the smallest lead of the best over the second best logit at any selection."""
         return min(self.margins, default=float("inf"))
 
     def tensors(self):
-        """`actions` [T, A], and where there are any `selected` [T] and `noise` [T, N]: all draws of a step in order, then zeros."""
+        """Returns `actions` [T, A], and where there are any `selected` [T] and `noise` [T, N]: all draws of a step in order, then zeros."""
         found = {"actions": np.stack(self.actions).astype(np.float32)}
         if any(index >= 0 for index in self.selected):
             found["selected"] = np.array(self.selected, np.int64)

@@ -1,9 +1,9 @@
-"""A bundle of contract version 1 to version 2: new metadata, the same graphs and weights to the bit.
+"""Upgrades a bundle of contract version 1 to version 2: new metadata, the same graphs and weights to the bit.
 
 What version 1 does not say, an action's meaning and the interface of an element, is taken from the environment file of the same
 id and version; where there is none, the contract says that it is not stated. Files beside the bundle that name its sha256 (the
 reference rollouts, results, the model card) are rewritten with the new one when the bundle is upgraded in place. What can fail:
-a file that is no bundle of version 1 is refused and nothing is written.
+a file that is not a bundle of version 1 is refused and nothing is written.
 """
 
 import base64
@@ -24,7 +24,7 @@ CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 
 
 def environment_file(known, path=None):
-    """The environment file of a contract's `environment`: `path`, or the one in configs; None where there is none."""
+    """Finds the environment file of a contract's `environment`: `path`, or the one in configs; None where there is none."""
     for candidate in [Path(path)] if path else sorted(CONFIGS.glob("*.environment.toml")):
         found = config.read_toml(candidate)
         if (found.get("id"), found.get("version")) == (known["id"], known["version"]):
@@ -35,13 +35,13 @@ def environment_file(known, path=None):
 
 
 def _meant(rows, stated):
-    """Elements of version 1 with what the environment file says beyond them; the bundle's own fields win."""
+    """Completes elements of version 1 with what the environment file says beyond them; the bundle's own fields win."""
     by_name = {row["name"]: row for row in stated}
     return [contracts.element(by_name.get(row["name"], {}) | row) for row in rows]
 
 
 def contract(old, environment=None):
-    """A contract of version 1 -> the same of version 2."""
+    """Upgrades a contract from version 1 to version 2."""
     stated = environment or {"observation": [], "action": []}
     own = {
         "quaternion_order": old["quaternion_order"],
@@ -67,7 +67,7 @@ def contract(old, environment=None):
 
 
 def golden(blob):
-    """A golden episode of version 1, base64 -> of version 2."""
+    """Upgrades a golden episode, in base64, from version 1 to version 2."""
     data = base64.b64decode(blob)
     old = load_safetensors(data)
     tensors = {
@@ -85,7 +85,7 @@ def _tolerance(data):
 
 
 def read(path):
-    """-> the ONNX model and its contract, of whatever version."""
+    """Reads a bundle -> the ONNX model and its contract, of whatever version."""
     try:
         model = onnx.load_from_string(Path(path).read_bytes())
         found = json.loads(contracts.properties(model)[contracts.KEY])

@@ -1,4 +1,4 @@
-"""The PyTorch policy that acts: from a run's checkpoint, or back from a bundle's initializers.
+"""Loads the PyTorch policy that acts: from a run's checkpoint, or back from a bundle's initializers.
 
 A bundle holds every weight of the networks that act, so the policy can be run in PyTorch from the repository alone. Two
 things are folded at export and stay folded here: the division by the observations' standard deviation (into the weights
@@ -19,7 +19,7 @@ from .model import HighLevelPolicy, LowLevelPolicy, Normalizer
 
 @dataclass(frozen=True)
 class Acting:
-    """What acts: normaliser, high level, codes [M, D], low level. All in eval mode."""
+    """Networks that act: normaliser, high level, codes [M, D], low level. All in eval mode."""
 
     normalizer: nn.Module
     high_level: nn.Module
@@ -28,7 +28,7 @@ class Acting:
 
 
 def from_lads(lads):
-    """The acting part of trained networks."""
+    """Takes the acting part of trained networks."""
     lads.eval()
     return Acting(lads.normalizer, lads.high_level, lads.codebook.codes, lads.low_level)
 
@@ -46,7 +46,7 @@ def _slope(model):
 
 
 def _lengths(contract):
-    """Elements of the observation and of the action."""
+    """Returns the numbers of elements of the observation and of the action."""
     return contracts.observation(contract)["shape"][0], contracts.action(contract)["shape"][0]
 
 
@@ -91,7 +91,7 @@ def _low_level(tensors, contract, slope):
 
 
 def from_bundle(model, contract):
-    """The acting networks of an ONNX bundle, with the normaliser's scale and batch norm folded into their neighbours."""
+    """Loads the acting networks of an ONNX bundle, with the normaliser's scale and batch norm folded into their neighbours."""
     tensors = _tensors(model)
     try:
         normalizer = Normalizer(_lengths(contract)[0])

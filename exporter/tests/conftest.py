@@ -17,7 +17,7 @@ def make_policy(name, seed=0):
 
 @pytest.fixture(scope="session", params=["tiny", "kitchen", "lorel"])
 def policy(request):
-    """(setting, encoded, lads, model) with random weights."""
+    """Makes a policy with random weights -> (setting, encoded, lads, model)."""
     return make_policy(request.param)
 
 

@@ -1,4 +1,4 @@
-"""Which free sentences are followed: the measure, the threshold, the shipped calibrations, and how they get into a contract."""
+"""Tests which free sentences are followed: the measure, the threshold, the shipped calibrations, and how they get into a contract."""
 
 import json
 import subprocess
@@ -26,7 +26,7 @@ def test_alignment_is_the_mean_of_the_best_cosines_without_the_end_mark():
     end = np.array([9, 9], np.float32)
     assert acceptance.alignment(np.stack([x, y, end]), np.stack([y, x, end])) == pytest.approx(1)
     assert acceptance.alignment(np.stack([x, y, end]), np.stack([x, end])) == pytest.approx(0.5)
-    assert acceptance.alignment(x[None], np.stack([x + y / 1.5, end])) == pytest.approx(0.5**0.5), "one word is no end mark"
+    assert acceptance.alignment(x[None], np.stack([x + y / 1.5, end])) == pytest.approx(0.5**0.5), "one word is not an end mark"
     assert acceptance.alignment(-x[None], x[None]) == pytest.approx(-1)
     assert acceptance.alignment(np.zeros((1, 2)), x[None]) == 0
     assert acceptance.nearest(x[None], [y[None], x[None], 2 * x[None]]) == (1, pytest.approx(1))
@@ -77,7 +77,7 @@ def test_a_bundle_takes_its_own_calibration_only(name):
 
 
 def calibrate(tmp_path, sentences):
-    """The command on the small encoder of tests; -> exit code, stdout, stderr, the file."""
+    """Runs the command on the small encoder of tests -> exit code, stdout, stderr, the file."""
     (tmp_path / "table.json").write_text(json.dumps(sentences))
     command = [sys.executable, "-m", "lads_exporter", "calibrate", "--config", "configs/tiny.toml"]
     command += ["--sentences", tmp_path / "table.json", "-o", tmp_path / "out.json"]

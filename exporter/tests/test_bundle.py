@@ -1,4 +1,4 @@
-"""The exported graphs against PyTorch, and the file against its contract."""
+"""Tests the exported graphs against PyTorch, and the file against its contract."""
 
 import base64
 
@@ -91,7 +91,7 @@ def test_low_level_and_encoder(policy):
 
 
 def past_of(lads, x):
-    """The keys and values of every block for embedded tokens x [1, S, d], by plain PyTorch."""
+    """Computes the keys and values of every block for embedded tokens x [1, S, d], by plain PyTorch."""
     out = {}
     mask = torch.triu(torch.full((1, 1, x.shape[1], x.shape[1]), -1e9), 1)
     for number, block in enumerate(lads.high_level.blocks):
@@ -117,7 +117,7 @@ def test_instruct(policy):
 @torch.no_grad()
 @pytest.mark.parametrize("instruction", [0, 3])
 def test_steps_with_cache_equal_the_whole_sequence(policy, instruction):
-    """280 control steps for the kitchen: logits of every step, and the cache after the last."""
+    """Tests 280 control steps for the kitchen: logits of every step, and the cache after the last."""
     setting, encoded, lads, model = policy
     steps = setting.config.high_level.context_steps
     observations = random_policy.observations(setting, steps, seed=9)
@@ -152,7 +152,7 @@ def test_contract_and_flat_keys(policy):
 
 
 def test_inputs_of_the_graphs_are_channels_states_or_integers(policy):
-    """Every name that an entry of the control loop reads is bound to something."""
+    """Tests that every name that an entry of the control loop reads is bound to something."""
     model = policy[3]
     names = {row["name"] for row in contracts.of(model)["channels"]} | {"id", "timestep", "index", "plan"}
     local = {value.name.rsplit("/", 1)[1] for value in model.graph.input}

@@ -1,4 +1,4 @@
-"""What a contract must keep: every broken rule is refused with the field's name."""
+"""Tests the rules of a contract: every broken rule is refused with the field's name."""
 
 import copy
 
@@ -17,7 +17,7 @@ def channel(contract, name):
 
 
 def put(path, value):
-    """A change of a contract: the value at a path; the number or name of each part, channels by name."""
+    """Changes a contract: the value at a path; the number or name of each part, channels by name."""
 
     def change(contract):
         *parts, last = path

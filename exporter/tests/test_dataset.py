@@ -1,4 +1,4 @@
-"""Readers: the project's layout and D4RL's, and what each refuses."""
+"""Tests the readers: the project's layout and D4RL's, and what each refuses."""
 
 import h5py
 import numpy as np
@@ -50,7 +50,7 @@ def test_wrong_files_are_refused(setting, tmp_path):
     with pytest.raises(UserError, match="make collect"):
         dataset.load(tmp_path / "absent.safetensors", setting)
     for name, message in (("text.safetensors", "not a lads-dataset file"), ("text.hdf5", "not a D4RL HDF5 file")):
-        (tmp_path / name).write_bytes(b"this is no dataset, whatever its name says")
+        (tmp_path / name).write_bytes(b"this is not a dataset, whatever its name says")
         with pytest.raises(UserError, match=message):
             dataset.load(tmp_path / name, setting)
     whole = synthetic.write(tmp_path / "whole.safetensors", setting).read_bytes()
@@ -60,7 +60,7 @@ def test_wrong_files_are_refused(setting, tmp_path):
 
 
 def d4rl_file(path, episodes, timeouts=True):
-    """The layout of kitchen_*-v0.hdf5: 60-d observations, of which the last 30 are the goal."""
+    """Writes the layout of kitchen_*-v0.hdf5: 60-d observations, of which the last 30 are the goal."""
     with h5py.File(path, "w") as file:
         rows = np.concatenate(episodes)
         ends = np.zeros(len(rows), bool)
@@ -75,7 +75,7 @@ def d4rl_file(path, episodes, timeouts=True):
 
 
 def d4rl_episode(environment, order, steps=60):
-    """An episode that completes the sub-tasks in this order, at equal intervals."""
+    """Makes an episode that completes the sub-tasks in this order, at equal intervals."""
     rows = np.zeros((steps, 30), np.float32)
     rows[:, 23:30] = [-0.27, 0.35, 1.62, 1, 0, 0, 0]
     for number, name in enumerate(order):

@@ -1,4 +1,4 @@
-"""Commands of the exporter that the documents show parse, and their inputs that the project brings are there."""
+"""Tests that commands of the exporter in the documents parse, and that their inputs that the project brings are there."""
 
 import re
 import shlex

@@ -1,4 +1,4 @@
-"""Other endings: which texts are made, and which steps count."""
+"""Tests other endings: which texts are made, and which steps count."""
 
 import dataclasses
 
@@ -30,7 +30,7 @@ def test_endings_keep_the_beginning_and_make_no_real_instruction(kitchen):
 
 
 def test_the_order_of_the_splits_does_not_matter(kitchen):
-    """An index is one of all instructions, wherever the seen ones stand in the file."""
+    """Tests that an index is one of all instructions, wherever the seen ones stand in the file."""
     unseen_first = sorted(kitchen.instructions, key=lambda row: row["split"] == "seen")
     made = texts(unseen_first, 5)
     assert {index for index, _ in made} == {index for index, row in enumerate(unseen_first) if row["split"] == "seen"}

@@ -1,4 +1,4 @@
-"""Random bundles of growing size: one dimension grows, everything else stays."""
+"""Tests random bundles of growing size: one dimension grows, everything else stays."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Relabelled parts of trajectories: every label is true of its part, and held-out trajectories stay held out."""
+"""Tests relabelled parts of trajectories: every label is true of its part, and held-out trajectories stay held out."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def wander(setting, trajectories=200, seed=0):
 
 
 def phrases(sentence):
-    """The sub-tasks of a label: a direction alone belongs to the mug before it."""
+    """Lists the sub-tasks of a label: a direction alone belongs to the mug before it."""
     names, head = [], ""
     for phrase in sentence.split(" and "):
         if " " in phrase:

@@ -1,4 +1,5 @@
-"""Random policies of every family: their contracts, the twin against the networks in PyTorch over whole episodes, the same bytes twice."""
+"""Tests random policies of every family: their contracts, the twin against the networks in PyTorch over whole episodes, the same bytes
+twice."""
 
 import json
 
@@ -19,7 +20,7 @@ OPERATORS = {
 
 
 class Made:
-    """A kind's networks and bundle, and an episode of its twin under one instruction."""
+    """Networks and bundle of a kind, and an episode of its twin under one instruction."""
 
     def __init__(self, name):
         self.name, self.sizes = name, kinds.KINDS[name].sizes
@@ -38,12 +39,12 @@ class Made:
         return actions.clamp(low, high)
 
     def plans(self, logits):
-        """The index in force at every step, from the logits of all steps [T, M]."""
+        """Computes the index in force at every step, from the logits of all steps [T, M]."""
         period = contracts.period(self.contract)
         return [int(logits[t - t % period].argmax()) for t in range(STEPS)]
 
     def chunks(self):
-        """(start, end) of every plan."""
+        """Yields (start, end) of every plan."""
         period = contracts.period(self.contract)
         return [(start, min(start + period, STEPS)) for start in range(0, STEPS, period)]
 
@@ -133,7 +134,7 @@ def test_the_same_seed_gives_the_same_bytes(made):
 
 
 def test_every_context_and_episode_begins_alike(made):
-    """A restart, a reset and a new instruction put everything back; only a restart keeps the last action."""
+    """Tests that a restart, a reset and a new instruction put everything back; only a restart keeps the last action."""
     if "context" not in made.contract:
         pytest.skip("no context to restart")
     quiet = twin.Zero()
@@ -142,7 +143,7 @@ def test_every_context_and_episode_begins_alike(made):
     rows = [{name: values[t] for name, values in channels.items()} for t in range(steps)]
 
     def play(runner=runner):
-        """Actions, and logits where there are any."""
+        """Returns the actions, and logits where there are any."""
         rollout = twin.Rollout(runner)
         for row in rows:
             rollout.step(row)

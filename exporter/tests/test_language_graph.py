@@ -1,4 +1,4 @@
-"""The language encoder as files: equal to PyTorch, whole or not there, and only of models whose graph is known."""
+"""Tests the language encoder as files: equal to PyTorch, whole or not there, and only of models whose graph is known."""
 
 import json
 

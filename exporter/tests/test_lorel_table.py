@@ -1,4 +1,4 @@
-"""The Python table gives the trajectories that the Rust table is tested against."""
+"""Tests that the Python table gives the trajectories that the Rust table is tested against."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Codebook and networks: start and revival of codes, masks and padding, the contrastive loss."""
+"""Tests codebook and networks: start and revival of codes, masks and padding, the contrastive loss."""
 
 import dataclasses
 
@@ -138,7 +138,7 @@ def test_logits_depend_on_the_past_only(setting):
 
 @pytest.mark.parametrize(("rows", "step", "prefix"), [(50, 1, 0), (1, 1, 0), (33, 2, 9), (5, 2, 30), (1, 2, 4)])
 def test_attention_in_blocks_equals_the_fused_operator(rows, step, prefix):
-    """Values and gradients; the fused operator is what a GPU runs."""
+    """Tests values and gradients; the fused operator is what a GPU runs."""
     torch.manual_seed(0)
     keys = prefix + (rows - 1) * step + 1
     q, k, v = (torch.randn(2, 2, size, 8, requires_grad=True) for size in (rows, keys, keys))

@@ -1,4 +1,4 @@
-"""Standard normal numbers: the bits of the runtime's, AS 241 as another implementation has it, and the distribution."""
+"""Tests standard normal numbers: the bits of the runtime's, AS 241 as another implementation has it, and the distribution."""
 
 import math
 import statistics
@@ -13,13 +13,13 @@ TABLE = Path(__file__).parents[2] / "runtime/core/tests/normals.txt"
 
 
 def rows(kind):
-    """The words of the table's rows of one kind."""
+    """Reads the words of the table's rows of one kind."""
     lines = (line.split() for line in TABLE.read_text(encoding="utf-8").splitlines())
     return [words[1:] for words in lines if words[0] == kind]
 
 
 def distance(sample):
-    """The largest distance between a sample's distribution and the normal one (Kolmogorov and Smirnov)."""
+    """Computes the largest distance between a sample's distribution and the normal one (Kolmogorov and Smirnov)."""
     sample = np.sort(sample.astype(np.float64))
     expected = np.array([math.erfc(-x / math.sqrt(2)) / 2 for x in sample])
     places = np.arange(len(sample) + 1) / len(sample)
@@ -44,7 +44,7 @@ def test_draws_have_the_bits_of_the_table():
 
 
 def test_quantiles_are_those_of_the_standard_library():
-    """CPython's `inv_cdf` is AS 241 too, in C, with the logarithm of the C library."""
+    """Tests against CPython's `inv_cdf`, which is AS 241 too, in C, with the logarithm of the C library."""
     draw = np.random.default_rng(0)
     u = np.concatenate([draw.random(2_000), 2.0 ** -draw.uniform(1, 53, 2_000)])
     # The multiples of 2^-53.

@@ -1,4 +1,4 @@
-"""Where the exporter's commands write: files whole, links followed, devices left what they are, nothing over what is read."""
+"""Tests where the exporter's commands write: files whole, links followed, devices left what they are, nothing over what is read."""
 
 import os
 import stat

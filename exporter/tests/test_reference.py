@@ -1,4 +1,4 @@
-"""Reference rollouts: the PyTorch policy out of a bundle, its full-sequence forward, and what ends and continues a run."""
+"""Tests reference rollouts: the PyTorch policy out of a bundle, its full-sequence forward, and what ends and continues a run."""
 
 import base64
 import json
@@ -74,7 +74,7 @@ def test_only_the_bundles_own_run_is_rolled_out(policy, monkeypatch):
 
 
 class Bench:
-    """A few steps of noise in place of an environment."""
+    """Environment of a few steps of noise."""
 
     ID, VERSION, MAX_STEPS = "tiny-bench", "1", 9
     SUB_TASKS = ["drawer", "lamp", "lever"]

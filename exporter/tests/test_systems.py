@@ -1,4 +1,5 @@
-"""Every system: its losses against values by hand, a few steps of training, and its bundle against its own networks over the whole sequence."""
+"""Tests every system: its losses against values by hand, a few steps of training, and its bundle against its own networks over the whole
+sequence."""
 
 import copy
 import math
@@ -79,7 +80,7 @@ class Trained:
         return range(0, len(self.observations), self.period)
 
     def held(self, plans):
-        """What is decided at the multiples of the period, at every step."""
+        """Holds what is decided at the multiples of the period, at every step."""
         return [plans[t - t % self.period] for t in range(len(self.observations))]
 
     def clip(self, actions):
@@ -105,7 +106,7 @@ def test_a_few_steps_lower_the_losses(trained):
 
 
 def quantised(trained):
-    """The codes of the unfolded high level at every step."""
+    """Computes the codes of the unfolded high level at every step."""
     networks = trained.networks
     latents = networks.project_in(networks.high_level(trained.words, trained.normed[None])[0])
     return nearest(latents, networks.codebook.codes).tolist()
@@ -184,7 +185,7 @@ def _goals_are_encoded_as_in_training(trained):
 
 
 def test_a_resumed_diffusion_equals_an_uninterrupted_one(tmp_path):
-    """The moving average and the options of the frozen high level come back."""
+    """Tests that the moving average and the options of the frozen high level come back."""
     setting = setting_of("skilldiffuser")
     setting.tables[0]["system"] = SKILLDIFFUSER | {"diffusion": DIFFUSION | {"steps": 40}}
     setting = config.from_tables(*setting.tables, "test")
@@ -340,7 +341,7 @@ def test_noise_schedule():
 
 
 def _posterior_mean(bar, k, x, x0):
-    """The mean of q(x_{k-1} | x_k, x_0) by Bayes' rule for the two Gaussians."""
+    """Computes the mean of q(x_{k-1} | x_k, x_0) by Bayes' rule for the two Gaussians."""
     alpha = bar[k] / bar[k - 1]
     precision = 1 / (1 - bar[k - 1]) + alpha / (1 - alpha)
     return (bar[k - 1] ** 0.5 * x0 / (1 - bar[k - 1]) + alpha**0.5 * x / (1 - alpha)) / precision

@@ -1,4 +1,5 @@
-"""A table end to end on the tiny setting, with a program in the place of lads-run that writes results of its form; what is refused; the numbers."""
+"""Tests a table end to end on the tiny setting, with a program in the place of lads-run that writes results of its form; what is refused;
+the numbers."""
 
 import json
 import os
@@ -62,7 +63,7 @@ seeds = { paper = [4] }
 
 @pytest.fixture
 def folder(tmp_path):
-    """A folder with a table, its configurations, data and program."""
+    """Makes a folder with a table, its configurations, data and program."""
     beside = config.find("configs/tiny.toml").resolve().parent
     base = (beside / "tiny.toml").read_text().replace('"tiny.', f'"{beside}/tiny.')
     for name, steps in {"plans": 40, "low_level": 20, "high_level": 20}.items():
@@ -192,7 +193,7 @@ def test_what_is_missing_is_named_with_its_remedy(folder):
 
 
 def test_wilson_interval():
-    """Against published values: 0 of 10, 5 of 10, 81 of 263 (Newcombe 1998, method 3)."""
+    """Tests against published values: 0 of 10, 5 of 10, 81 of 263 (Newcombe 1998, method 3)."""
     assert render.wilson(0, 10) == pytest.approx([0.0, 0.2775], abs=1e-4)
     assert render.wilson(5, 10) == pytest.approx([0.2366, 0.7634], abs=1e-4)
     assert render.wilson(81, 263) == pytest.approx([0.2553, 0.3662], abs=1e-4)

@@ -1,4 +1,4 @@
-"""Training on a tiny synthetic dataset: losses fall, a resumed run equals an uninterrupted one, the commands work."""
+"""Tests training on a tiny synthetic dataset: losses fall, a resumed run equals an uninterrupted one, the commands work."""
 
 import copy
 import csv
@@ -75,7 +75,7 @@ def test_joint_step_moves_everything_and_the_stages_only_their_part(tmp_path):
 
 
 def test_cross_entropy_does_not_move_the_plans(tmp_path):
-    """The stop-gradient of equation 7."""
+    """Tests the stop-gradient of equation 7."""
     trainer = trainer_for(tmp_path / "run", setting_for("joint"))
     stage = Stage("joint", trainer)
     for step in range(32):
@@ -283,7 +283,7 @@ def test_unknown_and_missing_keys_are_named():
 def test_a_context_off_the_grid_of_plans_is_refused(steps):
     tables = copy.deepcopy(config.load("configs/tiny.toml").tables)
     tables[0]["high_level"]["context_steps"] = steps
-    with pytest.raises(UserError, match=f"context_steps = {steps} is no multiple of the plan period of 4"):
+    with pytest.raises(UserError, match=f"context_steps = {steps} is not a multiple of the plan period of 4"):
         config.from_tables(*tables, "test")
 
 

@@ -1,4 +1,4 @@
-"""Bundles of contract version 1 become version 2: nothing but the metadata changes, and what says their sha256 follows."""
+"""Tests that bundles of contract version 1 become version 2: nothing but the metadata changes, and what says their sha256 follows."""
 
 import base64
 import hashlib
@@ -18,7 +18,7 @@ BEYOND = ("interface", "scale", "offset", "physical_unit")  # what version 1 did
 
 
 def version_1(model):
-    """The same bundle as the exporter of version 1 wrote it."""
+    """Returns the same bundle as the exporter of version 1 wrote it."""
     old = onnx.ModelProto.FromString(model.SerializeToString())
     found, properties = contracts.of(model), contracts.properties(model)
     element = lambda row: {key: value for key, value in row.items() if key not in BEYOND}
@@ -44,7 +44,7 @@ def version_1(model):
 
 @pytest.fixture
 def old(tiny, tmp_path):
-    """A bundle of version 1 with a reference, results and a card beside it; -> its path."""
+    """Writes a bundle of version 1 with a reference, results and a card beside it -> its path."""
     path = tmp_path / "tiny.onnx"
     sha256 = bundle.save(version_1(tiny[3]), path)
     head = f'{{\n "bundle_sha256": "{sha256}",\n "purpose_sha256": "{"0" * 64}",\n "seed": 0\n}}\n'

@@ -1,4 +1,4 @@
-"""A language encoder of a few kilobytes, BERT in everything but size: for tests that have no 90 MB at hand.
+"""Makes a language encoder of a few kilobytes, BERT in everything but size: for tests that have no 90 MB at hand.
 
 `python exporter/tests/tiny_encoder.py FOLDER` writes its export and, beside it, `sentences.json` with what PyTorch makes of some sentences;
 `runtime/language/tests/data/tiny-encoder` was made so.
@@ -29,7 +29,7 @@ def distilbert():
 
 
 def save(folder, make=bert):
-    """The model and its tokeniser as transformers keeps them."""
+    """Saves the model and its tokeniser as transformers keeps them."""
     torch.manual_seed(0)
     make().save_pretrained(folder)
     tokenizer = Tokenizer(models.WordPiece({word: i for i, word in enumerate(WORDS)}, unk_token="[UNK]"))

@@ -1,4 +1,4 @@
-//! `make mutate`: every change of a bundle, what it moves, and what a verification says of it, as a table.
+//! Prints the table of `make mutate`: every change of a bundle, what it moves, and the verdict on it.
 //!
 //! Exit code 1 if fewer than 98 % of the changes that move a logit by more than 1e-2, an action by more than 1e-4 or an encoding are DIFFERENT, or if one
 //! that is harmless is.
@@ -11,14 +11,14 @@ use std::process::ExitCode;
 
 use lads_compiler::{CacheFormat, Options, Storage, WeightFormat};
 use lads_proof::reference::Reference;
-use mutate::{Model, Normals, Said};
+use mutate::{Model, Normals, Outcome};
 
-/// A change that moves so much is to be found.
+/// Difference of a logit from which on a change must be found.
 const LOGIT: f64 = 1e-2;
 const ACTION: f64 = 1e-4;
 const FOUND: f64 = 0.98;
 
-/// A kind of change, and what came of all of them.
+/// Counts of one kind of change.
 #[derive(Default)]
 struct Kind {
     name: String,
@@ -40,8 +40,8 @@ impl Bench {
     fn add(&self, kind: &mut Kind, what: &str, bytes: &[u8], options: &Options) {
         kind.changes += 1;
         let judged = match mutate::verify(bytes, options, &self.reference, self.every) {
-            Said::Judged(judged) => judged,
-            Said::Refused(why) => {
+            Outcome::Judged(judged) => judged,
+            Outcome::Refused(why) => {
                 kind.refused += 1;
                 kind.refusals.push(format!("{what}: {why}"));
                 return;
@@ -68,7 +68,7 @@ impl Bench {
             let segments = answers.differing_segments;
             let reason = judged.reason();
             kind.exceptions.push(format!(
-                "{what}: {verdict}; largest logit {logit:.1e}, action {action:.1e}, segments encoded otherwise {segments} {reason}"
+                "{what}: {verdict}; largest logit {logit:.1e}, action {action:.1e}, segments encoded as another plan {segments} {reason}"
             ));
         }
     }

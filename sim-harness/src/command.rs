@@ -1,4 +1,4 @@
-//! What the harness's commands share: arguments that are refused in one line, and exit code 2 for everything refused.
+//! Shared by the harness's commands: arguments that are refused in one line, and exit code 2 for everything refused.
 
 use std::fmt::Display;
 use std::process::ExitCode;
@@ -11,16 +11,16 @@ use indicatif::{ProgressBar, ProgressStyle};
 /// Exit code of everything that was refused.
 pub const REFUSED: u8 = 2;
 
-/// The arguments of command `name`; else the exit code, after one line on stderr, or after the help on stdout.
+/// Parses the arguments of command `name`; on failure gives the exit code, after one line on stderr, or after the help on stdout.
 pub fn arguments<A: Parser>(name: &str) -> Result<A, ExitCode> {
     arguments_moved(name, &[])
 }
 
-/// The same, for a command of which `moved` options are now asked for otherwise, and how.
+/// Parses the arguments of command `name`, and tells a user of one of the `moved` options what replaces it.
 pub fn arguments_moved<A: Parser>(name: &str, moved: &[(&str, &str)]) -> Result<A, ExitCode> {
     A::try_parse().map_err(|error| {
         if !error.use_stderr() {
-            // Help or version; a closed pipe is no failure.
+            // Help or version; a closed pipe is not a failure.
             let _ = error.print();
             return ExitCode::SUCCESS;
         }
@@ -40,20 +40,20 @@ pub fn arguments_moved<A: Parser>(name: &str, moved: &[(&str, &str)]) -> Result<
     })
 }
 
-/// Says what is refused, in one line whatever the errors underneath contain.
+/// Prints why the command refuses, in one line whatever the errors underneath contain, and gives the exit code.
 pub fn refuse(wrong: impl Display) -> ExitCode {
     eprintln!("error: {}", one_line(&wrong.to_string()));
     ExitCode::from(REFUSED)
 }
 
-/// A progress bar over `count` things, as wide as the terminal leaves room; indicatif hides it where stderr is no terminal.
+/// A progress bar over `count` things, as wide as the terminal leaves room; indicatif hides it where stderr is not a terminal.
 pub fn progress(count: usize, things: &str) -> ProgressBar {
     let bar = ProgressBar::new(count as u64).with_style(style(things));
     bar.enable_steady_tick(Duration::from_millis(200));
     bar
 }
 
-/// Everything beside the bar fits into 40 columns.
+/// Style of progress bars; everything beside the bar fits into 40 columns.
 fn style(things: &str) -> ProgressStyle {
     let style = ProgressStyle::with_template(&format!(
         "{{wide_bar}} {{pos}}/{{len}} {things} {{elapsed}}, {{eta}} left {{msg}}"

@@ -1,4 +1,4 @@
-//! Files that the harness writes: [`lads_host::output`], and JSON by it.
+//! Writes the harness's files: [`lads_host::output`], and JSON through it.
 
 use std::io;
 use std::path::Path;

@@ -53,7 +53,7 @@ impl SeedSequence {
         Self { pool }
     }
 
-    /// numpy's `generate_state(4, uint64)`.
+    /// Generates four words like numpy's `generate_state(4, uint64)`.
     fn state(&self) -> [u64; 4] {
         let mut constant = INIT_B;
         let mut words = self.pool.iter().cycle().map(|&word| {
@@ -70,7 +70,7 @@ impl SeedSequence {
     }
 }
 
-/// A number as numpy's entropy words: the low half, and the high half unless it is zero.
+/// Splits a number into numpy's entropy words: the low half, and the high half unless it is zero.
 fn words_of(number: u64) -> impl Iterator<Item = u32> {
     let high = (number >> 32) as u32;
     std::iter::once(number as u32).chain((high != 0).then_some(high))
@@ -90,7 +90,7 @@ pub struct Stream {
 }
 
 impl Stream {
-    /// The stream of `numpy.random.default_rng(entropy)`.
+    /// Makes the stream of `numpy.random.default_rng(entropy)`.
     pub fn new(entropy: &[u64]) -> Self {
         let [state_high, state_low, stream_high, stream_low] =
             SeedSequence::new(entropy).state().map(u128::from);
@@ -102,17 +102,17 @@ impl Stream {
         }
     }
 
-    /// Uniform on `[0, 1)` with 53 random bits: numpy's `random()`.
+    /// Draws uniformly from `[0, 1)` with 53 random bits, like numpy's `random()`.
     pub fn unit(&mut self) -> f64 {
         (self.bits.next_u64() >> 11) as f64 * (1.0 / 9_007_199_254_740_992.0)
     }
 
-    /// Uniform on `[low, high)`: numpy's `uniform(low, high)`.
+    /// Draws uniformly from `[low, high)`, like numpy's `uniform(low, high)`.
     pub fn uniform(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.unit()
     }
 
-    /// A standard normal number by Box and Muller's transform. Not numpy's `normal`, which uses a ziggurat.
+    /// Draws a standard normal number by Box and Muller's transform. Not numpy's `normal`, which uses a ziggurat.
     pub fn normal(&mut self) -> f64 {
         let radius = (-2.0 * (1.0 - self.unit()).ln()).sqrt();
         radius * (std::f64::consts::TAU * self.unit()).cos()

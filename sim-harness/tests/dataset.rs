@@ -1,4 +1,4 @@
-//! The dataset file: round trip, equal bytes, refusals; and what `lads-collect` says about bad input.
+//! Tests the dataset file: round trip, equal bytes, refusals; and what `lads-collect` says about bad input.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -73,7 +73,7 @@ fn equal_datasets_are_equal_files() {
     assert!(files.iter().all(|file| *file == files[0]));
 }
 
-/// What reading says after `damage` was done to a good file.
+/// Returns the error of reading a good file after `damage` was done to it.
 fn refusal(damage: impl FnOnce(Vec<u8>) -> Vec<u8>) -> String {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("bad.safetensors");
@@ -100,8 +100,8 @@ fn replace(mut file: Vec<u8>, from: &str, to: &str) -> Vec<u8> {
 
 #[test]
 fn damaged_files_are_refused_by_name() {
-    assert!(refusal(|_| b"no dataset".to_vec()).contains("no safetensors file"));
-    assert!(refusal(|file| file[..file.len() - 5].to_vec()).contains("no safetensors file"));
+    assert!(refusal(|_| b"no dataset".to_vec()).contains("not a safetensors file"));
+    assert!(refusal(|file| file[..file.len() - 5].to_vec()).contains("not a safetensors file"));
     assert!(
         refusal(|file| replace(file, "\"version\":\"1\"", "\"version\":\"2\""))
             .contains("version is not \"1\"")

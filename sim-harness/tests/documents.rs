@@ -1,4 +1,4 @@
-//! The options of `lads-run` and `lads-collect` that the documents show exist.
+//! Tests that the options of `lads-run` and `lads-collect` in the documents exist.
 
 use std::path::Path;
 use std::process::Command;

@@ -1,4 +1,4 @@
-//! The scripted experts and the collector.
+//! Tests the scripted experts and the collector.
 
 use std::num::NonZeroUsize;
 use std::sync::LazyLock;

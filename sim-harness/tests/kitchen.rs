@@ -1,4 +1,4 @@
-//! The kitchen environment: determinism, noise, refusals.
+//! Tests the kitchen environment: determinism, noise, refusals.
 
 use std::path::Path;
 use std::sync::LazyLock;
@@ -19,7 +19,7 @@ fn episode(episode: u64) -> EpisodeSeed {
     }
 }
 
-/// The observations of an episode of random actions.
+/// Runs an episode of random actions and returns its observations.
 fn run(kitchen: &mut Kitchen, seed: EpisodeSeed, steps: usize) -> Vec<Vec<f64>> {
     let mut actions = Stream::new(&[77]);
     let mut observations = vec![kitchen.reset(seed, &[]).to_vec()];

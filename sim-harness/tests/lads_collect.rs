@@ -1,4 +1,4 @@
-//! What `lads-collect` refuses, before any work: one line that names the thing and the remedy, exit code 2, nothing written.
+//! Tests what `lads-collect` refuses, before any work: one line that names the thing and the remedy, exit code 2, nothing written.
 
 use std::process::Command;
 

@@ -1,4 +1,4 @@
-//! `lads-run record`: the pictures, that they change nothing, and that an interrupted film leaves nothing behind.
+//! Tests `lads-run record`: the pictures, that they change nothing, and that an interrupted film leaves nothing behind.
 //!
 //! Where there is no EGL these tests are skipped with a printed line.
 #![cfg(feature = "record")]
@@ -17,7 +17,7 @@ use serde_json::Value;
 
 const DRAWER: [&str; 5] = ["--instruction", "open drawer", "--episodes", "2", "--json"];
 
-/// Records; `None`, after a line, where there is no EGL.
+/// Runs `lads-run record`; `None`, after a line, where there is no EGL.
 fn recorded(model: &str, arguments: &[&str], out: &Path) -> Option<Output> {
     let output = lads_run(model, &[&["record"], arguments].concat())
         .arg(out)
@@ -32,7 +32,7 @@ fn recorded(model: &str, arguments: &[&str], out: &Path) -> Option<Output> {
     Some(output)
 }
 
-/// What ran, without measured times.
+/// Reads the JSON results without measured times.
 fn runs(json: &Path) -> Value {
     let results: Value = serde_json::from_str(&fs::read_to_string(json).unwrap()).unwrap();
     results["instructions"].clone()

@@ -1,4 +1,4 @@
-//! `lads-run --report`: the page says what the JSON says, has every chart, and fetches nothing.
+//! Tests `lads-run --report`: the page says what the JSON says, has every chart, and fetches nothing.
 #![cfg(feature = "report")]
 
 use std::fs;
@@ -7,7 +7,7 @@ use std::process::Command;
 
 use serde_json::Value;
 
-/// The page and the JSON of one small run.
+/// Makes the page and the JSON of one small run.
 fn page(environment: &[(&str, &str)]) -> (String, Value) {
     let folder = tempfile::tempdir().unwrap();
     let [page, json] = ["r.html", "r.json"].map(|name| folder.path().join(name));
@@ -29,7 +29,7 @@ fn page(environment: &[(&str, &str)]) -> (String, Value) {
     (fs::read_to_string(page).unwrap(), json)
 }
 
-/// What stands between a headline and the next.
+/// Returns the part of the page between a headline and the next.
 fn section<'p>(page: &'p str, title: &str) -> &'p str {
     let (_, rest) = page
         .split_once(&format!("<h2>{title}</h2>"))

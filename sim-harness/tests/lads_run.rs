@@ -1,4 +1,4 @@
-//! The program `lads-run` itself: its report, its JSON, and everything that it refuses.
+//! Tests the program `lads-run`: its report, its JSON, and everything that it refuses.
 
 #[path = "common/schema.rs"]
 mod schema;
@@ -10,17 +10,17 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-/// A file of the project, by its path from the root.
+/// Returns a file of the project, by its path from the root.
 fn project_file(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
 }
 
-/// The small bundle of the compiler's tests, for another environment.
+/// Path of the small bundle of the compiler's tests, which is for another environment.
 fn tiny_bundle() -> PathBuf {
     project_file("runtime/compiler/tests/data/tiny.onnx")
 }
 
-/// The bundle that ships.
+/// Path of the kitchen bundle that ships.
 fn kitchen_bundle() -> PathBuf {
     project_file("models/kitchen.onnx")
 }
@@ -38,7 +38,7 @@ fn lads_run(model: &Path, arguments: &[&str]) -> Command {
     command
 }
 
-/// Runs, expects success, and reads the JSON.
+/// Runs `lads-run`, expects success, and reads the JSON.
 fn results(arguments: &[&str], json: &Path) -> (String, Value) {
     let output = lads_run(&kitchen_bundle(), arguments)
         .arg("--json")
@@ -51,14 +51,14 @@ fn results(arguments: &[&str], json: &Path) -> (String, Value) {
     (String::from_utf8(output.stdout).unwrap(), results)
 }
 
-/// Without the fields that are measured times.
+/// Removes the fields that are measured times.
 fn timeless(mut results: Value) -> Value {
     let fields = results.as_object_mut().unwrap();
     assert!(fields.remove("latency_us").is_some() && fields.remove("time").is_some());
     results
 }
 
-/// Exit code 2, nothing on stdout, and one line on stderr with all `parts`.
+/// Asserts exit code 2, nothing on stdout, and one line on stderr with all `parts`.
 fn assert_refused(output: &Output, parts: &[&str]) {
     let errors = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(2), "{errors}");
@@ -77,7 +77,7 @@ fn refused(model: &Path, arguments: &[&str], parts: &[&str]) {
     assert_refused(&lads_run(model, arguments).output().unwrap(), parts);
 }
 
-/// A copy of a bundle in which one text of its metadata is another of the same length.
+/// Copies a bundle, with one text of its metadata replaced by another of the same length.
 fn altered(bundle: &Path, folder: &Path, from: &str, to: &str) -> PathBuf {
     assert_eq!(from.len(), to.len());
     let mut bytes = fs::read(bundle).unwrap();
@@ -183,7 +183,7 @@ fn bad_arguments_are_refused() {
     );
 }
 
-/// Who types what earlier releases took is told in one line what it is called now.
+/// Tests that options of earlier releases, which are subcommands now, are refused in one line that names the subcommand.
 #[test]
 fn options_that_have_become_jobs_are_named() {
     for (arguments, now) in [

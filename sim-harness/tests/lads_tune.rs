@@ -1,4 +1,4 @@
-//! `lads-run tune`: what it finds for a shipped policy, what it writes, and what it refuses.
+//! Tests `lads-run tune`: what it finds for a shipped policy, what it writes, and what it refuses.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -6,7 +6,7 @@ use std::process::{Command, Output};
 
 use lads_compiler::{Bundle, CacheFormat, Evidence, Storage, Tuned, WeightFormat};
 
-/// A file of the project, by its path from the root.
+/// Returns a file of the project, by its path from the root.
 fn project_file(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
 }

@@ -1,4 +1,4 @@
-//! `lads-run verify`: the certificate of the shipped policy, its form, its exit codes, and every reference that is refused.
+//! Tests `lads-run verify`: the certificate of the shipped policy, its form, its exit codes, and every reference that is refused.
 
 #[path = "common/interrupt.rs"]
 mod interrupt;
@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use lads_compiler::{Bundle, CacheFormat, Options, Storage, WeightFormat};
 use serde_json::Value;
 
-/// A file of the project, by its path from the root.
+/// Returns a file of the project, by its path from the root.
 fn project_file(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
 }
@@ -76,7 +76,7 @@ fn few_episodes_agree_on_every_instruction_set_and_are_too_few() {
     assert!(certificates.windows(2).all(|pair| pair[0] == pair[1]));
 }
 
-/// The image that goes into the machine is what is verified, here one with fewer bits where they only help to choose the plan.
+/// Tests that a given image is verified, here one with fewer bits where they only help to choose the plan.
 #[test]
 fn a_given_image_is_what_is_verified() {
     let folder = tempfile::tempdir().unwrap();
@@ -179,7 +179,7 @@ fn the_page_is_one_file_that_names_the_verdict() {
     );
 }
 
-/// What is printed says where the reference's weights came from, what that leaves open, and what was not looked at.
+/// Tests that the output says where the reference's weights came from, what that leaves open, and what was not looked at.
 #[test]
 fn the_source_of_the_reference_is_printed() {
     let output = verify(&["--episodes", "1", "--instruction", "kbls"]);
@@ -223,7 +223,7 @@ fn the_source_of_the_reference_is_printed() {
     );
 }
 
-/// A reference of the first version records neither contract nor logits: its silence is no agreement.
+/// Tests a reference of the first version, which records neither contract nor logits: its silence is not agreement.
 #[test]
 fn a_reference_without_a_contract_decides_nothing() {
     let folder = tempfile::tempdir().unwrap();
@@ -263,7 +263,7 @@ fn refused(arguments: &[&str], parts: &[&str]) {
     }
 }
 
-/// The reference with one text of it replaced.
+/// Copies the reference, with one text of it replaced.
 fn altered(folder: &Path, from: &str, to: &str) -> String {
     let text = fs::read_to_string(project_file("models/kitchen.reference.json")).unwrap();
     assert!(text.contains(from), "{from}");

@@ -1,4 +1,4 @@
-//! `lads-run view`: that a window changes nothing, and what is refused.
+//! Tests `lads-run view`: that a window changes nothing, and what is refused.
 //!
 //! The tests that open a window need the X server that needs no screen (Xvfb), and EGL; without them they are skipped with a printed line.
 #![cfg(feature = "viewer")]
@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-/// Without the display of whoever runs the tests.
+/// Makes a `lads-run` command without the display of whoever runs the tests.
 fn lads_run(model: &str, arguments: &[&str]) -> Command {
     let mut command = program::lads_run(model, arguments);
     command.env_remove("DISPLAY");
@@ -30,7 +30,7 @@ struct Display {
 }
 
 impl Display {
-    /// `None`, after a line, where there is none to be had.
+    /// Starts an X server; `None`, after a line, where Xvfb is not installed.
     fn open() -> Option<Self> {
         let server = Command::new("Xvfb")
             .args(["-displayfd", "1", "-screen", "0", "1024x768x24"])
@@ -57,7 +57,7 @@ impl Drop for Display {
     }
 }
 
-/// Whether this machine lacks what pictures need, which is then said.
+/// Whether this machine lacks what pictures need; prints that it does.
 fn lacks_egl(errors: &str) -> bool {
     let lacks = errors.contains("by EGL");
     if lacks {
@@ -66,13 +66,13 @@ fn lacks_egl(errors: &str) -> bool {
     lacks
 }
 
-/// What ran, without measured times.
+/// Reads the JSON results without measured times.
 fn runs(json: &Path) -> Value {
     let results: Value = serde_json::from_str(&fs::read_to_string(json).unwrap()).unwrap();
     results["instructions"].clone()
 }
 
-/// Exit code 2 and one line with all `parts`.
+/// Asserts exit code 2 and one line on stderr with all `parts`.
 fn assert_refused(output: &Output, parts: &[&str]) {
     let errors = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(2), "{errors}");

@@ -1,5 +1,5 @@
-//! The `LOReL` table against trajectories of the Python implementation (`exporter/lads_exporter/lorel_table.py`), its own promises, and
-//! what `lads-collect` makes of it.
+//! Tests the `LOReL` table against trajectories of the Python implementation (`exporter/lads_exporter/lorel_table.py`), its own promises,
+//! and what `lads-collect` makes of it.
 
 use std::num::NonZeroUsize;
 use std::sync::OnceLock;
@@ -22,7 +22,7 @@ struct Recorded {
     succeeded: Vec<String>,
 }
 
-/// Loaded once, so that its settled postures are made once.
+/// Loads the scene once, so that its settled postures are made once.
 fn scene() -> &'static Scene {
     static SCENE: OnceLock<Scene> = OnceLock::new();
     SCENE.get_or_init(|| Scene::load(&vendor_dir()).unwrap_or_else(|error| panic!("{error}")))

@@ -1,4 +1,4 @@
-//! The certificate against changed policies, a few of each kind; `make mutate` has all of them.
+//! Tests the certificate against changed policies, a few of each kind; `make mutate` has all of them.
 
 #[path = "common/mutate.rs"]
 mod mutate;
@@ -7,12 +7,12 @@ use std::path::{Path, PathBuf};
 
 use lads_compiler::Options;
 use lads_proof::reference::Reference;
-use mutate::{Judged, Model, Said};
+use mutate::{Judged, Model, Outcome};
 
-/// What is added at the end of the low level.
+/// Bias that is added at the end of the low level.
 const LAST_BIAS: &str = "low_level.layer.6.bias";
 
-/// The first traced episode of each seventh instruction.
+/// Distance of the instructions whose first traced episode is asked about: each seventh.
 const EVERY: usize = 7;
 
 fn project_file(path: &str) -> PathBuf {
@@ -27,8 +27,8 @@ fn shipped() -> (Model, Reference) {
 
 fn judged(model: &Model, reference: &Reference) -> Box<Judged> {
     match mutate::verify(model.bytes(), &Options::exact(), reference, EVERY) {
-        Said::Judged(judged) => judged,
-        Said::Refused(why) => panic!("{why}"),
+        Outcome::Judged(judged) => judged,
+        Outcome::Refused(why) => panic!("{why}"),
     }
 }
 
@@ -54,7 +54,7 @@ fn what_is_harmless_is_not_different() {
     );
 }
 
-/// The head times ten chooses the same plans; so does the encoder, which chooses none.
+/// Tests changes that keep every plan: the head times ten chooses the same plans; so does the encoder, which chooses none.
 #[test]
 fn what_chooses_the_same_plans_is_different_all_the_same() {
     let (model, reference) = shipped();
@@ -179,7 +179,7 @@ fn every_field_of_the_contract_is_compared_or_refused() {
     );
 }
 
-/// An image is compared with its bundle in everything that it holds of a contract: one change of each kind is found, and named.
+/// Tests that an image is compared with its bundle in every contract field that it holds: one change of each kind is found and named.
 #[test]
 fn an_image_of_another_bundle_is_told_apart_by_every_kind_of_field() {
     use serde_json::json;
@@ -325,7 +325,7 @@ fn an_image_of_another_bundle_is_told_apart_by_every_kind_of_field() {
     );
 }
 
-/// The attack that made EQUIVALENT of a policy that fails: it samples at temperature 5.
+/// Tests the attack that made EQUIVALENT of a policy that fails: it samples at temperature 5.
 #[test]
 fn another_rule_is_different_and_runs() {
     let (model, reference) = shipped();

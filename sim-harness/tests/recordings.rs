@@ -1,4 +1,4 @@
-//! Recorded episodes in an environment without a simulator: what is written is read, replayed, encoded and followed.
+//! Tests recorded episodes in an environment without a simulator: what is written is read, replayed, encoded and followed.
 
 #[path = "common/bench.rs"]
 mod bench;
@@ -6,7 +6,7 @@ mod bench;
 use std::io::Cursor;
 use std::sync::atomic::AtomicBool;
 
-use bench::{Bench, Says, tiny_contract, tiny_policy};
+use bench::{Bench, Spec, tiny_contract, tiny_policy};
 use lads_core::{Channel, Decision, Isa, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Setup};
@@ -37,7 +37,7 @@ fn try_evaluate(
     threads: usize,
     setup: Setup<'_>,
 ) -> Result<Evaluated, EvaluationError> {
-    let commanded = fit::check(tiny_contract(), &Bench::new(Says::default())).unwrap();
+    let commanded = fit::check(tiny_contract(), &Bench::new(Spec::default())).unwrap();
     let assignments: Vec<_> = (0..)
         .zip(commanded)
         .map(|(instruction, commanded)| Assignment {
@@ -61,7 +61,7 @@ fn try_evaluate(
             ..setup
         },
     };
-    let open = || -> Box<dyn Environment> { Box::new(Bench::new(Says::default())) };
+    let open = || -> Box<dyn Environment> { Box::new(Bench::new(Spec::default())) };
     evaluation.run(&open, &AtomicBool::new(false), &|| {})
 }
 
@@ -75,7 +75,7 @@ fn log(policy: &Policy<'_>, evaluated: &Evaluated) -> Log {
         let done = &mut trace.outcome.completions;
         let completed = done
             .iter()
-            .map(|c| Says::default().sub_tasks[c.sub_task].to_owned());
+            .map(|c| Spec::default().sub_tasks[c.sub_task].to_owned());
         let completed: Vec<_> = completed.collect();
         // As a log has it: its place among the completed.
         done.iter_mut()
@@ -148,7 +148,7 @@ fn a_log_reads_back_and_replays_bit_for_bit() {
     }
 }
 
-/// Of a policy that selects nothing and draws at random.
+/// Tests the log of a policy that selects nothing and draws at random.
 #[test]
 fn a_log_without_plans_reads_back() {
     let policy = tiny_policy();

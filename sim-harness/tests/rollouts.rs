@@ -1,29 +1,30 @@
-//! Rollouts with a compiled policy in an environment without a simulator: what they report, and that threads do not show.
+//! Tests rollouts with a compiled policy in an environment without a simulator: what they report, and that the number of threads does not
+//! show.
 
 #[path = "common/bench.rs"]
 mod bench;
 
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
-use bench::{Bench, Says, tiny_contract, tiny_policy};
+use bench::{Bench, Spec, tiny_contract, tiny_policy};
 use lads_core::{Decision, Isa, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Setup};
 use lads_sim::fit;
-use lads_sim::rollout::{Actor, Episode, Glimpse, Go, Onlooker, Stand};
+use lads_sim::rollout::{Actor, Control, Episode, Observer, Phase, Snapshot};
 
-/// The seed is replaced by one per episode.
+/// Decision rule of the tests; the seed is replaced by one per episode.
 const SAMPLE: Decision = Decision::Sample {
     temperature: 1.0,
     seed: 0,
 };
 
 fn open() -> Box<dyn Environment> {
-    Box::new(Bench::new(Says::default()))
+    Box::new(Bench::new(Spec::default()))
 }
 
 fn assignments() -> Vec<Assignment> {
-    let commanded = fit::check(tiny_contract(), &Bench::new(Says::default())).unwrap();
+    let commanded = fit::check(tiny_contract(), &Bench::new(Spec::default())).unwrap();
     (0..)
         .zip(commanded)
         .map(|(instruction, commanded)| Assignment {
@@ -75,35 +76,35 @@ fn the_number_of_threads_does_not_show() {
     }
 }
 
-/// Has the first episode again after five control steps, and once more at its end; stops the third in the middle.
+/// Restarts the first episode after five control steps, and once more at its end; stops the third in the middle.
 #[derive(Debug, Default)]
-struct Restless {
+struct RestartingObserver {
     looks: AtomicUsize,
     agains: AtomicUsize,
 }
 
-impl Onlooker for Restless {
-    fn look(&self, glimpse: Glimpse<'_>) -> Go {
+impl Observer for RestartingObserver {
+    fn observe(&self, snapshot: Snapshot<'_>) -> Control {
         self.looks.fetch_add(1, Ordering::Relaxed);
-        let (episode, steps) = (glimpse.task.seed.episode, glimpse.environment.steps());
+        let (episode, steps) = (snapshot.task.seed.episode, snapshot.environment.steps());
         let agains = self.agains.load(Ordering::Relaxed);
-        let ended = matches!(glimpse.stand, Stand::Ended { .. });
+        let ended = matches!(snapshot.phase, Phase::Ended { .. });
         if episode == 0 && ((agains == 0 && steps == 5) || (agains == 1 && ended)) {
             self.agains.fetch_add(1, Ordering::Relaxed);
-            return Go::Again;
+            return Control::Restart;
         }
         if episode == 2 && steps == 3 {
-            return Go::Stop;
+            return Control::Stop;
         }
-        Go::On
+        Control::Continue
     }
 }
 
 #[test]
-fn who_looks_on_changes_no_episode() {
+fn an_observer_changes_no_episode() {
     let policy = tiny_policy();
     let assignments = assignments();
-    let restless = Restless::default();
+    let observer = RestartingObserver::default();
     let evaluation = Evaluation {
         policy,
         contract: tiny_contract(),
@@ -115,7 +116,7 @@ fn who_looks_on_changes_no_episode() {
         isa: Isa::detect(),
         threads: 1,
         setup: Setup {
-            onlooker: Some(&restless),
+            observer: Some(&observer),
             traced: 1,
             ..Setup::default()
         },
@@ -130,7 +131,7 @@ fn who_looks_on_changes_no_episode() {
     assert_eq!(seen.traces[0].steps.len(), plain[0][0].steps);
     // One look at every action and one at every end: the first episode's beginning and twice the whole, the third up to its fourth step.
     let [first, second] = [0, 1].map(|episode| plain[0][episode].steps + 1);
-    let looks = restless.looks.load(Ordering::Relaxed);
+    let looks = observer.looks.load(Ordering::Relaxed);
     assert_eq!(looks, 6 + 2 * first + second + 4);
     let interrupted = evaluation.run(&open, &AtomicBool::new(false), &|| {});
     assert!(matches!(interrupted, Err(EvaluationError::Interrupted)));
@@ -238,59 +239,59 @@ fn a_stop_ends_the_work_without_a_result() {
 
 #[test]
 fn a_contract_that_does_not_fit_is_refused_by_name() {
-    let refusal = |says: Says| {
-        fit::check(tiny_contract(), &Bench::new(says))
+    let refusal = |spec: Spec| {
+        fit::check(tiny_contract(), &Bench::new(spec))
             .unwrap_err()
             .to_string()
     };
-    let says = Says::default;
+    let spec = Spec::default;
     let cases = [
         (
-            refusal(Says {
+            refusal(Spec {
                 id: "other",
-                ..says()
+                ..spec()
             }),
             ["environment.id", "'tiny-bench'", "'other'"],
         ),
         (
-            refusal(Says {
+            refusal(Spec {
                 version: "2",
-                ..says()
+                ..spec()
             }),
             ["environment.version", "'1'", "'2'"],
         ),
         (
-            refusal(Says {
+            refusal(Spec {
                 control_period_s: 0.04,
-                ..says()
+                ..spec()
             }),
             ["control_period_s", "0.05", "0.04"],
         ),
         (
-            refusal(Says {
+            refusal(Spec {
                 observation_names: &["joint1"],
-                ..says()
+                ..spec()
             }),
             ["observation", "5 elements", "has 1"],
         ),
         (
-            refusal(Says {
+            refusal(Spec {
                 action_names: &[],
-                ..says()
+                ..spec()
             }),
             ["action", "3 elements", "has 0"],
         ),
         (
-            refusal(Says {
+            refusal(Spec {
                 observation_names: &["joint2", "joint1", "drawer", "lamp", "lever"],
-                ..says()
+                ..spec()
             }),
             ["element 0", "'joint1'", "'joint2'"],
         ),
         (
-            refusal(Says {
+            refusal(Spec {
                 sub_tasks: &["drawer", "lamp"],
-                ..says()
+                ..spec()
             }),
             ["'lv'", "'lever'", "does not know"],
         ),
@@ -303,7 +304,7 @@ fn a_contract_that_does_not_fit_is_refused_by_name() {
     }
 }
 
-/// A thread that panics ends the others after their current episode, not after the whole queue.
+/// Tests that a thread that panics ends the others after their current episode, not after the whole queue.
 #[test]
 fn a_panic_stops_all_threads() {
     let policy = tiny_policy();

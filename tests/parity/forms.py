@@ -1,4 +1,4 @@
-"""The forms in which policy files lie in public repositories: one small ONNX file each, with random weights of its own.
+"""Makes policy files in the forms that public repositories have: one small ONNX file each, with random weights of its own.
 
     python tests/parity/forms.py FOLDER
 
@@ -29,7 +29,7 @@ N, M = 12, 4  # observations and actions of most forms
 
 @dataclass
 class Form:
-    """A file, and what its owner knows of it."""
+    """A policy file, and what its owner knows of it."""
 
     name: str
     model: onnx.ModelProto
@@ -45,7 +45,7 @@ def mlp(activation, n=N, m=M, hidden=(32, 24, 16)):
 
 
 class Normalized(nn.Module):
-    """rsl_rl and mjlab: the normaliser is in the graph."""
+    """Form of rsl_rl and mjlab: the normaliser is in the graph."""
 
     def __init__(self, by_division):
         super().__init__()
@@ -60,7 +60,7 @@ class Normalized(nn.Module):
 
 
 class GaussianHead(nn.Module):
-    """Actions, and log-probabilities that a controller needs none of."""
+    """Form with actions, and log-probabilities that a controller does not need."""
 
     def __init__(self):
         super().__init__()
@@ -73,7 +73,7 @@ class GaussianHead(nn.Module):
 
 
 class Recurrent(nn.Module):
-    """rsl_rl and Isaac Lab: a recurrent layer with its state at the edge of the graph."""
+    """Form of rsl_rl and Isaac Lab: a recurrent layer with its state at the edge of the graph."""
 
     def __init__(self, kind, layers=1, hidden=16):
         super().__init__()
@@ -89,7 +89,7 @@ class Recurrent(nn.Module):
 
 
 class GruCell(nn.Module):
-    """torchrl: a GRU cell, with a flag that clears the state."""
+    """Form of torchrl: a GRU cell, with a flag that clears the state."""
 
     def __init__(self, hidden=16):
         super().__init__()
@@ -106,7 +106,7 @@ class GruCell(nn.Module):
 
 
 class Window(nn.Module):
-    """A GRU over a window of observations, without a state."""
+    """Form with a GRU over a window of observations, without a state."""
 
     def __init__(self, steps, width=6, hidden=16):
         super().__init__()
@@ -119,7 +119,7 @@ class Window(nn.Module):
 
 
 class Convolved(nn.Module):
-    """1-d convolutions over a history."""
+    """Form with 1-d convolutions over a history."""
 
     def __init__(self, steps=20, width=6):
         super().__init__()
@@ -132,7 +132,7 @@ class Convolved(nn.Module):
 
 
 class Latent(nn.Module):
-    """An encoder whose latent vector has length one, joined with the newest observation."""
+    """Form with an encoder whose latent vector has length one, joined with the newest observation."""
 
     def __init__(self):
         super().__init__()
@@ -144,7 +144,7 @@ class Latent(nn.Module):
 
 
 class Normed(nn.Module):
-    """Layer norm between the layers."""
+    """Form with layer norm between the layers."""
 
     def __init__(self):
         super().__init__()
@@ -155,7 +155,7 @@ class Normed(nn.Module):
 
 
 class Motion(nn.Module):
-    """whole_body_tracking: a policy with the motion that it follows, by time step."""
+    """Form of whole_body_tracking: a policy with the motion that it follows, by time step."""
 
     def __init__(self, steps=40):
         super().__init__()
@@ -171,7 +171,7 @@ class Motion(nn.Module):
 
 
 class Attentive(nn.Module):
-    """Products of three axes, written as Einstein sums, and a softmax."""
+    """Form with products of three axes, written as Einstein sums, and a softmax."""
 
     def __init__(self):
         super().__init__()
@@ -184,7 +184,7 @@ class Attentive(nn.Module):
 
 
 class Folded(nn.Module):
-    """What is left of indexing and assignments: operators over constants alone."""
+    """Form with leftovers of indexing and assignments: operators over constants alone."""
 
     def __init__(self):
         super().__init__()
@@ -200,7 +200,7 @@ class Folded(nn.Module):
 
 
 def traced(module, inputs, names, outputs, opset, dynamo=False, batch=None):
-    """Exports a module; values of `batch` get a symbolic first axis of that name."""
+    """Exports a module by tracing; values of `batch` get a symbolic first axis of that name."""
     axes = {name: {0: batch} for name in [*names, *outputs]} if batch else None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -213,7 +213,8 @@ def traced(module, inputs, names, outputs, opset, dynamo=False, batch=None):
 
 
 def torch_forms():
-    """(name, module, inputs, names of inputs, names of outputs, states, limits, keywords), the action first."""
+    """Lists the forms that PyTorch exports: (name, module, inputs, names of inputs, names of outputs, states, limits, keywords), the action
+    first."""
     observed = (torch.randn(1, N),)
     plain = (["obs"], ["actions"], {}, {})
     activations = [nn.ELU, nn.SELU, nn.Mish, nn.Softplus, nn.Hardswish, nn.Hardsigmoid, nn.Softsign, nn.PReLU, nn.ReLU6, nn.Hardtanh, nn.SiLU, nn.Sigmoid]
@@ -248,7 +249,7 @@ def torch_forms():
 
 
 def built(nodes, constants, inputs, outputs, opset, ir=8, kind=TensorProto.FLOAT, listed=False):
-    """A graph of nodes. `listed`: the initializers are among the inputs too, as files of IR version 3 have them."""
+    """Builds a graph of nodes. `listed`: the initializers are among the inputs too, as files of IR version 3 have them."""
     tensors = [numpy_helper.from_array(np.asarray(array), name) for name, array in constants.items()]
     value = lambda name, shape: helper.make_tensor_value_info(name, kind, shape)
     given = [value(*pair) for pair in inputs.items()]
@@ -355,7 +356,7 @@ def built_forms(random):
 
 
 def forms(wanted=lambda name: True):
-    """All forms whose names are wanted, in a fixed order."""
+    """Yields all forms whose names are wanted, in a fixed order."""
     newer = importlib.util.find_spec("onnxscript") is not None
     torch.manual_seed(7)
     for name, module, inputs, names, outputs, states, limits, more in torch_forms():

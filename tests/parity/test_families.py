@@ -1,5 +1,5 @@
-"""Every family of policies through the runtime, beside ONNX Runtime: random bundles and episodes, made here by the exporter's own twin of the
-schedule, and the ignored tests of `lads-tests` on them (`families`, and the instruction counts where valgrind is installed).
+"""Tests every family of policies through the runtime, beside ONNX Runtime: random bundles and episodes, made here by the exporter's own
+twin of the schedule, and the ignored tests of `lads-tests` on them (`families`, and the instruction counts where valgrind is installed).
 
 Skipped where the exporter's environment or cargo is missing.
 """
@@ -31,7 +31,7 @@ def exporter(*arguments):
 
 @pytest.fixture(scope="module")
 def families(tmp_path_factory):
-    """-> the folder with a bundle and an episode of each kind."""
+    """Makes the folder with a bundle and an episode of each kind."""
     folder = tmp_path_factory.mktemp("families")
     for kind in KINDS:
         exporter("random", "--kind", kind, "-o", folder / f"{kind}.onnx")
@@ -40,7 +40,7 @@ def families(tmp_path_factory):
 
 
 def ignored(target, folder, *names):
-    """-> what the ignored tests of a target printed, and how many passed."""
+    """Runs the ignored tests of a target -> what they printed, and how many passed."""
     if not shutil.which("cargo"):
         pytest.skip("cargo is not installed")
     command = ["cargo", "test", *SELECTION, "--test", target, "--", "--ignored", "--nocapture", *names]
@@ -55,7 +55,8 @@ def test_every_family_replays(families):
 
 
 def test_edited_images_and_bundles(families):
-    """The fuzz targets' functions on edit scripts of a seeded generator: images of every family, and the bundle of a policy that sees images."""
+    """Runs the fuzz targets' functions on edit scripts of a seeded generator: images of every family, and the bundle of a policy that sees
+    images."""
     if not shutil.which("cargo"):
         pytest.skip("cargo is not installed")
     command = ["cargo", "test", *SELECTION, "--test", "hostile", "--", "--nocapture", "edited"]

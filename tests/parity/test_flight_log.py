@@ -1,4 +1,4 @@
-"""A flight log is a file that others read: MCAP's own reader with its checksums, and a JSON Schema validator, which know nothing of lads.
+"""Tests that others can read a flight log: MCAP's own reader with its checksums, and a JSON Schema validator, which know nothing of lads.
 
 Run with `python -m pytest tests/parity` in the exporter's environment, after `cargo build -p lads-sim`. Skipped where either is missing.
 """
@@ -23,7 +23,7 @@ STEPS = ("/observation", "/action", "/plan", "/timing", "/gripper")
 
 @pytest.fixture(params=[("kitchen", "kbls"), ("lorel", "open drawer")], ids=lambda case: case[0])
 def flight(request, tmp_path):
-    """-> the results, the log."""
+    """Records a flight -> the results, the log."""
     if not PROGRAM.is_file():
         pytest.skip("lads-run is not built: run `cargo build -p lads-sim`")
     model, instruction = request.param

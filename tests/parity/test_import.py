@@ -1,4 +1,5 @@
-"""Every form of policy file that lies in public repositories, imported with `lads import` and stepped with `lads act`, beside ONNX Runtime.
+"""Tests every form of policy file that public repositories have, imported with `lads import` and stepped with `lads act`, beside ONNX
+Runtime.
 
 The files are made by `forms.py`. ONNX Runtime runs the file as it is, its states fed back by hand; the runtime has only the bundle and raw
 values. 200 steps with resets. Skipped where ONNX Runtime or cargo is missing.
@@ -34,7 +35,7 @@ BEGINS = ("is_init",)
 
 @pytest.fixture(scope="module")
 def lads():
-    """-> the path of the command."""
+    """Builds the command `lads` -> its path."""
     if not shutil.which("cargo"):
         pytest.skip("cargo is not installed")
     subprocess.run(["cargo", "build", "--quiet", *SELECTION, "--bin", "lads"], cwd=ROOT, check=True)
@@ -42,7 +43,7 @@ def lads():
 
 
 def inputs(form):
-    """-> (name, shape with batches of one, numpy type) of all inputs that are no weights."""
+    """Lists all inputs that are not weights -> (name, shape with batches of one, numpy type)."""
     weights = {tensor.name for tensor in form.model.graph.initializer}
     for value in form.model.graph.input:
         if value.name not in weights:
@@ -52,7 +53,7 @@ def inputs(form):
 
 
 def described(form, width):
-    """What a person says of the file: as little as is needed."""
+    """Returns a person's description of the file: as little as is needed."""
     terms = []
     for number, (name, shape, _) in enumerate(inputs(form)):
         if name in form.states:
@@ -70,7 +71,7 @@ def described(form, width):
 
 
 def stepped(session, form, rows):
-    """What ONNX Runtime does: rows {input: [STEPS, ...]} -> actions [STEPS, A]."""
+    """Runs ONNX Runtime: rows {input: [STEPS, ...]} -> actions [STEPS, A]."""
     shapes = {name: (shape, kind) for name, shape, kind in inputs(form)}
     outputs = [value.name for value in session.get_outputs()]
     actions = []

@@ -1,4 +1,4 @@
-"""The harness's kitchen against the official FrankaKitchen-v1 of gymnasium-robotics.
+"""Tests the harness's kitchen against the official FrankaKitchen-v1 of gymnasium-robotics.
 
 Run with `python -m pytest tests/parity`. Needs lads_exporter, numpy, mujoco 3.17.0, gymnasium and gymnasium-robotics 1.4.2, and the harness's
 `kitchen-trace` (`cargo build -p lads-sim`); skipped where they are missing. KITCHEN_TRACE names another binary.
@@ -29,7 +29,7 @@ STEPS = 1000
 
 
 def trace_binary():
-    """The harness's `kitchen-trace`: the newest build, or the one that KITCHEN_TRACE names."""
+    """Finds the harness's `kitchen-trace`: the newest build, or the one that KITCHEN_TRACE names."""
     if "KITCHEN_TRACE" in os.environ:
         return pathlib.Path(os.environ["KITCHEN_TRACE"])
     builds = [p for p in (TARGET / profile / "kitchen-trace" for profile in ("release", "debug")) if p.is_file()]
@@ -64,7 +64,7 @@ class Harness:
 
 @pytest.fixture
 def official(monkeypatch):
-    """FrankaKitchen-v1, made by `official(robot_noise_ratio, object_noise_ratio)`."""
+    """Makes FrankaKitchen-v1 by `official(robot_noise_ratio, object_noise_ratio)`."""
     monkeypatch.setattr(mujoco_utils, "get_joint_qpos", joint_qpos)
     monkeypatch.setattr(mujoco_utils, "get_joint_qvel", joint_qvel)
     made = []
@@ -85,7 +85,7 @@ def official(monkeypatch):
 
 
 def random_actions(seed, steps):
-    """Random actions that keep their direction for a while, so that the arm travels and touches things."""
+    """Draws random actions that keep their direction for a while, so that the arm travels and touches things."""
     rng = np.random.default_rng(seed)
     action = np.zeros(9)
     for _ in range(steps):
@@ -94,7 +94,7 @@ def random_actions(seed, steps):
 
 
 def same_run(environment, harness, observation, answer, actions):
-    """Steps both; returns the largest difference of the observations and the official completions."""
+    """Steps both environments; returns the largest difference of the observations and the official completions."""
     worst = np.abs(positions(observation) - answer["observation"]).max()
     completions = []
     for step, action in enumerate(actions, 1):
@@ -118,7 +118,7 @@ def test_random_actions_without_noise(official, seed):
 
 @pytest.mark.parametrize(("noise", "robot", "objects"), [("v0", 0.1, 0.1), ("v1", 0.01, 0.0005)])
 def test_the_closed_loop_with_our_noise_in_both(official, noise, robot, objects):
-    """Observation noise moves the set-points, so equal trajectories mean equal noise and equal use of it."""
+    """Tests that observation noise moves the set-points alike: equal trajectories mean equal noise and equal use of it."""
     entropy = [5, 3, 1]
     environment = official(robot, objects)
     robot_env = environment.robot_env
@@ -146,7 +146,7 @@ def test_completions_and_their_steps(official):
 
 
 def test_our_stream_is_numpys():
-    """v0 noise on a still scene is amplitude times the stream, number by number."""
+    """Tests that v0 noise on a still scene is amplitude times the stream, number by number."""
     for entropy in ([0, 0, 0], [7, 3, 12], [2**40 + 5, 21, 2**32 + 9]):
         with Harness() as harness:
             answer = harness.reset("v0", entropy)

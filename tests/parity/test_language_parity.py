@@ -1,4 +1,4 @@
-"""The language encoder outside Python: embeddings of `lads-language`, and what `lads-run` makes of them.
+"""Tests the language encoder outside Python: embeddings of `lads-language`, and what `lads-run` makes of them.
 
 The encoder is exported once for all tests here. Skipped where the exporter's environment is missing.
 """
@@ -45,7 +45,7 @@ def cache(tmp_path_factory):
 
 
 def test_embeddings_are_the_exporters(cache):
-    """Of all instructions of the shipped bundles, and of sentences outside their tables, to 1e-4."""
+    """Compares the embeddings of all instructions of the shipped bundles, and of sentences outside their tables, to 1e-4."""
     folder = cache / "language" / language.DEFAULT
     cases = []
     for name in ("kitchen", "lorel"):
@@ -66,7 +66,7 @@ def test_embeddings_are_the_exporters(cache):
 
 
 def lads_run(cache, model, *arguments):
-    """-> exit code, stdout, stderr; of the shipped bundle with its calibration, where the cache has that."""
+    """Runs lads-run on the shipped bundle with its calibration, where the cache has that -> exit code, stdout, stderr."""
     program = TARGET / "debug/lads-run"
     if not program.is_file():
         pytest.skip("lads-run is not built: run `make test-exporter`")
@@ -80,7 +80,7 @@ def lads_run(cache, model, *arguments):
 
 
 def results(cache, folder, model, *arguments):
-    """-> the table, the JSON."""
+    """Runs lads-run -> the table, the JSON."""
     file = folder / "results.json"
     code, table, wrong = lads_run(cache, model, "--episodes", "1", "--json", file, *arguments)
     assert code == 0, wrong
@@ -95,7 +95,7 @@ def refusal(cache, model, *arguments):
 
 @pytest.mark.parametrize(("model", "arguments", "count"), [("lorel", (), 101), ("kitchen", ("--instruction", "mkbs"), 1)])
 def test_table_and_encoder_make_the_same_episodes(cache, tmp_path, model, arguments, count):
-    """All 71 rephrased instructions are among LOReL's."""
+    """Tests all of LOReL's instructions, among them the 71 rephrased ones."""
     _, table = results(cache, tmp_path, model, *arguments)
     text, heard = results(cache, tmp_path, model, *arguments, "--encode-language")
     assert f"{count} instructions heard by the language encoder" in text

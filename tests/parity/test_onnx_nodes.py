@@ -1,4 +1,4 @@
-"""ONNX's own node conformance tests through the compiler and the core's executor.
+"""Runs ONNX's own node conformance tests through the compiler and the core's executor.
 
 The cases come from the `onnx` package. Each is written as one model with its data among the initializers; `runtime/compiler`'s test
 `onnx_node_cases` compiles and runs them all. Skipped where the package is missing.
@@ -29,7 +29,7 @@ OTHERWISE = {"test_resize_downsample_scales_linear_align_corners"}
 
 
 def write(case, folder):
-    """Writes a case; False for element types, or numbers of values, that a policy has none of."""
+    """Writes a case; False for element types, or numbers of values, that no policy has."""
     inputs, outputs = (list(values) for values in case.data_sets[0])
     if len(case.model.graph.node) == 1 and case.model.graph.node[0].op_type == "LayerNormalization":
         # Mean and deviation are optional outputs for training.
@@ -77,7 +77,8 @@ def write(case, folder):
 
 
 def gru(linear_before_reset):
-    """A GRU of three steps whose expected outputs are ONNX Runtime's: the package has no case of the variant that PyTorch exports."""
+    """Makes a case of a GRU of three steps whose expected outputs are ONNX Runtime's: the package has no case of the variant that PyTorch
+    exports."""
     ort = pytest.importorskip("onnxruntime")
     steps, batch, width, hidden = 3, 2, 4, 5
     shapes = {"X": [steps, batch, width], "W": [1, 3 * hidden, width], "R": [1, 3 * hidden, hidden], "B": [1, 6 * hidden]}
@@ -96,7 +97,7 @@ def gru(linear_before_reset):
 
 
 def drawn(number):
-    """A convolution, pool or change of size of random shape, whose expected output is ONNX Runtime's."""
+    """Makes a case of a convolution, pool or change of size of random shape, whose expected output is ONNX Runtime's."""
     ort = pytest.importorskip("onnxruntime")
     random = np.random.default_rng(number)
     whole = lambda low, high, count=None: random.integers(low, high + 1, count).tolist()

@@ -1,4 +1,4 @@
-"""The runtime (`lads act`) against ONNX Runtime on the same bundle: the same plans, actions within 1e-4, over whole episodes.
+"""Tests the runtime (`lads act`) against ONNX Runtime on the same bundle: the same plans, actions within 1e-4, over whole episodes.
 
 Run with `python -m pytest tests/parity` in the exporter's environment, after `cargo build -p lads-cli`. Skipped where either is missing.
 """
@@ -31,7 +31,7 @@ def lads():
 
 
 def act(bundle, instruction, observations):
-    """-> plans [T], actions [T, A] of the runtime."""
+    """Runs the runtime -> plans [T], actions [T, A]."""
     lines = "".join(json.dumps([float(x) for x in row]) + "\n" for row in observations)
     command = [lads(), "act", "--model", bundle, "--instruction", instruction, "--plans"]
     done = subprocess.run(command, input=lines, capture_output=True, text=True, timeout=120)
@@ -49,7 +49,7 @@ def bundle(request):
 
 
 def open_loop(reference, instruction, golden):
-    """-> what ONNX Runtime does on the golden observations under an instruction, and these."""
+    """Runs ONNX Runtime on the golden observations under an instruction -> its rollout, and the observations."""
     observations = golden["channel.observation"]
     return twin.open_loop(reference, instruction, {"observation": observations}), observations
 
@@ -66,7 +66,7 @@ def test_golden_episode(bundle):
 
 @pytest.mark.parametrize("offset", [1, 7])
 def test_other_instructions_on_the_same_observations(bundle, offset):
-    """What the observations mean does not matter here: any instruction has to give the same numbers.
+    """Tests other instructions on the same observations, whose meaning does not matter here: any instruction has to give the same numbers.
 
     Two logits may be closer than rounding; from there on the two may rightly differ, so the comparison ends at the first
     decision with a margin below the tolerance.

@@ -1,4 +1,4 @@
-"""`lads-run verify` calls a damaged policy DIFFERENT.
+"""Tests that `lads-run verify` calls a damaged policy DIFFERENT.
 
 Each damage is done to the shipped bundle's ONNX file, and the golden episode is recorded anew with the damaged graph, as an exporter with
 that fault would: the self-test passes, and only the comparison with the reference can see it.
@@ -35,7 +35,7 @@ def lads_run():
 
 
 def verify(bundle, folder):
-    """-> exit code, certificate."""
+    """Runs `lads-run verify` -> exit code, certificate."""
     file = folder / "certificate.json"
     command = [lads_run(), "verify", "--model", bundle, "--reference", REFERENCE, "--certificate", file, "--instruction", "kbls", "--episodes", "1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
@@ -48,7 +48,7 @@ def properties(model):
 
 
 def edit(model, name, change):
-    """Replaces an initializer by what `change` makes of it."""
+    """Replaces an initializer by `change` of it."""
     tensor = next(row for row in model.graph.initializer if row.name.removeprefix("weights/") == name)
     changed = change(numpy_helper.to_array(tensor).copy())
     tensor.CopyFrom(numpy_helper.from_array(np.ascontiguousarray(changed), tensor.name))
@@ -59,7 +59,7 @@ READERS = ("high_level.embed_observation.weight", "low_level.layer.0.weight")
 
 
 def scale_off(model):
-    """The normaliser takes one joint's standard deviation for 2 % smaller than it is."""
+    """Damages the normaliser: it takes one joint's standard deviation for 2 % smaller than it is."""
 
     def change(weight):
         weight[:, JOINT] *= 1.02
@@ -70,7 +70,7 @@ def scale_off(model):
 
 
 def joints_swapped(model):
-    """Two joints arrive in each other's place."""
+    """Damages the observation: two joints arrive in each other's place."""
 
     def change(rows):
         order = list(range(rows.shape[-1]))
@@ -82,7 +82,7 @@ def joints_swapped(model):
 
 
 def horizon_off(model):
-    """Plans are decided every H + 1 steps; the trajectory encoder drops the last step of its longer window."""
+    """Damages the horizon: plans are decided every H + 1 steps; the trajectory encoder drops the last step of its longer window."""
     contract = json.loads(properties(model)["lads.contract"])
     horizon, graph = contract["family"]["horizon"], model.graph
     contract["family"]["horizon"] += 1
@@ -105,7 +105,7 @@ def horizon_off(model):
 
 
 def second_best(model):
-    """The likeliest plan is never taken: its logit is pushed below the others."""
+    """Damages the choice: the likeliest plan is never taken, as its logit is pushed below the others."""
     graph = model.graph
     graph.initializer.extend(
         [
@@ -134,7 +134,7 @@ def set_property(model, key, value):
 
 
 def record_golden(model):
-    """The golden episode as an exporter with this fault would have recorded it."""
+    """Records the golden episode as an exporter with this fault would have recorded it."""
     golden = load(base64.b64decode(properties(model)["lads.golden"]))
     runner = exporter.twin.Twin(model)
     index, channels = int(golden["instruction"][0]), {"observation": golden["channel.observation"][: runner.steps]}
@@ -159,7 +159,7 @@ def test_a_damaged_policy_is_different(damage, tmp_path):
 
 
 def test_another_rule_is_different_though_the_networks_are_the_same(tmp_path):
-    """What runs samples at temperature 5, and hardly ever succeeds: the contract is compared, and its own rule is what is run."""
+    """Tests a policy that samples at temperature 5, and hardly ever succeeds: the contract is compared, and its own rule is what is run."""
     model = onnx.load(BUNDLE)
     contract = json.loads(properties(model)["lads.contract"])
     contract["family"]["decision"] |= {"rule": "sample", "temperature": 5.0}

@@ -1,7 +1,7 @@
-//! The project's documents, read as Markdown: blocks of code, what is set in the font of code, the commands among them, and links.
+//! Reads the project's documents as Markdown: blocks of code, inline code, the commands among them, and links.
 //!
 //! The first word of a block's info string is its language; of a block of commands (`sh`) the second one says when a test runs it, see
-//! [`When`]. A block of commands without it is no block of commands to [`Block::when`], and a test refuses that.
+//! [`When`]. A block of commands without it is not a block of commands to [`Block::when`], and a test refuses that.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -11,37 +11,37 @@ use pulldown_cmark::{CodeBlockKind, Event, Options, Parser, Tag, TagEnd};
 
 use crate::project_path;
 
-/// When the commands of a block are run by a test.
+/// Says when the commands of a block are run by a test.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum When {
-    /// `short`: with every run of the tests.
+    /// Class `short`: with every run of the tests.
     Always,
-    /// `long`: with the full suite, `make test-full`.
+    /// Class `long`: with the full suite, `make test-full`.
     Full,
-    /// `manual`, and then the reason: hours, a screen or a quiet machine are needed; only what they would run is looked at.
+    /// Class `manual`, and then the reason: hours, a screen or a quiet machine are needed; only what they would run is looked at.
     Never,
 }
 
 /// A block of code.
 #[derive(Debug, Clone)]
 pub struct Block {
-    /// The document, from the project's root.
+    /// Path of the document, from the project's root.
     pub document: String,
-    /// The line that it begins in, from 1.
+    /// Line in which the block begins, from 1.
     pub line: usize,
-    /// The words behind the opening fence.
+    /// Info string behind the opening fence.
     pub info: String,
-    /// What is in it.
+    /// Text of the block.
     pub text: String,
 }
 
 impl Block {
-    /// The language.
+    /// Language of the block.
     pub fn language(&self) -> &str {
         self.info.split([' ', ',']).next().unwrap_or_default()
     }
 
-    /// When its commands are run; `None` where nothing or nonsense is said.
+    /// Class of the block's commands; `None` where none or an unknown one is given.
     pub fn when(&self) -> Option<When> {
         let mut words = self.info.split_whitespace();
         let kind = (words.next()?, words.next()?, words.next());
@@ -53,7 +53,7 @@ impl Block {
         }
     }
 
-    /// Its commands: lines that end in a backslash joined, comments and empty lines left out.
+    /// Commands of the block: lines that end in a backslash joined, comments and empty lines left out.
     pub fn commands(&self) -> Vec<String> {
         let joined = self.text.replace("\\\n", " ");
         let lines = joined.lines().map(|line| {
@@ -66,7 +66,7 @@ impl Block {
             .collect()
     }
 
-    /// Where it is, for messages.
+    /// Document and line of the block, for messages.
     pub fn place(&self) -> String {
         format!("{}:{}", self.document, self.line)
     }
@@ -84,11 +84,11 @@ pub struct Link {
 /// A document with its blocks.
 #[derive(Debug, Clone)]
 pub struct Document {
-    /// From the project's root.
+    /// Path of the document, from the project's root.
     pub name: String,
-    /// Its blocks of code.
+    /// Blocks of code, in order.
     pub blocks: Vec<Block>,
-    /// Everything else that is set in the font of code.
+    /// Inline code of the document.
     pub inline: Vec<String>,
     /// Its links and pictures.
     pub links: Vec<Link>,
@@ -96,7 +96,7 @@ pub struct Document {
     pub anchors: BTreeSet<String>,
 }
 
-/// All documents of the project, in the order of their names.
+/// Reads all documents of the project, in the order of their names.
 ///
 /// # Panics
 ///
@@ -174,7 +174,7 @@ fn anchor(heading: &str, taken: &BTreeSet<String>) -> String {
 /// Folders that hold nothing of the project's own.
 const FOREIGN: [&str; 6] = ["target", "vendor", "data", "runs", "out", "__pycache__"];
 
-/// The project's files whose names end so, from its root, in order.
+/// Lists the project's files whose names end in one of `endings`, from its root, in order.
 ///
 /// # Panics
 ///

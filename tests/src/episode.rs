@@ -1,5 +1,5 @@
-//! Recorded episodes of random policies: what was observed, which instructions and resets came when, and what the exporter's own twin
-//! of the schedule did with ONNX Runtime.
+//! Recorded episodes of random policies: observations, instructions and resets, and the answers of the exporter's twin of the schedule with
+//! ONNX Runtime.
 //!
 //! `python -m lads_exporter random` makes the bundles and `python -m lads_exporter episode` the episodes; `lads_exporter/episode.py` says
 //! what is in one. `tests/parity/test_families.py` makes them all, in the folder that [`FOLDER`] names.
@@ -9,10 +9,10 @@ use std::path::{Path, PathBuf};
 use lads_core::{ChannelId, Controller, DType, Data, Instruction, Policy, StepReport};
 use safetensors::{SafeTensors, tensor::TensorView};
 
-/// The environment variable that names the folder of bundles and episodes.
+/// Environment variable that names the folder of bundles and episodes.
 pub const FOLDER: &str = "LADS_FAMILIES";
 
-/// The kinds of random policies.
+/// Kinds of random policies.
 pub const KINDS: [&str; 12] = [
     "lads",
     "lang_dt",
@@ -28,7 +28,7 @@ pub const KINDS: [&str; 12] = [
     "images",
 ];
 
-/// Where the bundles and episodes lie.
+/// Returns the folder of the bundles and episodes.
 ///
 /// # Panics
 ///
@@ -41,7 +41,7 @@ pub fn folder() -> PathBuf {
     )
 }
 
-/// The values of a channel over all steps.
+/// Values of a channel over all steps.
 #[derive(Debug)]
 enum Values {
     F32(Vec<f32>),
@@ -63,13 +63,13 @@ impl Values {
 /// A recorded episode.
 #[derive(Debug)]
 pub struct Episode {
-    /// Before each step: nothing (-1), a reset (-2), or the instruction that is set.
+    /// Event before each step: nothing (-1), a reset (-2), or the instruction that is set.
     pub events: Vec<i64>,
-    /// The index in force after each step; -1 where none is selected.
+    /// Index in force after each step; -1 where none is selected.
     pub selected: Vec<i64>,
-    /// `[T, A]`
+    /// Actions, `[T, A]`.
     pub actions: Vec<f32>,
-    /// `[T, N]`, empty without noise.
+    /// Noise, `[T, N]`, empty without noise.
     noise: Vec<f32>,
     channels: Vec<(ChannelId, usize, Values)>,
     noise_channel: Option<ChannelId>,
@@ -121,17 +121,17 @@ impl Episode {
         }
     }
 
-    /// Control steps.
+    /// Number of control steps.
     pub fn steps(&self) -> usize {
         self.events.len()
     }
 
-    /// Whether it has noise.
+    /// Whether the episode has noise.
     pub fn is_noisy(&self) -> bool {
         !self.noise.is_empty()
     }
 
-    /// What is given in each step, the recorded noise with it or not.
+    /// Returns the inputs of each step, with the recorded noise or without.
     pub fn inputs(&self, with_noise: bool) -> Vec<Vec<(ChannelId, Data<'_>)>> {
         let width = self.noise.len() / self.steps().max(1);
         let row = |step: usize| {
@@ -144,7 +144,7 @@ impl Episode {
         (0..self.steps()).map(row).collect()
     }
 
-    /// Takes a controller through the episode on these inputs; allocates nothing.
+    /// Drives a controller through the episode on these inputs; allocates nothing.
     ///
     /// # Panics
     ///

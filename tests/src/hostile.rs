@@ -1,5 +1,5 @@
-//! Files as an attacker would write them: an edit script turns the small bundle, or the image made of it, into one that is almost
-//! sound, and everything that takes it has to refuse it or work.
+//! Hostile files: an edit script turns the small bundle, or the image made of it, into one that is almost sound, and everything that takes
+//! it has to refuse it or work.
 //!
 //! A script is a row of edits of eight bytes: what to do, where, and with which value. Any bytes are a script, so fuzzers (`tests/fuzz`)
 //! and the seeded mutator of `tests/tests/hostile.rs` drive the same two functions. Both panic when an invariant is broken.
@@ -18,16 +18,16 @@ use lads_image::format::{CRC_WORD, crc32};
 use crate::episode::{FOLDER, KINDS, folder};
 use crate::{compiled, wire};
 
-/// Bytes of one edit.
+/// Number of bytes of one edit.
 const EDIT_BYTES: usize = 8;
 
-/// Edits of a script that are carried out.
+/// Largest number of edits of a script that are carried out.
 const MOST_EDITS: usize = 32;
 
-/// The most elements that a caller of these tests lends; a policy that wants more is not run.
+/// Largest number of elements that a caller of these tests lends; a policy that wants more is not run.
 const MOST_ELEMENTS: usize = 1 << 20;
 
-/// Numbers that break things.
+/// Numbers that tend to break parsers.
 const VALUES: [u64; 16] = [
     0,
     1,
@@ -47,14 +47,14 @@ const VALUES: [u64; 16] = [
     u64::MAX,
 ];
 
-/// One edit.
+/// One edit of a script.
 #[derive(Debug, Clone, Copy)]
 pub struct Edit {
-    /// What to do; each function has its own meaning.
+    /// Operation; each function gives it its own meaning.
     pub kind: u8,
-    /// Where.
+    /// Place of the edit.
     pub place: usize,
-    /// With which value.
+    /// Value to write.
     pub value: u64,
 }
 
@@ -76,7 +76,7 @@ fn script(bytes: &[u8]) -> impl Iterator<Item = Edit> {
 /// The small bundle.
 const TINY: &[u8] = include_bytes!("../../runtime/compiler/tests/data/tiny.onnx");
 
-/// The images that are edited: the small bundle's, exact and with weights and cache of fewer bits, and where the parity tests have
+/// Returns the images that are edited: the small bundle's, exact and with weights and cache of fewer bits, and where the parity tests have
 /// made them, one of every family.
 fn images() -> &'static [Vec<u32>] {
     static IMAGES: OnceLock<Vec<Vec<u32>>> = OnceLock::new();
@@ -143,10 +143,10 @@ pub fn image(edits: &[u8]) {
     open_and_drive(&bytes);
 }
 
-/// The most multiply-adds of a step that these tests wait for; a policy that wants more is refused when it is opened.
+/// Largest number of multiply-adds of a step that these tests wait for; a policy that wants more is refused when it is opened.
 const MOST_WORK: u64 = 1 << 24;
 
-/// The values of an observation channel, in memory of their own.
+/// Values of an observation channel, in memory of their own.
 enum Values {
     F32(Vec<f32>),
     U8(Vec<u8>),
@@ -172,7 +172,7 @@ pub fn open_and_drive(bytes: &[u8]) {
     drive(bytes, true, 12);
 }
 
-/// Opens an image and takes what opens a few steps far, as [`open_and_drive`] does, without the self-test: for very many images.
+/// Opens an image and runs what opens for a few steps, as [`open_and_drive`] does, without the self-test: for very many images.
 ///
 /// # Panics
 ///
@@ -254,7 +254,7 @@ fn drive(bytes: &[u8], tested: bool, steps: u64) {
     }
 }
 
-/// The bundles that are edited: the small one, and where the parity tests have made it, one whose policy sees images.
+/// Returns the bundles that are edited: the small one, and where the parity tests have made it, one whose policy sees images.
 fn trees() -> &'static [Vec<wire::Field>] {
     static TREES: OnceLock<Vec<Vec<wire::Field>>> = OnceLock::new();
     TREES.get_or_init(|| {

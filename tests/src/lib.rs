@@ -1,4 +1,4 @@
-//! What suites that need more than one crate share; the suites are in `tests/`.
+//! Code shared by suites that need more than one crate; the suites are in `tests/`.
 #![forbid(unsafe_code)]
 
 pub mod documents;
@@ -10,12 +10,12 @@ use std::path::{Path, PathBuf};
 
 use lads_compiler::{Bundle, Image, compile};
 
-/// A file or folder of the project, by its path from the root.
+/// Returns a file or folder of the project, by its path from the root.
 pub fn project_path(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
 }
 
-/// The small bundle of the compiler's tests and every bundle that ships.
+/// Lists the small bundle of the compiler's tests and every bundle that ships.
 ///
 /// # Panics
 ///

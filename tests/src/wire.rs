@@ -1,11 +1,12 @@
-//! Protocol buffers as a tree of fields, without knowing their schema, so that one can be changed and the lengths around it still fit.
+//! Parses protocol buffers as a tree of fields, without knowing their schema, so that one can be changed and the lengths around it still
+//! fit.
 
 use crate::hostile::Edit;
 
-/// How deep messages are looked into.
+/// Largest depth of nested messages that is parsed.
 const MOST_DEPTH: usize = 8;
 
-/// The longest that an edit makes a message, in bytes.
+/// Largest size of a message after an edit, in bytes.
 const MOST_BYTES: usize = 1 << 20;
 
 /// One field of a message.
@@ -37,7 +38,7 @@ fn varint(bytes: &mut &[u8]) -> Option<u64> {
     None
 }
 
-/// The fields of a message; `None` when the bytes are none.
+/// Parses the fields of a message; `None` when the bytes are not a message.
 pub fn parse(bytes: &[u8]) -> Option<Vec<Field>> {
     parse_to(bytes, MOST_DEPTH)
 }
@@ -74,7 +75,7 @@ fn parse_to(mut rest: &[u8], depth: usize) -> Option<Vec<Field>> {
     Some(fields)
 }
 
-/// A message where the bytes are one, and are the same when written again.
+/// Parses the bytes as a message if they are one and are the same when written again.
 fn content_of(content: &[u8], depth: usize) -> Value {
     let parsed = (depth > 0 && content.len() > 1).then(|| parse_to(content, depth - 1));
     match parsed.flatten() {
@@ -91,7 +92,7 @@ fn put_varint(mut value: u64, out: &mut Vec<u8>) {
     out.push(value as u8);
 }
 
-/// The message of the fields.
+/// Writes the fields as a message.
 pub fn bytes(fields: &[Field]) -> Vec<u8> {
     let mut out = Vec::new();
     for Field { number, value } in fields {
@@ -170,7 +171,7 @@ pub fn edit(fields: &mut Vec<Field>, edit: Edit) {
     }
 }
 
-/// A small change inside a value.
+/// Changes a value slightly.
 fn change(value: &mut Value, with: u64) {
     match value {
         Value::Varint(old) => *old = old.wrapping_add(with),

@@ -1,4 +1,4 @@
-//! After construction a controller allocates nothing: counted by the global allocator over 1,000 control steps of every bundle.
+//! Tests that a controller allocates nothing after construction: counted by the global allocator over 1,000 control steps of every bundle.
 //!
 //! Only this thread's allocations count, so the test harness cannot disturb it.
 
@@ -13,7 +13,7 @@ mod counting;
 
 use counting::calls_during;
 
-/// 1,000 steps on the recorded observations, over and over: two instructions, one reset, both decision rules.
+/// Runs 1,000 steps on the recorded observations, over and over: two instructions, one reset, both decision rules.
 fn work(controller: &mut Controller<'_, '_>, action: &mut [f32]) {
     let golden = controller.policy().golden().unwrap();
     let mut steps = |controller: &mut Controller<'_, '_>, count| {

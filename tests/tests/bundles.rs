@@ -1,4 +1,4 @@
-//! Every bundle that ships, compiled and put to work on this machine.
+//! Tests every bundle that ships, compiled and run on this machine.
 
 use lads_core::{Instruction, Policy, Workspace, WorkspaceTooSmall};
 use lads_host::Memory;

@@ -1,4 +1,4 @@
-//! The examples of controllers build as strictly as compilers can and do what they say.
+//! Tests that the examples of controllers build as strictly as compilers can and do what they say.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -25,14 +25,14 @@ fn output(command: &mut Command) -> (bool, String) {
     (status.success(), text.concat())
 }
 
-/// Runs a command that has to succeed.
+/// Runs a command that has to succeed and returns its output.
 fn run(command: &mut Command) -> String {
     let (success, text) = output(command);
     assert!(success, "{command:?}\n{text}");
     text
 }
 
-/// The installed library.
+/// Installs the library once and returns its folder.
 fn prefix() -> &'static Path {
     static PREFIX: OnceLock<PathBuf> = OnceLock::new();
     PREFIX.get_or_init(|| {
@@ -42,7 +42,7 @@ fn prefix() -> &'static Path {
     })
 }
 
-/// The shipped policy's image, in a file.
+/// Compiles the shipped policy to a file once and returns its path.
 fn kitchen() -> &'static Path {
     static IMAGE: OnceLock<PathBuf> = OnceLock::new();
     IMAGE.get_or_init(|| {
@@ -168,7 +168,7 @@ fn the_rust_loop_runs() {
     );
 }
 
-/// The number behind `digest` in what a program prints.
+/// Returns the number behind `digest` in a program's output.
 fn digest(text: &str) -> &str {
     text.lines()
         .find_map(|line| line.strip_prefix("digest "))

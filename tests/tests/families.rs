@@ -1,4 +1,4 @@
-//! Every family of policies, beside ONNX Runtime: random policies of small size, driven by a recorded episode with two instructions,
+//! Tests every family of policies beside ONNX Runtime: random policies of small size, driven by a recorded episode with two instructions,
 //! resets and restarts of the context; see [`lads_tests::episode`].
 //!
 //! For each: equal selections and actions within a tolerance; the same bits on every instruction set, and whether noise is given or drawn
@@ -16,13 +16,14 @@ use lads_tests::hostile::{open_and_drive, open_and_step};
 #[path = "common/counting.rs"]
 mod counting;
 
-/// Largest difference of an action from ONNX Runtime's.
+/// Largest allowed difference of an action from ONNX Runtime's.
 const TOLERANCE: f32 = 1e-5;
 
-/// Of weights and the golden episode, whose values no check depends on, every so manieth byte is flipped.
+/// Interval of the bytes that are flipped in weights and the golden episode, whose values no check depends on.
 const SPARSE: usize = 997;
 
-/// Of the other bytes so many are flipped at most, evenly spread: where each of them is a step of many passes, all of them take minutes.
+/// Largest number of bytes that are flipped outside weights and golden episode, evenly spread: where each of them is a step of many passes,
+/// all of them take minutes.
 const MOST: usize = 30_000;
 
 fn image(kind: &str) -> Image {
@@ -35,7 +36,7 @@ fn episode(kind: &str, policy: &Policy) -> Episode {
     Episode::open(&folder().join(format!("{kind}.safetensors")), policy)
 }
 
-/// Runs a policy through its recorded episode, beside what ONNX Runtime did.
+/// Runs a policy through its recorded episode and compares with ONNX Runtime.
 fn replay(kind: &str) {
     let image = image(kind);
     let policy = Policy::new_checked(image.as_bytes());
@@ -80,7 +81,7 @@ fn replay(kind: &str) {
     }
 }
 
-/// Bits of all actions, and the selected indices, of the recorded episode.
+/// Returns the bits of all actions, and the selected indices, of the recorded episode.
 fn bits(policy: &Policy, isa: Isa, with_noise: bool, episode: &Episode) -> Vec<(i64, Vec<u32>)> {
     let mut memory = Memory::of(policy).expect("there is memory");
     let mut controller = memory
@@ -135,7 +136,7 @@ fn allocates_nothing(kind: &str) {
     assert_eq!(calls, 0, "{kind}");
 }
 
-/// Every truncation, with and without the header's length set right, and flips in all that is checked.
+/// Tests every truncation, with and without the header's length set right, and flips in all that is checked.
 fn damaged(kind: &str) {
     let image = image(kind);
     let whole = image.as_bytes();
@@ -181,13 +182,13 @@ fn damaged(kind: &str) {
     println!("{kind}: {} truncations, {flipped} flips", whole.len());
 }
 
-/// Gives an image the right checksum.
+/// Sets the right checksum of an image.
 fn sealed(bytes: &mut [u8]) {
     let crc = crc32(bytes);
     bytes[CRC_WORD * 4..][..4].copy_from_slice(&crc.to_le_bytes());
 }
 
-/// Whether an image that lies as images have to opens.
+/// Whether an image, copied to aligned memory as images need, opens.
 fn opens(bytes: &[u8]) -> bool {
     let mut aligned = vec![0_u32; bytes.len().div_ceil(4)];
     let memory: &mut [u8] = bytemuck::cast_slice_mut(&mut aligned);

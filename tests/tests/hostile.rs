@@ -1,4 +1,4 @@
-//! The fuzz targets' functions on the kept corpus and on scripts of a seeded generator, so that they run without a fuzzer.
+//! Runs the fuzz targets' functions on the kept corpus and on scripts of a seeded generator, so that no fuzzer is needed.
 //!
 //! `LADS_FUZZ_SECONDS` says how long each generator runs.
 
@@ -8,10 +8,10 @@ use std::time::{Duration, Instant};
 
 use lads_tests::{hostile, project_path};
 
-/// Seconds of each generator unless the environment says otherwise.
+/// Seconds that each generator runs unless the environment says otherwise.
 const SECONDS: u64 = 15;
 
-/// Knuth's MMIX generator.
+/// Draws the next number of Knuth's MMIX generator.
 fn next(state: &mut u64) -> u64 {
     *state = state
         .wrapping_mul(6364136223846793005)
@@ -19,7 +19,7 @@ fn next(state: &mut u64) -> u64 {
     *state >> 33
 }
 
-/// Scripts of a few edits, small numbers more often than large ones.
+/// Generates a script of a few edits, small numbers more often than large ones.
 fn generated(state: &mut u64) -> Vec<u8> {
     let edits = 1 + next(state) % 5;
     let mut script = Vec::new();
@@ -27,7 +27,7 @@ fn generated(state: &mut u64) -> Vec<u8> {
         let shift = next(state) % 8;
         script.push((next(state) as u8) >> shift);
     }
-    // The length chooses the image; less than an edit at the end is no edit.
+    // The length chooses the image; less than an edit at the end is not an edit.
     script.extend((0..next(state) % 8).map(|_| 0));
     script
 }

@@ -1,4 +1,4 @@
-//! The work of a control step does not depend on what is observed: under `callgrind`, the same number of instructions for random
+//! Tests that the work of a control step does not depend on what is observed: under `callgrind`, the same number of instructions for random
 //! observations at the same place in the schedule. Skipped where `valgrind` is missing.
 //!
 //! The kitchen's policy: an ordinary step and one that decides or draws its plan, with 32-bit weights and with integers. Random policies
@@ -21,19 +21,19 @@ use lads_host::{Aligned, Memory};
 use lads_tests::episode::{KINDS, folder};
 use lads_tests::project_path;
 
-/// Names the image to the program under `callgrind`.
+/// Environment variable that names the image to the program under `callgrind`.
 const IMAGE: &str = "LADS_IMAGE_UNDER_CALLGRIND";
 
-/// Names the number of the case to it.
+/// Environment variable that names the number of the case to the program under `callgrind`.
 const CHILD: &str = "LADS_STEPS_UNDER_CALLGRIND";
 
-/// How plans are drawn, where they are.
+/// Rule of the cases in which plans are drawn.
 const DRAWN: Decision = Decision::Sample {
     temperature: 1.0,
     seed: 5,
 };
 
-/// Steps before the one that is counted, of an episode that decides in every tenth.
+/// Cases of an episode that decides in every tenth step: format, rule, and the number of steps before the one that is counted.
 const CASES: [(WeightFormat, Decision, usize); 5] = [
     (WeightFormat::F32, Decision::Argmax, 1),
     (WeightFormat::F32, Decision::Argmax, 10),
@@ -42,14 +42,14 @@ const CASES: [(WeightFormat, Decision, usize); 5] = [
     (WeightFormat::Int16, Decision::Argmax, 10),
 ];
 
-/// Observations of which the steps are counted.
+/// Number of observations whose steps are counted.
 const OBSERVATIONS: usize = 100;
 
-/// Episodes of a random policy, and steps of each; no random policy selects more seldom than in every tenth step.
+/// Number of episodes of a random policy, and of steps of each; no random policy selects more seldom than in every tenth step.
 const EPISODES: usize = 4;
 const STEPS: usize = 22;
 
-/// What is counted; a name that the tool can be told.
+/// Function whose instructions are counted, with a name that the tool can be told.
 #[inline(never)]
 #[unsafe(no_mangle)]
 #[expect(
@@ -64,7 +64,7 @@ fn one_control_step(
     controller.step_with(black_box(inputs), action).unwrap()
 }
 
-/// Numbers from 0 to 1, always the same ones.
+/// Generator of numbers from 0 to 1, always the same ones.
 struct Random(u64);
 
 impl Random {
@@ -95,7 +95,7 @@ impl<'p> Observed<'p> {
         }
     }
 
-    /// From all over the contract's limits.
+    /// Draws values from all over the contract's limits.
     fn draw(&mut self, random: &mut Random) {
         self.floats.clear();
         self.bytes.clear();
@@ -131,14 +131,14 @@ impl<'p> Observed<'p> {
     }
 }
 
-/// Opens the image that the parent wrote.
+/// Opens the image that the parent process wrote.
 fn with_image(work: impl FnOnce(&Policy<'_>)) {
     let path = std::env::var_os(IMAGE).expect("the parent names it");
     let image = Aligned::new(&std::fs::read(path).unwrap());
     work(&Policy::new_checked(image.as_bytes()).unwrap());
 }
 
-/// A step of an episode of the kitchen's policy, over and over.
+/// Runs one step of an episode of the kitchen's policy, over and over.
 fn steps((_, decision, before): (WeightFormat, Decision, usize), policy: &Policy<'_>) {
     let mut memory = Memory::of(policy).expect("there is memory");
     let mut controller = memory.controller(policy).unwrap();
@@ -159,7 +159,7 @@ fn steps((_, decision, before): (WeightFormat, Decision, usize), policy: &Policy
     }
 }
 
-/// The first steps of a random policy's contexts, each with observations of its own.
+/// Runs the first steps of a random policy's contexts, each with observations of its own.
 fn episodes(policy: &Policy<'_>) {
     let mut memory = Memory::of(policy).expect("there is memory");
     let mut controller = memory.controller(policy).unwrap();
@@ -230,7 +230,7 @@ fn every_place_in_the_schedule_of_every_family_takes_one_number_of_instructions(
     }
 }
 
-/// The numbers of instructions of all calls in their order; `None` without `valgrind`.
+/// Returns the numbers of instructions of all calls in their order; `None` without `valgrind`.
 fn counts(test: &str, case: usize, image: &[u8]) -> Option<Vec<u64>> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("image");
@@ -262,7 +262,7 @@ fn counts(test: &str, case: usize, image: &[u8]) -> Option<Vec<u64>> {
     Some(counts.into_values().collect())
 }
 
-/// What a file of `callgrind` counted.
+/// Reads the count from a file of `callgrind`.
 fn total(path: &Path) -> Option<u64> {
     let text = String::from_utf8(std::fs::read(path).ok()?).ok()?;
     let mut lines = text.lines();

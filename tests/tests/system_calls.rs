@@ -1,4 +1,5 @@
-//! A control step makes no system call: `strace` sees none between two marks. Skipped where `strace` is missing or may not trace.
+//! Tests that a control step makes no system call: `strace` sees none between two marks. Skipped where `strace` is missing or may not
+//! trace.
 //!
 //! The test runs its own binary once more under `strace`; there the one test of this file takes its steps between two marks, which
 //! are system calls that nobody else makes: looking for files of a certain name. Waiting for a lock would be a system call too.
@@ -19,7 +20,7 @@ fn mark(name: &str) {
     assert!(!Path::new(name).exists());
 }
 
-/// Steps of every kind, and a new instruction, between two marks.
+/// Runs steps of every kind, and a new instruction, between two marks.
 fn steps() {
     let image = compiled(&project_path("models/kitchen.onnx"));
     let policy = Policy::new_checked(image.as_bytes()).unwrap();

@@ -1,5 +1,5 @@
-//! The self-test of the small kitchen policy on aarch64 and Cortex-M under qemu, and the kernels' own tests on aarch64, where tools and
-//! targets are there; what is missing is named.
+//! Runs the self-test of the small kitchen policy on aarch64 and Cortex-M under qemu, and the kernels' own tests on aarch64, where tools
+//! and targets are installed; what is missing is named.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -125,7 +125,7 @@ fn kernels_equal_their_twins_on_aarch64() {
     assert_eq!(text.matches("test result: ok").count(), 10, "{text}");
 }
 
-/// Whether a script had no tools; where `LADS_REQUIRE_TOOLS` is set, that is a failure.
+/// Whether a script lacked its tools; where `LADS_REQUIRE_TOOLS` is set, that is a failure.
 fn skipped(text: &str) -> bool {
     let skipped = text.contains("skipped: ");
     let required = std::env::var_os("LADS_REQUIRE_TOOLS").is_some();

@@ -1,10 +1,10 @@
-//! Warming a controller changes nothing, wherever it happens.
+//! Tests that warming a controller changes nothing, wherever it happens.
 
 use lads_core::{Controller, Instruction, Policy};
 use lads_host::Memory;
 use lads_tests::{bundles, compiled};
 
-/// Plans, actions and logits of steps over a context's end, with a second instruction on the way.
+/// Returns plans, actions and logits of steps over a context's end, with a second instruction on the way.
 fn episode(policy: &Policy<'_>, warm: bool) -> Vec<(Option<u32>, Vec<f32>, Vec<f32>)> {
     let mut memory = Memory::of(policy).expect("there is memory");
     let mut controller = memory.controller(policy).unwrap();

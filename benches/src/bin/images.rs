@@ -1,4 +1,4 @@
-//! A policy that sees images, hot, for `python/images.py`, which lets it take turns with ONNX Runtime.
+//! Runs a policy that sees images, hot, for `python/images.py`, which lets it take turns with ONNX Runtime.
 //!
 //! Prints a line for each instruction set that this CPU offers. Then each line of its input, an instruction set and a number, is that many
 //! control steps of the golden episode, answered by a line of their nanoseconds. What can fail ends with one line on stderr and exit code 2.

@@ -1,4 +1,4 @@
-//! The protocol of `lads bench` with what users would pick instead beside lads, in turns.
+//! Measures lads and its peers in turns, by the protocol of `lads bench`.
 //!
 //! What can fail ends with one line on stderr and exit code 2.
 #![forbid(unsafe_code)]

@@ -8,7 +8,7 @@ use prost::Message;
 
 use lads_pace::BenchError;
 
-/// `ModelProto`, its parts undecoded.
+/// A `ModelProto` whose parts are not decoded.
 #[derive(Clone, PartialEq, Message)]
 struct Model {
     #[prost(int64, tag = "1")]
@@ -21,7 +21,7 @@ struct Model {
     graph: Option<Graph>,
 }
 
-/// `GraphProto`, its parts undecoded.
+/// A `GraphProto` whose parts are not decoded.
 #[derive(Clone, PartialEq, Message)]
 struct Graph {
     #[prost(bytes = "vec", repeated, tag = "1")]
@@ -36,7 +36,7 @@ struct Graph {
     output: Vec<Vec<u8>>,
 }
 
-/// What a `NodeProto` reads and gives.
+/// Names of a `NodeProto`'s inputs and outputs.
 #[derive(Clone, PartialEq, Message)]
 struct NodeNames {
     #[prost(string, repeated, tag = "1")]
@@ -69,7 +69,7 @@ fn broken(error: impl std::fmt::Display) -> BenchError {
     BenchError::new("the bundle", error, "export it again")
 }
 
-/// Parts of a graph with the name that `name` reads from them, if `wanted`.
+/// Keeps the parts of a graph whose name, which `name` reads, is `wanted`.
 fn keep<M: Message + Default>(
     parts: &[Vec<u8>],
     name: fn(M) -> String,
@@ -96,12 +96,12 @@ impl Source {
         Ok(Self { model })
     }
 
-    /// The entry whose values start with `entry/`, as a model of its own: its inputs and outputs, and what lies between.
+    /// Cuts out the entry whose values start with `entry/`, as a model of its own: its inputs and outputs, and what lies between.
     pub fn cut(&self, entry: &str) -> Result<Vec<u8>, BenchError> {
         self.cut_for(entry, |_| true)
     }
 
-    /// The same with only those outputs for which `wanted` holds, given their names without the entry's.
+    /// Cuts out an entry with only those outputs for which `wanted` holds, given their names without the entry's.
     pub fn cut_for(
         &self,
         entry: &str,
@@ -158,7 +158,7 @@ impl Source {
     }
 }
 
-/// Names of a model's inputs and outputs, in order.
+/// Returns the names of a model's inputs and outputs, in order.
 pub fn signature(model: &[u8]) -> Result<(Vec<String>, Vec<String>), BenchError> {
     let graph = Model::decode(model)
         .map_err(broken)?
@@ -174,9 +174,9 @@ pub fn signature(model: &[u8]) -> Result<(Vec<String>, Vec<String>), BenchError>
 /// A tensor for a general runtime.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tensor {
-    /// Its axes.
+    /// Lengths of the tensor's axes.
     pub shape: Vec<usize>,
-    /// Its elements.
+    /// Elements of the tensor.
     pub data: Data,
 }
 
@@ -190,7 +190,7 @@ pub enum Data {
 }
 
 impl Tensor {
-    /// A row `[1, n]`.
+    /// Makes a row `[1, n]`.
     pub fn row(values: &[f32]) -> Self {
         Self {
             shape: vec![1, values.len()],
@@ -198,7 +198,7 @@ impl Tensor {
         }
     }
 
-    /// One integer, `[1]`.
+    /// Makes a tensor of one integer, `[1]`.
     pub fn integer(value: usize) -> Self {
         Self {
             shape: vec![1],
@@ -206,7 +206,7 @@ impl Tensor {
         }
     }
 
-    /// The elements as floating-point numbers; none of integers.
+    /// Returns the elements as floating-point numbers; empty for integers.
     pub fn f32(&self) -> &[f32] {
         match &self.data {
             Data::F32(values) => values,
@@ -214,7 +214,7 @@ impl Tensor {
         }
     }
 
-    /// The first element of an integer tensor.
+    /// Returns the first element of an integer tensor.
     pub fn first(&self) -> Option<i64> {
         match &self.data {
             Data::F32(_) => None,
@@ -222,7 +222,7 @@ impl Tensor {
         }
     }
 
-    /// The first `rows` rows of keys or values, `[1, heads, P, head_dim]`.
+    /// Returns the first `rows` rows of keys or values, `[1, heads, P, head_dim]`.
     #[must_use]
     pub fn first_rows(&self, rows: usize) -> Self {
         let &[one, heads, len, dim] = self.shape.as_slice() else {

@@ -1,18 +1,18 @@
-//! What a general runtime has to do here: load one ONNX model, and run it again and again on inputs that stay where they are.
+//! Interface of a general runtime: it loads one ONNX model, and runs it again and again on inputs that stay where they are.
 
 use lads_pace::BenchError;
 
 use super::cut::Tensor;
 
-/// Named tensors.
+/// Tensors with their names.
 pub type Named<'t> = [(String, &'t Tensor)];
 
 /// A general runtime.
 pub trait Engine {
-    /// Its name in tables.
+    /// Name of the runtime in tables.
     fn name(&self) -> &'static str;
 
-    /// Version and settings, for the report.
+    /// Version and settings of the runtime, for the report.
     fn detail(&self) -> String;
 
     /// Loads a model.
@@ -30,7 +30,7 @@ pub trait Session {
     /// Overwrites a bound input of one integer.
     fn write_integer(&mut self, input: usize, value: i64) -> Result<(), BenchError>;
 
-    /// Runs on what is bound.
+    /// Runs the model on the bound inputs.
     fn call(&mut self) -> Result<(), BenchError>;
 
     /// Copies an output of the last call, by its place among the model's outputs.
@@ -39,14 +39,14 @@ pub trait Session {
     /// All outputs of the last call, by name.
     fn outputs(&self) -> Result<Vec<(String, Tensor)>, BenchError>;
 
-    /// Names of the inputs, in the model's order.
+    /// Names of the model's inputs, in its order.
     fn input_names(&self) -> Vec<String>;
 
-    /// Names of the outputs, in the model's order.
+    /// Names of the model's outputs, in its order.
     fn output_names(&self) -> Vec<String>;
 }
 
-/// The tensor for an input of a model.
+/// Finds the tensor for an input of a model.
 pub fn given<'t>(inputs: &Named<'t>, wanted: &str) -> Result<&'t Tensor, String> {
     inputs
         .iter()
@@ -55,7 +55,7 @@ pub fn given<'t>(inputs: &Named<'t>, wanted: &str) -> Result<&'t Tensor, String>
         .ok_or_else(|| format!("no value for input {wanted}"))
 }
 
-/// An error of a runtime, in one line.
+/// Makes an error of a runtime, in one line.
 pub fn failed(engine: &str, error: impl std::fmt::Display) -> BenchError {
     BenchError::new(engine, error, "leave this peer out or fix its installation")
 }

@@ -1,5 +1,5 @@
-//! The control loop of a policy on a general runtime, as a user would write it: the bundle's entries, cut out, each loaded once;
-//! keys and values handed from call to call.
+//! Runs the control loop of a policy on a general runtime, as a user would write it: the bundle's entries, cut out, each loaded once; keys
+//! and values handed from call to call.
 //!
 //! Timed calls stay at one context length: past and present keys and values are bound once, and the same control step is repeated
 //! on fresh observations. This flatters the peers, who would have to bind anew, or allocate, as the context grows.
@@ -11,7 +11,7 @@ use super::engine::{Engine, Session, failed};
 use lads_pace::BenchError;
 use lads_pace::contender::{Block, Computed, Contender, Episode, Kind, Sample, Work, measure};
 
-/// What a control step at some context starts from.
+/// State that a control step at some context starts from.
 #[derive(Debug, Clone)]
 struct Past {
     /// Keys and values, named as inputs without their entry.
@@ -39,7 +39,7 @@ pub struct General<'e> {
     action: Vec<f32>,
 }
 
-/// The place of a name that ends so.
+/// Index of the name that ends in `end`.
 fn place(names: &[String], end: &str) -> Result<usize, BenchError> {
     names
         .iter()
@@ -95,13 +95,13 @@ impl<'e> General<'e> {
         })
     }
 
-    /// The plan of highest logit.
+    /// Returns the plan with the largest logit.
     fn decide(&mut self, output: usize) -> Result<usize, BenchError> {
         self.step.read(output, &mut self.logits)?;
         Ok(argmax(&self.logits))
     }
 
-    /// One untimed control step; leaves the grown context in `past`.
+    /// Runs one untimed control step; leaves the grown context in `past`.
     fn advance(&mut self, step: usize, past: &mut Past) -> Result<u32, BenchError> {
         let entry = if step == 0 {
             "high_level/start"
@@ -171,7 +171,7 @@ impl<'e> General<'e> {
         }
     }
 
-    /// The context behind the words of the instruction.
+    /// Returns the context after the words of the instruction.
     fn beginning(&mut self) -> Result<Past, BenchError> {
         self.instruct
             .bind(&[("high_level/instruct/words".into(), &self.words)])?;
@@ -192,7 +192,7 @@ impl<'e> General<'e> {
         })
     }
 
-    /// Walks to a control step, which nobody has yet, and remembers what it starts from.
+    /// Walks to a control step that was not reached before, and keeps the state that it starts from.
     fn walk_to(&mut self, step: usize) -> Result<(), BenchError> {
         if self.pasts.contains_key(&step) {
             return Ok(());
@@ -208,7 +208,7 @@ impl<'e> General<'e> {
         Ok(())
     }
 
-    /// Binds all that a timed control step needs, and checks that it computes what the walk did.
+    /// Binds all that a timed control step needs, and checks that it computes the same as the untimed steps before.
     fn bind(&mut self, step: usize) -> Result<(), BenchError> {
         let step = step.max(1);
         if self.bound == Some(step) {
@@ -251,7 +251,7 @@ impl<'e> General<'e> {
         })
     }
 
-    /// One timed control step at the bound context, as step number `as_step` of its horizon.
+    /// Runs one timed control step at the bound context, as step number `as_step` of its horizon.
     fn control_step(
         &mut self,
         ports: &Ports,

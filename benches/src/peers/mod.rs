@@ -1,4 +1,4 @@
-//! What users would pick instead of lads, on the very same graphs.
+//! Peers of lads: the runtimes that users would pick instead, on the very same graphs.
 //!
 //! ONNX Runtime, tract and rten run in this process; PyTorch and OpenVINO in Python, in a worker that keeps to the same
 //! protocol. They run policies of the family `lads`. Only with the cargo feature `peers`.
@@ -22,7 +22,7 @@ use engine::Engine;
 use general::General;
 use worker::{NAMES, Worker};
 
-/// Which peers to run, and where they are.
+/// Choice of the peers to run, and where they are.
 #[derive(Debug, Clone, Default)]
 pub struct Peers {
     /// The bundle's bytes.
@@ -31,7 +31,7 @@ pub struct Peers {
     pub onnxruntime: Option<PathBuf>,
     /// Whether to run tract and rten.
     pub crates: bool,
-    /// A Python that has PyTorch or OpenVINO, and the bundle's file.
+    /// Python that has PyTorch or OpenVINO, and the bundle's file.
     pub python: Option<(PathBuf, PathBuf)>,
 }
 

@@ -1,4 +1,4 @@
-//! ONNX Runtime through its C API: one thread, no spinning, inputs and outputs bound to memory that is allocated once.
+//! Runs ONNX Runtime through its C API: one thread, no spinning, inputs and outputs bound to memory that is allocated once.
 
 use std::path::Path;
 use std::sync::OnceLock;
@@ -15,10 +15,10 @@ use lads_pace::BenchError;
 
 const NAME: &str = "ONNX Runtime";
 
-/// A process has one.
+/// ONNX Runtime's environment, of which a process has one.
 static ENVIRONMENT: OnceLock<Environment> = OnceLock::new();
 
-/// The library, loaded.
+/// The loaded library of ONNX Runtime.
 #[derive(Debug)]
 pub struct OnnxRuntime {
     environment: Environment,
@@ -83,7 +83,7 @@ impl Engine for OnnxRuntime {
     }
 }
 
-/// A session, its binding, and the tensors that are bound.
+/// A session, its binding, and the bound tensors.
 struct Bound {
     session: OrtSession,
     binding: Option<IoBinding>,
@@ -92,7 +92,7 @@ struct Bound {
 }
 
 impl Bound {
-    /// Rows of the past: the only axis that is not fixed.
+    /// Binds all inputs and outputs; the only axis that is not fixed is the rows of the past.
     fn bind_all(&mut self, inputs: &Named) -> ort::Result<()> {
         let mut binding = self.session.create_binding()?;
         self.inputs.clear();
@@ -115,7 +115,7 @@ impl Bound {
             let dtype = outlet.dtype();
             let shape = dtype
                 .tensor_shape()
-                .ok_or_else(|| ort::Error::new("an output is no tensor"))?;
+                .ok_or_else(|| ort::Error::new("an output is not a tensor"))?;
             // `present.N.key` is [1, heads, P + new, head_dim], with the past as its symbolic axis.
             let new = if outlet.name().contains("/start/") {
                 1

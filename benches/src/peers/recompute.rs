@@ -1,4 +1,4 @@
-//! What a plain export costs: a model that takes the whole history at once, on the inputs that it was exported with.
+//! Measures a plain export: a model that takes the whole history at once, on the inputs that it was exported with.
 
 use std::path::Path;
 
@@ -28,7 +28,7 @@ impl Recompute {
         let mut session = engine.load(&bytes)?;
         let tensors = inputs.iter().map(|input| matrix(&values[input]));
         let tensors: Option<Vec<_>> = tensors.collect();
-        let tensors = tensors.ok_or_else(|| failed(&name, "its inputs are no matrices"))?;
+        let tensors = tensors.ok_or_else(|| failed(&name, "its inputs are not matrices"))?;
         let named: Vec<_> = inputs.into_iter().zip(&tensors).collect();
         session.bind(&named)?;
         session.call()?;
@@ -53,7 +53,7 @@ impl Recompute {
     }
 }
 
-/// Rows of numbers.
+/// Makes a tensor from rows of numbers.
 fn matrix(rows: &Value) -> Option<Tensor> {
     let rows: Vec<Vec<f32>> = serde_json::from_value(rows.clone()).ok()?;
     let shape = vec![rows.len(), rows.first()?.len()];

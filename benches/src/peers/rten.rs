@@ -1,4 +1,4 @@
-//! rten: weights packed when the model is loaded, a pool of one thread.
+//! Runs rten: weights packed when the model is loaded, a pool of one thread.
 
 use std::sync::Arc;
 
@@ -64,7 +64,7 @@ struct Loaded {
     outputs: Vec<Value>,
 }
 
-/// rten has no 64-bit integers: they are 32-bit ones.
+/// Converts a tensor to rten's type, which has no 64-bit integers: they become 32-bit ones.
 fn value(tensor: &Tensor) -> Value {
     match &tensor.data {
         Data::F32(values) => RtenTensor::from_data(&tensor.shape, values.clone()).into(),

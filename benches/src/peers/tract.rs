@@ -1,4 +1,4 @@
-//! tract: the context length stays symbolic, the plan is optimised once, a state is kept over all calls.
+//! Runs tract: the context length stays symbolic, the plan is optimised once, a state is kept over all calls.
 
 use tract_onnx::prelude::{Tensor as TractTensor, *};
 

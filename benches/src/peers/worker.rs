@@ -1,4 +1,4 @@
-//! A contender in Python: PyTorch or OpenVINO, in a process of its own that measures itself by the same protocol.
+//! Runs a contender in Python: PyTorch or OpenVINO, in a process of its own that measures itself by the same protocol.
 
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
@@ -11,10 +11,10 @@ use lads_pace::BenchError;
 use lads_pace::clock::Pace;
 use lads_pace::contender::{Block, Computed, Contender, Episode, Kind, Sample, Work};
 
-/// The contenders that the script knows.
+/// Names of the contenders that the script knows.
 pub const NAMES: [&str; 2] = ["PyTorch", "OpenVINO"];
 
-/// The process, and how to talk to it.
+/// The process of a Python contender, and its pipes.
 #[derive(Debug)]
 pub struct Worker {
     name: &'static str,
@@ -26,7 +26,7 @@ pub struct Worker {
 }
 
 impl Worker {
-    /// Starts `python` on the script and lets it load the bundle.
+    /// Starts `python` on the script, which loads the bundle.
     pub fn new(
         name: &'static str,
         python: &Path,

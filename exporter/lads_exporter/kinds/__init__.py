@@ -50,7 +50,7 @@ LARGE = {name: _images(name, *parts, Sizes(steps=4)) for name, parts in images.S
 
 
 def export(name, seed=0):
-    """-> the networks in PyTorch, the complete bundle."""
+    """Makes a random policy of a kind -> the networks in PyTorch, the complete bundle."""
     known = KINDS | LARGE
     if name not in known:
         raise UserError(f"--kind {name}: unknown; known: {', '.join(known)}")

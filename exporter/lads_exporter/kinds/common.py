@@ -1,4 +1,4 @@
-"""What policies of every family share: sizes and parts of networks; and a made-up bench with instructions for small random ones.
+"""Shared parts of the policies of every family: sizes and parts of networks; and a made-up bench with instructions for small random ones.
 
 The random ones exist to prove that the runtime runs a family. Invariant: the same kind and seed give the same bundle. Trained policies (`systems`)
 fill in `Sizes` from their configuration and take networks and entry graphs from here.
@@ -38,7 +38,7 @@ WORDS = language.encode(config.Language("random-12", -1, False), [row["text"] fo
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of the networks, those of the bench's where nothing is said; the names are the configuration's."""
+    """Sizes of the networks, by default the bench's; the names are the configuration's."""
 
     observation: int = len(ENVIRONMENT["observation"])
     action: int = len(ENVIRONMENT["action"])
@@ -72,7 +72,7 @@ class Sizes:
 
 
 class Codes(nn.Module):
-    """The latent plans [M, D]."""
+    """Codebook of latent plans [M, D]."""
 
     def __init__(self, sizes):
         super().__init__()
@@ -80,12 +80,12 @@ class Codes(nn.Module):
 
 
 def high_level(sizes, outputs, actions=True):
-    """The transformer that hears the words; its head has so many outputs. Without `actions` its history is of observations only."""
+    """Makes the transformer that reads the words; its head has `outputs` outputs. Without `actions` its history is of observations only."""
     return HighLevelPolicy(sizes.transformer, sizes.words.dim, sizes.observation, sizes.action if actions else None, outputs)
 
 
 def randomize(policy, seed):
-    """Random weights in all parts of a policy: plans differ from step to step, and few actions are at their limits."""
+    """Sets random weights in all parts of a policy: plans differ from step to step, and few actions are at their limits."""
     generator = torch.Generator().manual_seed(seed)
     random_policy.draw_weights(policy, generator)
     random_policy.place_normalizer(policy.normalizer, ENVIRONMENT["observation"])
@@ -99,21 +99,21 @@ def randomize(policy, seed):
 
 
 def graph_of(policy, sizes):
-    """A graph with the table of instructions and the entry that hears one."""
+    """Makes a graph with the table of instructions and the entry that sets one."""
     graph = graphs.Graph()
     graphs.known_instructions(graph, policy.high_level, sizes.words)
     return graph
 
 
 def select_at_every_token(graph, policy):
-    """`high_level/step` of a policy whose history is of observations: logits at every step, the first too."""
+    """Adds `high_level/step` of a policy whose history is of observations: logits at every step, the first too."""
     entry, x, embedded = graphs.high_level_state(graph, policy.high_level, policy.normalizer)
     graphs.head(entry, x, policy.high_level.head, "logits")
     return entry, embedded
 
 
 def contract(family, sizes, seed, noise=None, segment=None):
-    """The contract of a policy on the bench with instructions."""
+    """Makes the contract of a policy on the bench with instructions."""
     return bundle.describe(
         family,
         ENVIRONMENT,
@@ -127,5 +127,5 @@ def contract(family, sizes, seed, noise=None, segment=None):
 
 
 def argmax(rule="argmax"):
-    """A decision without chance."""
+    """Makes the contract's part for a decision by argmax."""
     return {"rule": rule, "temperature": 1.0, "seed": 0}

@@ -1,4 +1,4 @@
-"""`history`: LISA's high level; the low level is a transformer over the plan, a window of earlier steps and those of the plan.
+"""Kind `history`: LISA's high level; the low level is a transformer over the plan, a window of earlier steps and those of the plan.
 
 The window is a ring of tokens before their positions are added: row = [action embedded, observation embedded]. At a decision the low level hears
 the plan, then the window's rows at positions 0, 1, ...; a step of the plan stands at position `window` plus its phase.
@@ -31,8 +31,8 @@ class HistoryPolicy(nn.Module):
         self.head = nn.Linear(sizes.hidden, sizes.action)
 
     def forward(self, index, observations, before, previous, steps):
-        """The last so many `steps` of normalised observations [T, O] are the plan's own, `before` rows are its window; previous [T, A] are the
-        actions executed before each observation -> actions [steps, A]."""
+        """Computes actions [steps, A]: the last so many `steps` of normalised observations [T, O] are the plan's own, `before` rows are its
+        window; previous [T, A] are the actions executed before each observation."""
         pairs = torch.stack([self.embed_action(previous), self.embed_observation(observations)], 1)
         places = torch.cat([torch.arange(before), self.window + torch.arange(steps)])
         pairs = pairs[-(before + steps) :] + self.embed_position.weight[places][:, None]

@@ -1,4 +1,5 @@
-"""`images`: actions from what cameras see, through convolutions; and policies of the sizes that encoders have in the field, for measurements.
+"""Kind `images`: actions from what cameras see, through convolutions; and policies of the sizes that encoders have in the field, for
+measurements.
 
 An encoder is a list of steps, from which both the network in PyTorch and the entry graph are made. Frames are bytes [rows, columns, 3];
 scale and mean are in the graph.
@@ -34,7 +35,7 @@ class Conv:
 
 @dataclass(frozen=True)
 class Pool:
-    """Windows."""
+    """A pooling layer."""
 
     operator: str  # MaxPool, AveragePool or GlobalAveragePool
     kernel: int = 0
@@ -55,7 +56,7 @@ class Camera:
 
 
 class Encoder(nn.Module):
-    """The steps of a camera, then the flattened features."""
+    """Encoder of a camera's frames: its steps, then the flattened features."""
 
     def __init__(self, camera):
         super().__init__()
@@ -73,7 +74,7 @@ class Encoder(nn.Module):
             self.layers.append(layer)
 
     def forward(self, frames):
-        """frames [T, rows, columns, 3] of bytes -> [T, F]."""
+        """Encodes frames [T, rows, columns, 3] of bytes -> [T, F]."""
         x, known = (frames.permute(0, 3, 1, 2).float() - self.camera.mean) / self.camera.scale, {}
         for step, layer in zip(self.camera.steps, self.layers):
             top, left, bottom, right = step.pads
@@ -131,7 +132,7 @@ class Encoder(nn.Module):
 
 
 class Images(nn.Module):
-    """Encoders of cameras, a layer for their features, an MLP over them and the observation."""
+    """Policy of camera encoders, a layer for their features, and an MLP over them and the observation."""
 
     def __init__(self, cameras, hidden):
         super().__init__()
@@ -144,7 +145,7 @@ class Images(nn.Module):
         self.last = nn.Linear(hidden[-1], len(common.ENVIRONMENT["action"]))
 
     def forward(self, observations, *frames):
-        """observations [T, O], frames of each camera -> actions [T, A]."""
+        """Computes the actions: observations [T, O], frames of each camera -> actions [T, A]."""
         x = torch.cat([encoder(rows) for encoder, rows in zip(self.encoders, frames)], 1)
         for layer in self.dense:
             x = functional.relu(layer(x))
@@ -152,7 +153,7 @@ class Images(nn.Module):
 
 
 def randomize(policy, seed):
-    """Random weights with which the features keep their size from layer to layer, and follow the frame."""
+    """Sets random weights with which the features keep their size from layer to layer, and follow the frame."""
     generator = torch.Generator().manual_seed(seed)
     draw = lambda tensor: torch.randn(tensor.shape, generator=generator)
     random_policy.draw_weights(policy, generator)
@@ -193,12 +194,12 @@ def contract(cameras, seed, kind):
 
 
 def lorel(widths):
-    """Eight convolutions with kernels of 4 and strides 2 and 1 by turns, as the paper's encoder of 64x64 frames."""
+    """Lists eight convolutions with kernels of 4 and strides 2 and 1 by turns, as the paper's encoder of 64x64 frames."""
     return tuple(Conv(width, 4, 2 - number % 2, (1, 1, 1, 1)) for number, width in enumerate(widths))
 
 
 def _inverted(channels, outputs, kernel, stride, expand, side, before, name):
-    """A block of a mobile network, with TensorFlow's "same" padding for an input of so many rows and columns."""
+    """Lists the steps of a block of a mobile network, with TensorFlow's "same" padding for an input of so many rows and columns."""
     wide, total = channels * expand, max((-(-side // stride) - 1) * stride + kernel - side, 0)
     pads = (total // 2, total // 2, total - total // 2, total - total // 2)
     add = before if stride == 1 and channels == outputs else None
@@ -207,7 +208,7 @@ def _inverted(channels, outputs, kernel, stride, expand, side, before, name):
 
 
 def lite0():
-    """EfficientNet-Lite0 up to its block 10, then means over parts of the image."""
+    """Lists the steps of EfficientNet-Lite0 up to its block 10, then means over parts of the image."""
     rows = ((1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112))
     steps, channels, side, before = [Conv(32, 3, 2, (0, 0, 1, 1), norm=1e-3, activation="Relu6", name="stem")], 32, 112, "stem"
     for row, (repeats, kernel, stride, expand, outputs) in enumerate(rows):
@@ -219,7 +220,7 @@ def lite0():
 
 
 def resnet18():
-    """ResNet18 without its classifier."""
+    """Lists the steps of ResNet18 without its classifier."""
     conv = lambda outputs, kernel, stride=1, **more: Conv(outputs, kernel, stride, (kernel // 2,) * 4, norm=1e-5, **more)
     steps, channels, before = [conv(64, 7, 2), Pool("MaxPool", 3, 2, (1, 1, 1, 1), "pool")], 64, "pool"
     for outputs in (64, 128, 256, 512):

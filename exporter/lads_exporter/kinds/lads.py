@@ -1,4 +1,4 @@
-"""`lads`: the exporter's own policy, through the code that trained ones take."""
+"""Kind `lads`: the exporter's own policy, through the code that trained ones take."""
 
 from .. import config, graphs, random_policy
 from ..model import Lads
@@ -6,7 +6,7 @@ from . import common
 
 
 def setting(sizes):
-    """The tiny configuration on the bench, with these sizes."""
+    """Makes the tiny configuration on the bench, with the given sizes."""
     table = config.read_toml("configs/tiny.toml")
     table["name"] = "random lads"
     table["language"] |= {"encoder": common.WORDS.encoder}

@@ -1,4 +1,4 @@
-"""`lang_dt`: the high level's transformer whose head is the action, at every step; no plan and no low level."""
+"""Kind `lang_dt`: the high level's transformer whose head is the action, at every step; no plan and no low level."""
 
 from torch import nn
 
@@ -8,7 +8,7 @@ from . import common
 
 
 class LangDt(nn.Module):
-    """Words, observations and actions to actions."""
+    """Policy from words, observations and actions to actions."""
 
     def __init__(self, sizes):
         super().__init__()
@@ -16,7 +16,7 @@ class LangDt(nn.Module):
         self.high_level = common.high_level(sizes, sizes.action)
 
     def forward(self, words, observations, actions):
-        """words [L, E], observations [T, O] in raw units, actions [T, A] as executed -> actions [T, A]."""
+        """Computes the actions: words [L, E], observations [T, O] in raw units, actions [T, A] as executed -> actions [T, A]."""
         return self.high_level([words], self.normalizer(observations)[None], actions[None])[0]
 
 

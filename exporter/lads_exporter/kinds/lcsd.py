@@ -1,4 +1,4 @@
-"""`lcsd`: a plan at every step, and one action by denoising it with fresh noise at each pass (DDPM)."""
+"""Kind `lcsd`: a plan at every step, and one action by denoising it with fresh noise at each pass (DDPM)."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ from .denoising import Pass, ddpm, dense, mish, passes, sinusoids
 
 @dataclass(frozen=True)
 class Denoiser:
-    """Sizes of the denoiser; the bench's where nothing is said."""
+    """Sizes of the denoiser, by default the bench's."""
 
     observed: int = 12  # elements of the embedded observation
     time: int = 16
@@ -26,7 +26,7 @@ class Denoiser:
 
 
 class ActionDenoiser(nn.Module):
-    """The noise in an action: an MLP on the action, the observation, the plan and the level."""
+    """Network that predicts the noise in an action: an MLP on the action, the observation, the plan and the level."""
 
     def __init__(self, sizes, shape):
         super().__init__()
@@ -39,7 +39,7 @@ class ActionDenoiser(nn.Module):
         self.last = nn.Linear(shape.hidden, sizes.action)
 
     def forward(self, x, observations, plans, levels):
-        """x [N, A], normalised observations [N, O], plans [N, D], levels [N] from 1 -> the noise [N, A]."""
+        """Predicts the noise: x [N, A], normalised observations [N, O], plans [N, D], levels [N] from 1 -> the noise [N, A]."""
         time = self.embed_time(self.sinusoids)[levels - 1]
         x = torch.cat([x, self.embed_observation(observations), plans, time], -1)
         for layer in self.layers:
@@ -48,13 +48,13 @@ class ActionDenoiser(nn.Module):
 
 
 def box(action):
-    """The centre and half width of the action's limits: what a denoised element between -1 and 1 means."""
+    """Returns the centre and half width of the action's limits: what a denoised element between -1 and 1 means."""
     low, high = (np.array([row[key] for row in action], np.float32) for key in ("min", "max"))
     return (low + high) / 2, (high - low) / 2
 
 
 class Lcsd(nn.Module):
-    """A plan at every step, an action by denoising. `action`: the environment's rows."""
+    """Policy with a plan at every step and an action by denoising. `action`: the environment's rows."""
 
     def __init__(self, sizes, shape=Denoiser(), action=common.ENVIRONMENT["action"]):
         super().__init__()
@@ -65,11 +65,11 @@ class Lcsd(nn.Module):
         self.centre, self.half = box(action)
 
     def logits(self, words, observations):
-        """words [L, E], observations [T, O] in raw units -> logits [T, M]."""
+        """Computes the plans' logits: words [L, E], observations [T, O] in raw units -> logits [T, M]."""
         return self.high_level([words], self.normalizer(observations)[None])[0]
 
     def denoise(self, observation, index, noise):
-        """observation [1, O] in raw units, noise [1 + passes, A] in the order of its use -> action [1, A]."""
+        """Denoises an action: observation [1, O] in raw units, noise [1 + passes, A] in the order of its use -> action [1, A]."""
         steps = self.denoiser.shape.steps
         tables = {name: torch.from_numpy(table) for name, table in ddpm(steps).items()}
         x = noise[:1]

@@ -1,4 +1,4 @@
-"""`lisa`: one high-level token a step; the low level is a transformer over the steps of the plan in force."""
+"""Kind `lisa`: one high-level token a step; the low level is a transformer over the steps of the plan in force."""
 
 import torch
 from onnx import TensorProto
@@ -12,7 +12,7 @@ LEVEL = "low_level"
 
 
 class ChunkPolicy(nn.Module):
-    """A causal transformer over (option, observation, action) of one plan's steps; the action is read at the observation.
+    """Low level: a causal transformer over (option, observation, action) of one plan's steps; the action is read at the observation.
 
     An option is a row of a table; while it is trained `embed_option` is a layer on the plan instead (`systems.lisa`).
     """
@@ -31,12 +31,14 @@ class ChunkPolicy(nn.Module):
         start_weights(self)
 
     def forward(self, index, start, observations, actions):
-        """The plan `index` from timestep `start`: normalised observations [T, O], actions [T, A] as executed -> actions [T, A]."""
+        """Computes the actions of the plan `index` from timestep `start`: normalised observations [T, O], actions [T, A] as executed ->
+        actions [T, A]."""
         options = self.embed_option.weight[index].expand(1, len(observations), -1)
         return self.chunks(options, torch.tensor([start]), observations[None], actions[None])[0]
 
     def chunks(self, options, starts, observations, actions):
-        """N plans of H steps: options [N, H, d] embedded, starts [N], observations [N, H, O], actions [N, H, A] -> actions [N, H, A]."""
+        """Computes the actions of N plans of H steps: options [N, H, d] embedded, starts [N], observations [N, H, O], actions [N, H, A] ->
+        actions [N, H, A]."""
         time = self.embed_timestep(starts[:, None] + torch.arange(options.shape[1], device=starts.device))
         tokens = torch.stack([options + time, self.embed_observation(observations) + time, self.embed_action(actions) + time], 2)
         return self.head(run_blocks(self, tokens.flatten(1, 2)[:, :-1])[:, 1::3]).float()
@@ -50,12 +52,12 @@ class Lisa(nn.Module):
         self.low_level = ChunkPolicy(sizes)
 
     def logits(self, words, observations):
-        """words [L, E], observations [T, O] in raw units -> logits [T, M]."""
+        """Computes the plans' logits: words [L, E], observations [T, O] in raw units -> logits [T, M]."""
         return self.high_level([words], self.normalizer(observations)[None])[0]
 
 
 def run_blocks(policy, tokens):
-    """tokens [N, S, d] before the first norm -> rows [N, S, d] after the last, causal."""
+    """Runs causal blocks: tokens [N, S, d] before the first norm -> rows [N, S, d] after the last."""
     x = policy.drop(policy.embed_norm(tokens.float()))
     mask = torch.triu(torch.full((1, 1, tokens.shape[1], tokens.shape[1]), -1e9, device=tokens.device), 1).expand(len(tokens), -1, -1, -1)
     for block in policy.blocks:
@@ -64,7 +66,7 @@ def run_blocks(policy, tokens):
 
 
 def option_token(entry, table, index, time=None):
-    """The token of a plan: its row of the table, with the row `time` = (table, index) added."""
+    """Makes the token of a plan: its row of the table, with the row `time` = (table, index) added."""
     row = entry.op("Gather", [table, index], "option_row", axis=0)
     if time:
         row = entry.op("Add", [row, entry.op("Gather", list(time), "option_time", axis=0)], "option_flat")

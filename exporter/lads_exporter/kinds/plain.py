@@ -1,5 +1,5 @@
-"""`plain`: observation to action, without instructions, plans or a context; `recurrent` and `stacked` are plain with states,
-`camera` with channels of other types."""
+"""Kind `plain`: observation to action, without instructions, plans or a context; `recurrent` and `stacked` are plain with states, `camera`
+with channels of other types."""
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ COMMAND = [{"name": name, "unit": "m/s", "min": -1.0, "max": 1.5} for name in ("
 
 
 class Plain(nn.Module):
-    """An MLP with tanh from the normalised observation to the action."""
+    """Policy of an MLP with tanh from the normalised observation to the action."""
 
     def __init__(self, sizes):
         super().__init__()
@@ -25,13 +25,13 @@ class Plain(nn.Module):
         self.last = nn.Linear(sizes.hidden, sizes.action)
 
     def forward(self, observations):
-        """observations [T, O] in raw units -> actions [T, A]."""
+        """Computes the actions: observations [T, O] in raw units -> actions [T, A]."""
         x = torch.tanh(self.first(self.normalizer(observations)))
         return self.last(torch.tanh(self.middle(x)))
 
 
 class Recurrent(nn.Module):
-    """A linear layer, a GRU, an LSTM, a linear layer."""
+    """Policy of a linear layer, a GRU, an LSTM, a linear layer."""
 
     def __init__(self, sizes):
         super().__init__()
@@ -42,13 +42,13 @@ class Recurrent(nn.Module):
         self.last = nn.Linear(16, sizes.action)
 
     def forward(self, observations):
-        """observations [T, O] of an episode from its start -> actions [T, A]."""
+        """Computes the actions: observations [T, O] of an episode from its start -> actions [T, A]."""
         x = torch.tanh(self.first(self.normalizer(observations)))
         return self.last(self.lstm(self.gru(x)[0])[0])
 
 
 class Stacked(nn.Module):
-    """An MLP over the last observations and a command."""
+    """Policy of an MLP over the last observations and a command."""
 
     ROWS = 5
 
@@ -59,7 +59,7 @@ class Stacked(nn.Module):
         self.last = nn.Linear(sizes.hidden, sizes.action)
 
     def forward(self, observations, commands):
-        """observations [T, O] of an episode from its start, commands [T, C] -> actions [T, A]."""
+        """Computes the actions: observations [T, O] of an episode from its start, commands [T, C] -> actions [T, A]."""
         normed = self.normalizer(observations)
         padded = torch.cat([normed[:1].expand(self.ROWS - 1, -1), normed])
         stacks = torch.stack([padded[t : t + self.ROWS].flatten() for t in range(len(normed))])
@@ -67,7 +67,7 @@ class Stacked(nn.Module):
 
 
 class Camera(nn.Module):
-    """An MLP over the observation, a small image and whole numbers."""
+    """Policy of an MLP over the observation, a small image and whole numbers."""
 
     IMAGE, MODES = [6, 8, 3], 2
 
@@ -79,7 +79,7 @@ class Camera(nn.Module):
         self.last = nn.Linear(sizes.hidden, sizes.action)
 
     def forward(self, observations, images, modes):
-        """observations [T, O], images [T, 6, 8, 3] of bytes, modes [T, 2] of whole numbers -> actions [T, A]."""
+        """Computes the actions: observations [T, O], images [T, 6, 8, 3] of bytes, modes [T, 2] of whole numbers -> actions [T, A]."""
         seen = torch.tanh(self.pixels(images.flatten(1).float() / 255))
         return self.last(torch.tanh(self.first(torch.cat([self.normalizer(observations), seen, modes.float()], 1))))
 
@@ -90,7 +90,7 @@ def _dense(entry, x, module, out, weight=None):
 
 
 def _start(policy):
-    """The entry of a policy that observes one vector, and its first hidden layer."""
+    """Starts the entry of a policy that observes one vector, up to its first hidden layer."""
     graph = graphs.Graph()
     entry = graphs.Entry(graph, ENTRY)
     observation = entry.input("observation", [1, len(policy.normalizer.mean)])
@@ -112,7 +112,7 @@ def build_plain(policy, sizes):
 
 
 def _cell(entry, kind, x, module, order, states, **attributes):
-    """One step of a recurrent layer as an ONNX node: x [1, k] and states [1, h] -> the output [1, h]; the states are outputs too."""
+    """Adds one step of a recurrent layer as an ONNX node: x [1, k] and states [1, h] -> the output [1, h]; the states are outputs too."""
     name, hidden = kind.lower(), module.hidden_size
     gates = len(module.bias_ih_l0) // hidden
     turn = lambda array: np.concatenate([np.split(graphs.double(array), gates)[gate] for gate in order])

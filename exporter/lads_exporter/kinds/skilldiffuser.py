@@ -1,4 +1,4 @@
-"""`skilldiffuser`: every H steps, H + 1 embedded observations by denoising with guidance, and from them the H actions in between.
+"""Kind `skilldiffuser`: every H steps, H + 1 embedded observations by denoising with guidance, and from them the H actions in between.
 
 The first row is the present observation and stays clean. DDIM takes few passes and no noise but the first; DDPM takes every level and noise at each.
 """
@@ -18,7 +18,7 @@ GUIDANCE, TEMPERATURE, CLIP = 1.2, 0.5, 3.0
 
 
 class Sampler:
-    """How rows are denoised: the passes' levels and coefficients."""
+    """Sampler of the denoised rows: the passes' levels and coefficients."""
 
     def __init__(self, name="ddim", levels=20, count=4, guidance=GUIDANCE, temperature=TEMPERATURE, clip=CLIP):
         self.name, self.guidance, self.temperature, self.clip = name, guidance, temperature, clip
@@ -26,7 +26,7 @@ class Sampler:
         self.tables = ddim(levels, count) if name == "ddim" else ddpm(levels, temperature)
 
     def step(self, number, x, eps, noise):
-        """x and eps [L, c] of a pass -> the rows after it."""
+        """Runs a pass on x and eps [L, c] -> the rows after it."""
         row = {name: torch.from_numpy(table[number]) for name, table in self.tables.items()}
         x0 = (row["x_scale"] * x + row["eps_scale"] * eps).clamp(-self.clip, self.clip)
         if self.name == "ddpm":
@@ -45,20 +45,20 @@ class Sampler:
 
 
 class InverseDynamics(nn.Module):
-    """The action between two embedded observations: three linear layers."""
+    """Network for the action between two embedded observations: three linear layers."""
 
     def __init__(self, inputs, hidden, action):
         super().__init__()
         self.first, self.second, self.head = nn.Linear(2 * inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, action)
 
     def forward(self, x):
-        """x [..., L, c] -> actions [..., L - 1, A]."""
+        """Computes the actions between rows: x [..., L, c] -> actions [..., L - 1, A]."""
         pairs = torch.cat([x[..., :-1, :], x[..., 1:, :]], -1)
         return self.head(F.relu(self.second(F.relu(self.first(pairs)))))
 
 
 class SkillDiffuser(nn.Module):
-    """A plan every H steps; H + 1 embedded observations by denoising, H actions between them."""
+    """Policy with a plan every H steps; H + 1 embedded observations by denoising, H actions between them."""
 
     def __init__(self, sizes, shape=Shape(), hidden=32, sampler=None):
         super().__init__()
@@ -72,11 +72,12 @@ class SkillDiffuser(nn.Module):
         self.inverse = InverseDynamics(shape.inputs, hidden, sizes.action)
 
     def logits(self, words, observations):
-        """words [L, E], observations [T, O] in raw units -> logits [T, M]."""
+        """Computes the plans' logits: words [L, E], observations [T, O] in raw units -> logits [T, M]."""
         return self.high_level([words], self.normalizer(observations)[None])[0]
 
     def chunk(self, observation, index, noise):
-        """observation [1, O] in raw units, noise of the first rows and of each pass that draws, flat -> actions [H, A]."""
+        """Computes a chunk of actions: observation [1, O] in raw units, noise of the first rows and of each pass that draws, flat ->
+        actions [H, A]."""
         rows = self.denoiser.shape.rows
         present, draws = self.embed_norm(self.embed(self.normalizer(observation))), noise.view(-1, rows, self.denoiser.shape.inputs)
         x = torch.cat([present, self.sampler.temperature * draws[0, 1:]])
@@ -91,7 +92,7 @@ class SkillDiffuser(nn.Module):
 
 
 def _first_row(entry, present, x, rows, width, out):
-    """x with `present` in its first row."""
+    """Replaces the first row of x by `present`."""
     ends = [entry.integers(f"number.{n}", [n]) for n in (1, rows, 0)]
     rest = entry.op("Slice", [x, *ends], out + ".rest")
     entry.op("Concat", [present, rest], out, axis=0)

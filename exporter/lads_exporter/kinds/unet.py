@@ -1,4 +1,5 @@
-"""The temporal U-Net of SkillDiffuser, and its nodes: the noise in L rows of embedded observations, told the noise level and the option.
+"""The temporal U-Net of SkillDiffuser, and its nodes: it predicts the noise in L rows of embedded observations, given the noise level and
+the option.
 
 Convolutions over rows stand in a graph as products of shifted rows side by side; taps that meet only the zeros beyond both ends are left out. Level and
 option reach each block through a linear layer on Mish of both, whose halves are two tables: a row per pass and a row per option.
@@ -16,7 +17,7 @@ from .denoising import mish, sinusoids
 
 @dataclass(frozen=True)
 class Shape:
-    """Sizes of the U-Net; the bench's where nothing is said."""
+    """Sizes of the U-Net, by default the bench's."""
 
     inputs: int = 16  # elements of a row, of the option and of the embedded level
     width: int = 8
@@ -27,7 +28,7 @@ class Shape:
 
 
 class Block(nn.Module):
-    """Two convolutions with group norm and Mish, level and option added in between, and the input added at the end."""
+    """U-Net block: two convolutions with group norm and Mish, level and option added in between, and the input added at the end."""
 
     def __init__(self, inputs, outputs, shape):
         super().__init__()
@@ -37,14 +38,14 @@ class Block(nn.Module):
         self.skip = nn.Conv1d(inputs, outputs, 1) if inputs != outputs else None
 
     def forward(self, x, told):
-        """x [N, c, L], told [N, 2 E] -> [N, c', L]."""
+        """Runs the block: x [N, c, L], told [N, 2 E] -> [N, c', L]."""
         y = F.mish(self.norm1(self.conv1(x))) + self.embed(told)[:, :, None]
         y = F.mish(self.norm2(self.conv2(y)))
         return y + (x if self.skip is None else self.skip(x))
 
 
 class Unet(nn.Module):
-    """Two blocks at each length going down, two in the middle, two at each length going up."""
+    """U-Net with two blocks at each length going down, two in the middle, two at each length going up."""
 
     def __init__(self, shape):
         super().__init__()
@@ -62,11 +63,11 @@ class Unet(nn.Module):
         self.last = nn.Conv1d(widths[0], inputs, 1)
 
     def told(self, levels, options, known):
-        """levels [N] from 1, options [N, E], known [N, 1] (0 leaves the option out) -> [N, 2 E]."""
+        """Embeds level and option: levels [N] from 1, options [N, E], known [N, 1] (0 leaves the option out) -> [N, 2 E]."""
         return F.mish(torch.cat([self.embed_level(self.sinusoids[levels - 1]), self.embed_option(options) * known], 1))
 
     def forward(self, x, told):
-        """x [N, L, inputs] -> the noise in it."""
+        """Predicts the noise in x [N, L, inputs]."""
         x, fine = x.transpose(1, 2), []
         for place, blocks in enumerate(self.down):
             for block in blocks:
@@ -85,13 +86,13 @@ class Unet(nn.Module):
 
 
 class Nodes:
-    """The nodes of a U-Net for one row of level and option tables; names of values start with `prefix`."""
+    """Nodes of a U-Net for one row of level and option tables; names of values start with `prefix`."""
 
     def __init__(self, entry, net, tables, prefix):
         self.entry, self.net, self.tables, self.prefix = entry, net, tables, prefix
 
     def run(self, x):
-        """x [L, inputs] -> the noise in it."""
+        """Adds the nodes that predict the noise in x [L, inputs]."""
         net, rows, fine = self.net, self.net.shape.rows, []
         for place, blocks in enumerate(net.down):
             x = self.blocks(x, blocks, f"down.{place}", rows)
@@ -122,7 +123,7 @@ class Nodes:
         return entry.op("Add", [y, x if block.skip is None else self.conv(x, block.skip, name + ".skip", rows)], out + ".out")
 
     def shifted(self, x, offset, width, rows, name):
-        """Row i is row i + offset of x [rows, width], zeros beyond the ends."""
+        """Shifts rows: row i of the result is row i + offset of x [rows, width], zeros beyond the ends."""
         if offset == 0:
             return x
         entry, out = self.entry, f"{self.prefix}.{name}.shift.{offset}"
@@ -133,7 +134,7 @@ class Nodes:
         return entry.op("Concat", [nothing, kept] if offset < 0 else [kept, nothing], out, axis=0)
 
     def taps(self, x, offsets, width, rows, name):
-        """x at several offsets, side by side: [rows, len(offsets) * width]."""
+        """Places x at several offsets side by side: [rows, len(offsets) * width]."""
         parts = [self.shifted(x, offset, width, rows, name) for offset in offsets]
         return parts[0] if len(parts) == 1 else self.entry.op("Concat", parts, f"{self.prefix}.{name}.taps", axis=1)
 
@@ -149,13 +150,14 @@ class Nodes:
         return entry.gemm(seen, entry.weight(f"denoiser.{name}.weight", weight), entry.weight(f"denoiser.{name}.bias", module.bias), f"{self.prefix}.{name}")
 
     def halve(self, x, module, name, rows):
-        """A convolution of three taps at every second row."""
+        """Computes a convolution of three taps at every second row."""
         seen = self.taps(x, (-1, 0, 1), module.in_channels, rows, name)
         even = self.entry.integers(f"even_rows.{rows}", list(range(0, rows, 2)))
         return self._gemm(self.entry.op("Gather", [seen, even], f"{self.prefix}.{name}.even", axis=0), module, [0, 1, 2], name)
 
     def widen(self, x, module, name, rows):
-        """A transposed convolution of four taps: even rows from the row and the one before it, odd ones from the row and the one after it."""
+        """Computes a transposed convolution of four taps: even rows from the row and the one before it, odd ones from the row and the one
+        after it."""
         entry, out, width = self.entry, f"{self.prefix}.{name}", module.in_channels
         halves = []
         for half, offsets, taps in (("even", (-1, 0), (3, 1)), ("odd", (0, 1), (2, 0))):
@@ -184,10 +186,10 @@ class Nodes:
 
 
 class Tables:
-    """What the blocks add: for each a table over the passes and one over the options, the last of which is none."""
+    """Tables of what the blocks add: for each a table over the passes and one over the options, the last of which stands for no option."""
 
     def __init__(self, entry, net, levels, options, number):
-        """levels: of each pass; options [M, E]; number: the name of the pass."""
+        """Makes the tables from the levels of each pass and options [M, E]; number: the name of the pass."""
         self.entry, self.number, self.chosen, self.times = entry, number, {}, {}
         with torch.no_grad():
             time = F.mish(net.embed_level(net.sinusoids[torch.tensor(levels) - 1])).double()
@@ -200,11 +202,11 @@ class Tables:
                     self.weights[name] = time @ on_time.T + block.embed.bias.double(), option @ on_option.T
 
     def choose(self, prefix, index):
-        """The option whose rows the nodes with this prefix add."""
+        """Chooses the option whose rows the nodes with this prefix add."""
         self.chosen[prefix] = index
 
     def row(self, prefix, name):
-        """What the block `name` adds, [1, c]."""
+        """Returns the row that the block `name` adds, [1, c]."""
         entry, (time, option) = self.entry, self.weights[name]
         if name not in self.times:
             self.times[name] = entry.op("Gather", [entry.weight(f"denoiser.{name}.levels", time), self.number], f"{name}.level", axis=0)

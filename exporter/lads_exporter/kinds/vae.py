@@ -1,4 +1,4 @@
-"""`vae`: the high level gives the mean and the deviation of a continuous plan, the low level is an MLP on observation and plan."""
+"""Kind `vae`: the high level gives the mean and the deviation of a continuous plan, the low level is an MLP on observation and plan."""
 
 import torch
 from torch import nn
@@ -11,7 +11,7 @@ LOG_STD = (-10.0, 2.0)
 
 
 class Vae(nn.Module):
-    """High level with a Gaussian head, low level, and the trajectory encoder's mean."""
+    """Policy of a high level with a Gaussian head, a low level, and the trajectory encoder's mean."""
 
     def __init__(self, sizes):
         super().__init__()
@@ -22,7 +22,8 @@ class Vae(nn.Module):
         self.encoder = TrajectoryEncoder(16, sizes.observation, sizes.action, sizes.plan, sizes.observation, False)
 
     def plans(self, words, observations, actions):
-        """words [L, E], observations [T, O] in raw units, actions [T, A] as executed -> mean and log deviation [T, D]."""
+        """Computes the plans' distribution: words [L, E], observations [T, O] in raw units, actions [T, A] as executed -> mean and log
+        deviation [T, D]."""
         mean, log_std = self.high_level([words], self.normalizer(observations)[None], actions[None])[0].chunk(2, -1)
         return mean, log_std.clamp(*LOG_STD)
 
@@ -31,7 +32,7 @@ class Vae(nn.Module):
 
 
 def _half(module, part):
-    """Half of a linear layer's outputs as a layer of its own."""
+    """Takes half of a linear layer's outputs as a layer of its own."""
     rows = module.out_features // 2
     half = nn.Linear(module.in_features, rows)
     pick = slice(part * rows, (part + 1) * rows)

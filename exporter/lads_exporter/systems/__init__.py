@@ -24,5 +24,5 @@ MODULES = {
 
 
 def of(config):
-    """The module of the system that a configuration names."""
+    """Returns the module of the system that a configuration names."""
     return import_module(f".{MODULES[config.system.kind]}", __name__)

@@ -1,4 +1,4 @@
-"""The moving average of a network's weights."""
+"""Moving average of a network's weights."""
 
 import torch
 

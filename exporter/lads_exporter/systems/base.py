@@ -1,4 +1,4 @@
-"""What every system's training has: stages, the settings of each, draws of episodes; and what an export gives."""
+"""Base of every system's training: stages, the settings of each, draws of episodes; and the result of an export."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ HELD_OUT = 512  # episodes that losses of whole contexts are validated on
 
 @dataclass(frozen=True)
 class Exported:
-    """A policy's entry graphs, and what its contract says beyond the setting."""
+    """Entry graphs of a policy, and what its contract says beyond the setting."""
 
     model: object  # ONNX, without metadata
     family: dict
@@ -22,7 +22,7 @@ class Exported:
 
 
 def sizes(setting, encoded):
-    """The sizes of a system's networks, from its configuration."""
+    """Returns the sizes of a system's networks, from its configuration."""
     config = setting.config
     high, encoder = config.high_level, config.encoder
     return Sizes(
@@ -42,12 +42,12 @@ def sizes(setting, encoded):
 
 
 def decision(setting):
-    """How a plan is picked from logits."""
+    """Returns how a plan is picked from logits, for the contract."""
     return {"rule": setting.config.decision, "temperature": 1.0, "seed": 0}
 
 
 class Training:
-    """How a system's networks learn. A subclass says its stages, which parts each trains, and each one's loss.
+    """Training of a system's networks. A subclass says its stages, which parts each trains, and each one's loss.
 
     Everything random is drawn from PyTorch's generator, which the trainer seeds for every step, or from generators of `seed_of`.
     """
@@ -62,12 +62,13 @@ class Training:
 
     @classmethod
     def stages(cls, config):
-        """The names of the stages, in their order."""
+        """Names of the stages, in their order."""
         return cls.STAGES[config.training.schedule]
 
     @classmethod
     def settings(cls, config, stage):
-        """Steps, batch and learning rate of a stage. What is trained end to end takes those of the high level where the schedule is staged."""
+        """Returns steps, batch and learning rate of a stage. What is trained end to end takes those of the high level where the schedule is
+        staged."""
         own = getattr(config.system, stage, None)
         if own is not None:
             return own
@@ -76,50 +77,51 @@ class Training:
         return getattr(config.training, stage)
 
     def parts(self, stage):
-        """The names of the networks that a stage trains."""
+        """Returns the names of the networks that a stage trains."""
         raise NotImplementedError
 
     def begin(self, stage):
-        """Before the first step of a stage, and again where it is resumed."""
+        """Prepares a stage before its first step, and again where it is resumed."""
 
     def loss(self, stage, step):
-        """The total loss of a step, and its parts by name."""
+        """Computes the total loss of a step, and its parts by name."""
         raise NotImplementedError
 
     def after(self, stage):
-        """After the optimiser's step."""
+        """Called after the optimiser's step."""
 
     def finish(self, stage):
-        """After a stage's last step: corrections that go into the weights."""
+        """Called after a stage's last step: corrections that go into the weights."""
 
     def validate(self, stage):
-        """Numbers on the held-out episodes, by name; networks are put into evaluation."""
+        """Computes numbers on the held-out episodes, by name; networks are put into evaluation."""
         return {}
 
     def summary(self):
-        """What a run's summary says beyond steps and seconds."""
+        """Returns what a run's summary says beyond steps and seconds."""
         return {}
 
     def generator(self, stage, draw):
         return torch.Generator().manual_seed(self.seed_of(stage, "draw", draw))
 
     def draw_alike(self, stage, step):
-        """Training episodes of similar length for a step."""
+        """Draws training episodes of similar length for a step."""
         batch = self.settings(self.config, stage).batch
         return self.corpus.draw_alike(batch, step, lambda draw: self.generator(stage, draw))
 
     def held_out(self):
-        """Episodes for validation, no more than fit a batch."""
+        """Returns episodes for validation, no more than fit a batch."""
         return self.corpus.validation[:HELD_OUT]
 
     def half(self):
-        """Where the transformers run in bfloat16."""
+        """Context in which the transformers run in bfloat16."""
         return torch.autocast(self.corpus.device.type, torch.bfloat16, enabled=self.autocast)
 
 
 @torch.no_grad()
 def gain(linear, factor):
-    """The mean of random actions is small even where their direction is clear, and a policy that follows it is slow, so it has a gain."""
+    """Multiplies a linear layer by a gain: the mean of random actions is small even where their direction is clear, and a policy that
+    follows it is slow."""
     linear.weight.mul_(factor)
     linear.bias.mul_(factor)
 

@@ -1,4 +1,4 @@
-"""Cluster: the plans are goals, observations in the middle of clusters of all observations; no latent space is learned.
+"""System `cluster`: the plans are goals, observations in the middle of clusters of all observations; no latent space is learned.
 
 Observations, z-scored, are laid out in the plane by t-SNE and grouped there by k-means; a cluster's goal is the observation nearest to its centre.
 The low level learns to reach the last observation of its own segment, the high level to name the goal nearest to it. So there are two stages. A goal is
@@ -38,7 +38,7 @@ class Networks(nn.Module):
 
 
 def medoids(points, count, perplexity, seed):
-    """The rows of points [N, O] nearest to the centres of `count` clusters in their t-SNE plane: indices [count]."""
+    """Finds the rows of points [N, O] nearest to the centres of `count` clusters in their t-SNE plane: indices [count]."""
     try:
         from sklearn.cluster import KMeans
         from sklearn.manifold import TSNE
@@ -77,7 +77,7 @@ class Training(base.Training):
         self.networks.codebook.started.fill_(True)
 
     def _ends(self, episodes, starts):
-        """The last observation of the segments that start there."""
+        """Returns the last observation of the segments that start at the given steps."""
         last = torch.minimum(starts + self.corpus.horizon - 1, self.corpus.lengths.to(starts.device)[episodes] - 1)
         return self.corpus.observations[episodes.to(self.corpus.device), last.clamp(min=0).to(self.corpus.device)]
 
@@ -96,7 +96,7 @@ class Training(base.Training):
         return ce, {"ce": ce}
 
     def high_level(self, episodes, codes):
-        """The cross-entropy of the goals and the accuracy; codes [B, T], -1 where there is none."""
+        """Computes the cross-entropy of the goals and the accuracy; codes [B, T], -1 where there is none."""
         high_level = self.networks.high_level
         words, codes, observations, executed = self.contexts.take(episodes, codes, high_level.training)
         with self.half():
@@ -105,13 +105,13 @@ class Training(base.Training):
         return F.cross_entropy(out, targets), (out.argmax(-1) == targets).float().mean()
 
     def _uses(self):
-        """How often each goal is the nearest at the end of a segment, [M]."""
+        """Counts how often each goal is the nearest at the end of a segment, [M]."""
         starts = self.codes[:, :: self.corpus.horizon]
         return torch.bincount(starts[starts >= 0], minlength=len(self.networks.codebook.codes)).clamp(min=1).float()
 
     @torch.no_grad()
     def finish(self, stage):
-        """The same corrections as LADS'."""
+        """Applies the same corrections as LADS after a stage."""
         if stage == "high_level":
             uses = self._uses()
             self.networks.high_level.head.bias.sub_(self.config.high_level.balance * (uses / uses.sum()).log())
@@ -120,7 +120,7 @@ class Training(base.Training):
 
     @torch.no_grad()
     def validate(self, stage):
-        """Each segment's own end as its goal; segments from step 0."""
+        """Validates with each segment's own end as its goal; segments from step 0."""
         episodes = self.corpus.validation
         self.networks.eval()
         segments = self.corpus.segments(episodes, torch.zeros(len(episodes), dtype=torch.long))
@@ -140,7 +140,7 @@ class Training(base.Training):
 
 
 def goal_encode(graph, codes, normalizer, horizon, action_len):
-    """A segment to the goal nearest to its last observation."""
+    """Adds the entry that maps a segment to the goal nearest to its last observation."""
     entry = graphs.Entry(graph, "trajectory_encoder/encode")
     observations = entry.input("observations", [1, horizon, len(normalizer.mean)])
     entry.op("Identity", [entry.input("actions", [1, horizon, action_len])], "not_looked_at")

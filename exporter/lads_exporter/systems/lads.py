@@ -1,4 +1,4 @@
-"""LADS: a categorical high level over a codebook that a trajectory encoder and the semantic regularisation made (Section 4).
+"""System `lads`: a categorical high level over a codebook that a trajectory encoder and the semantic regularisation made (Section 4).
 
 Jointly by Algorithm 1, or in three stages. The stop-gradients of equation 7 keep the cross-entropy from moving the plans and the other
 losses from moving the high level, so the stages minimise the same sum (equation 11) in turn:
@@ -41,7 +41,7 @@ class Training(base.Training):
         return self.PARTS[stage]
 
     def begin(self, stage):
-        """The codes of all windows, which are frozen from here on."""
+        """Computes the codes of all windows, which stay fixed during the stage."""
         if stage in ("low_level", "high_level"):
             self.networks.eval()
             self.codes = self.corpus.codes(self.encode, range(len(self.corpus.lengths)))
@@ -63,7 +63,7 @@ class Training(base.Training):
         return torch.randint(self.corpus.horizon, (len(episodes),), generator=generator)
 
     def plans(self, episodes, offsets):
-        """L_BC, the commitment term of L_VQ and L_align (equations 5, 6, 10); and the segments' codes [B, T].
+        """Computes L_BC, the commitment term of L_VQ and L_align (equations 5, 6, 10); and the segments' codes [B, T].
 
         The code of a segment stands at the step at which it starts, -1 at all other steps.
         """
@@ -77,13 +77,13 @@ class Training(base.Training):
         return losses, codes
 
     def cloning(self, segments, plans):
-        """The mean squared error of the low level's actions under each segment's plan (equation 5)."""
+        """Computes the mean squared error of the low level's actions under each segment's plan (equation 5)."""
         valid = segments.valid
         each = plans[:, None].expand(-1, self.corpus.horizon, -1)[valid]
         return F.mse_loss(self.networks.low_level(segments.low_level_observations[valid], each), segments.actions[valid])
 
     def align(self, plans, segments, episodes):
-        """L_align of the sequences of plans and their sentences (equation 10); 0 where it has no weight."""
+        """Computes L_align of the sequences of plans and their sentences (equation 10); 0 where it has no weight."""
         if self.config.alignment.weight == 0:
             return plans.new_zeros(())
         most = int(segments.places.max()) + 1
@@ -95,7 +95,8 @@ class Training(base.Training):
         return self.networks.alignment(sequence, valid, self.corpus.sentences[instruction], instruction)
 
     def high_level(self, episodes, codes):
-        """L_CE (equation 8), or without CP the squared distance to the code; and the accuracy. codes [B, T] are the targets, -1 where there is none."""
+        """Computes L_CE (equation 8), or without CP the squared distance to the code; and the accuracy. codes [B, T] are the targets, -1
+        where there is none."""
         high_level = self.networks.high_level
         words, codes, observations, executed = self.contexts.take(episodes, codes, high_level.training)
         with self.half():
@@ -144,7 +145,7 @@ class Training(base.Training):
 
     @torch.no_grad()
     def finish(self, stage):
-        """After the stage that trains it, a policy's correction goes into its last layer.
+        """Puts a policy's correction into its last layer, after the stage that trains it.
 
         High level: less what is frequent anyway, the logits say which plan the instruction speaks for. Low level: a gain.
         """
@@ -156,7 +157,7 @@ class Training(base.Training):
 
     @torch.no_grad()
     def validate(self, stage):
-        """Losses on the held-out episodes, segmented from step 0."""
+        """Computes losses on the held-out episodes, segmented from step 0."""
         episodes = self.corpus.validation
         self.networks.eval()
         parts, codes = self.plans(episodes, torch.zeros(len(episodes), dtype=torch.long))
@@ -169,7 +170,7 @@ class Training(base.Training):
         return out
 
     def summary(self):
-        """How the codebook is used over the dataset."""
+        """Describes how the codebook is used over the dataset."""
         self.networks.eval()
         codes = self.corpus.codes(self.encode, range(len(self.corpus.lengths)))
         starts = codes[:, :: self.corpus.horizon]
@@ -178,7 +179,7 @@ class Training(base.Training):
 
 
 def family(setting):
-    """What the contract says of a policy with a codebook of plans that last H steps."""
+    """Makes what the contract says of a policy with a codebook of plans that last H steps."""
     encoder = setting.config.encoder
     return {
         "kind": "lads",

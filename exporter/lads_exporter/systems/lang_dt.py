@@ -1,4 +1,5 @@
-"""Lang DT: a causal transformer over words, observations and actions that gives the action itself, in every step; no plan, no low level.
+"""System `lang_dt`: a causal transformer over words, observations and actions that gives the action itself, in every step; no plan, no low
+level.
 
 Trained end to end by the mean squared error over whole trajectories.
 """
@@ -26,7 +27,7 @@ class Training(base.Training):
         return ("high_level",)
 
     def actions(self, episodes):
-        """The mean squared error of the actions over all steps of the episodes."""
+        """Computes the mean squared error of the actions over all steps of the episodes."""
         high_level = self.networks.high_level
         words, places, observations, executed = self.contexts.take(episodes, self.contexts.places(episodes), high_level.training)
         with self.half():

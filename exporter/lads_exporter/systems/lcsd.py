@@ -1,4 +1,4 @@
-"""LCSD, our reading of it: a plan at every step by a quantised high level, and a low level that denoises one action.
+"""System `lcsd`, our reading of LCSD: a plan at every step by a quantised high level, and a low level that denoises one action.
 
 Only the abstract of LCSD is public. What is read out of it: two forms of the mutual information of plans and language given the state. I(z; l | s) as
 H(z | s) - H(z | s, l): k-means and revival keep the first term up, the second vanishes because the nearest code is taken. And as H(l | s) - H(l | z, s),
@@ -22,7 +22,7 @@ from ..kinds.denoising import alpha_bar
 
 
 def shape(setting):
-    """The denoiser's sizes."""
+    """Returns the denoiser's sizes."""
     system = setting.config.system
     return lcsd.Denoiser(observed=setting.config.high_level.hidden, time=16, hidden=system.hidden, layers=3, steps=system.steps)
 
@@ -52,7 +52,7 @@ class Training(lisa.Training):
         return 1
 
     def parts_of(self, episodes, levels=None):
-        """The losses of all steps of the episodes, and their codes. levels [N]: of the noise, drawn where None."""
+        """Computes the losses of all steps of the episodes, and their codes. levels [N]: of the noise, drawn where None."""
         networks, corpus = self.networks, self.corpus
         latents, chunks = self.latents(episodes, 1)
         plans, index, commitment = networks.codebook(latents)
@@ -67,7 +67,8 @@ class Training(lisa.Training):
         return parts, index
 
     def language(self, plans, kept, episodes):
-        """How far the sentence embedding reconstructed from each trajectory's plans is from the true one, mean per element times the elements."""
+        """Computes how far the sentence embedding reconstructed from each trajectory's plans is from the true one, mean per element times
+        the elements."""
         sequences = plans.new_zeros(*kept.shape, plans.shape[1])
         sequences[kept] = plans
         rows = F.pad(sequences, (0, 0, 0, self.config.high_level.context_steps - kept.shape[1])).flatten(1)
@@ -85,7 +86,7 @@ class Training(lisa.Training):
         follow(self.networks.average, self.networks.denoiser, self.config.system.average)
 
     def finish(self, stage):
-        """No gain: what is denoised is no mean."""
+        """Applies no gain: what is denoised is not a mean."""
 
     @torch.no_grad()
     def validate(self, stage):
@@ -96,7 +97,7 @@ class Training(lisa.Training):
 
 @torch.no_grad()
 def acting(networks, setting, encoded):
-    """The policy that acts."""
+    """Returns the policy that acts."""
     policy = lcsd.Lcsd(base.sizes(setting, encoded), shape(setting), setting.environment["action"])
     policy.normalizer.load_state_dict(networks.normalizer.state_dict())
     policy.high_level = networks.folded()

@@ -1,4 +1,5 @@
-"""LISA: a high level on words and observations that regresses an option every H steps, quantised; a transformer on the steps of its chunk acts.
+"""System `lisa`: a high level on words and observations that regresses an option every H steps, quantised; a transformer on the steps of
+its chunk acts.
 
 Trained end to end: mean squared error of the actions plus commitment. Of an option's H copies the first carries its gradient, as in the published
 code, or all do. Departures: the language encoder is frozen; trajectories are padded at their end, chunks start at step 0, and what is padded
@@ -24,14 +25,14 @@ START_BATCHES = 8  # whose latents the codebook starts from
 
 
 def chunk_sizes(setting, encoded):
-    """The low level's sizes: it has a time for every step of a chunk, also where the context ends within one."""
+    """Returns the low level's sizes: it has a time for every step of a chunk, also where the context ends within one."""
     sizes = base.sizes(setting, encoded)
     whole = -(-sizes.steps // sizes.horizon) * sizes.horizon
     return dataclasses.replace(sizes, steps=whole)
 
 
 class Quantised(nn.Module):
-    """A high level whose head regresses a vector of `hidden` elements, projected into the codebook's space, quantised, and projected back."""
+    """High level whose head regresses a vector of `hidden` elements, projected into the codebook's space, quantised, and projected back."""
 
     def __init__(self, setting, encoded):
         super().__init__()
@@ -42,7 +43,7 @@ class Quantised(nn.Module):
         self.codebook = Codebook(setting.config.encoder)
 
     def folded(self):
-        """The high level with logits over the codes."""
+        """Returns the high level with logits over the codes."""
         acting = copy.deepcopy(self.high_level)
         acting.head = fold(acting.head, self.project_in, self.codebook.codes)
         return acting
@@ -56,7 +57,7 @@ class Networks(Quantised):
         self.low_level = lisa.ChunkPolicy(sizes, nn.Linear(sizes.hidden, sizes.hidden))
 
     def option_table(self):
-        """The options of all codes [M, d], before the low level embeds them."""
+        """Computes the options of all codes [M, d], before the low level embeds them."""
         return self.project_out(self.codebook.codes)
 
 
@@ -68,7 +69,8 @@ class Training(base.Training):
         return self.PARTS
 
     def latents(self, episodes, every):
-        """The episodes' contexts cut into chunks of `every` steps: latents [N, D] at each one's start, and what it is of (`Chunks`)."""
+        """Encodes the episodes' contexts cut into chunks of `every` steps: latents [N, D] at each one's start, and what it is of
+        (`Chunks`)."""
         networks = self.networks
         words, places, observations, executed = self.contexts.take(episodes, self.contexts.places(episodes), networks.high_level.training)
         with self.half():
@@ -77,7 +79,7 @@ class Training(base.Training):
         return networks.project_in(regressed[:, ::every][chunks.kept]), chunks
 
     def chunks(self, episodes):
-        """The losses of chunks of H steps, and their codes."""
+        """Computes the losses of chunks of H steps, and their codes."""
         networks, config = self.networks, self.config.system
         latents, chunks = self.latents(episodes, self.corpus.horizon)
         plans, index, commitment = networks.codebook(latents)
@@ -122,7 +124,7 @@ class Training(base.Training):
 
     @property
     def every(self):
-        """Control steps from one option to the next in training."""
+        """Returns the control steps from one option to the next in training."""
         return self.corpus.horizon
 
 
@@ -142,7 +144,7 @@ class Chunks:
 
 
 def copies(options, count, gradient):
-    """options [N, d] -> [N, count, d], of which only the first, or all, carry the gradient."""
+    """Repeats options [N, d] -> [N, count, d], of which only the first, or all, carry the gradient."""
     if gradient == "all":
         return options[:, None].expand(-1, count, -1)
     return torch.cat([options[:, None], options.detach()[:, None].expand(-1, count - 1, -1)], 1)
@@ -150,7 +152,7 @@ def copies(options, count, gradient):
 
 @torch.no_grad()
 def acting(networks, setting, encoded):
-    """The policy that acts, its quantiser folded."""
+    """Returns the policy that acts, its quantiser folded."""
     sizes = base.sizes(setting, encoded)
     policy = lisa.Lisa(sizes)
     policy.normalizer.load_state_dict(networks.normalizer.state_dict())

@@ -1,4 +1,5 @@
-"""SkillDiffuser: LISA's high level with chunks of H states; a diffusion of H embedded observations and inverse dynamics give H - 1 actions.
+"""System `skilldiffuser`: LISA's high level with chunks of H states; a diffusion of H embedded observations and inverse dynamics give H - 1
+actions.
 
 Two stages: `joint` trains LISA, whose low level is then left out; `diffusion` freezes the rest and trains U-Net and inverse dynamics on all windows of H
 real steps under the option of the chunk that a window starts in. The observations' embedding is the high level's, normalised. The first row is the
@@ -20,7 +21,7 @@ from .base import Exported
 
 
 def shape(setting):
-    """The U-Net's sizes."""
+    """Returns the U-Net's sizes."""
     config, system = setting.config, setting.config.system
     return unet.Shape(config.high_level.hidden, system.width, tuple(system.multiples), system.groups, config.encoder.horizon, system.schedule)
 
@@ -34,7 +35,7 @@ class Networks(lisa.Networks):
         self.inverse = skilldiffuser.InverseDynamics(hidden, setting.config.system.inverse, setting.action_len)
 
     def embedded(self, observations):
-        """Normalised observations [..., O] -> the rows that are denoised [..., d]."""
+        """Embeds normalised observations [..., O] -> the rows that are denoised [..., d]."""
         rows = self.high_level.embed_observation(observations)
         return F.layer_norm(rows, rows.shape[-1:])
 
@@ -58,7 +59,7 @@ class Training(lisa.Training):
 
     @torch.no_grad()
     def _options(self):
-        """The code in force at each step of every episode, [E * T]: that of the chunk it lies in."""
+        """Returns the code in force at each step of every episode, [E * T]: that of the chunk it lies in."""
         codes = torch.zeros(self.corpus.observations.shape[:2], dtype=torch.long, device=self.corpus.device).flatten()
         for episodes in torch.arange(len(self.corpus.lengths)).split(256):
             latents, chunks = self.latents(episodes, self.corpus.horizon)
@@ -68,14 +69,14 @@ class Training(lisa.Training):
         return codes
 
     def _windows(self, episodes):
-        """The place of the first step of every window of H real steps."""
+        """Returns the place of the first step of every window of H real steps."""
         lengths = self.corpus.lengths[episodes]
         starts = torch.arange(self.corpus.steps)
         fits = starts[None] + self.corpus.horizon <= lengths[:, None]
         return (episodes[:, None] * self.corpus.steps + starts)[fits].to(self.corpus.device)
 
     def diffusion(self, places, levels=None):
-        """The losses of the windows that start at `places` [N]."""
+        """Computes the losses of the windows that start at `places` [N]."""
         networks, config = self.networks, self.config.system
         steps = places[:, None] + torch.arange(self.corpus.horizon, device=places.device)
         with torch.no_grad():
@@ -106,7 +107,7 @@ class Training(lisa.Training):
             follow(self.networks.average, self.networks.denoiser, self.config.system.average)
 
     def finish(self, stage):
-        """No gain: what is denoised is no mean."""
+        """Applies no gain: what is denoised is not a mean."""
 
     @torch.no_grad()
     def validate(self, stage):
@@ -124,7 +125,7 @@ def sampler(setting):
 
 @torch.no_grad()
 def acting(networks, setting, encoded):
-    """The policy that acts."""
+    """Returns the policy that acts."""
     policy = skilldiffuser.SkillDiffuser(base.sizes(setting, encoded), shape(setting), setting.config.system.inverse, sampler(setting))
     policy.normalizer.load_state_dict(networks.normalizer.state_dict())
     policy.high_level = networks.folded()

@@ -1,4 +1,4 @@
-"""VAE, and LADS with a VAE: plans are Gaussian vectors instead of codes, and the high level gives the mean and deviation of one.
+"""System `vae`, and LADS with a VAE: plans are Gaussian vectors instead of codes, and the high level gives the mean and deviation of one.
 
 The trajectory encoder gives q = N(mu, sigma); the low level learns on a draw from it. Its loss is the squared error plus beta times the mean
 divergence per element from N(0, 1); the high level's is the divergence of its Gaussian from q, summed over the elements, with q held fixed (equation 7).
@@ -33,7 +33,7 @@ class Networks(nn.Module):
 
 
 def split(gaussian):
-    """[..., 2 D] -> mean [..., D], limited log deviation [..., D]."""
+    """Splits [..., 2 D] -> mean [..., D], limited log deviation [..., D]."""
     mean, log_std = gaussian.chunk(2, -1)
     return mean, log_std.clamp(*vae.LOG_STD)
 
@@ -44,7 +44,7 @@ def sample(gaussian):
 
 
 def divergence(q, p):
-    """KL(q || p) of each element, [..., D]; both as [..., 2 D], p None for N(0, 1)."""
+    """Computes KL(q || p) of each element, [..., D]; both as [..., 2 D], p None for N(0, 1)."""
     mean, log_std = split(q)
     other, other_log = split(p) if p is not None else (0.0, torch.zeros_like(log_std))
     return other_log - log_std + (torch.exp(2 * log_std) + (mean - other).square()) / (2 * torch.exp(2 * other_log)) - 0.5
@@ -60,7 +60,7 @@ class Training(lads.Training):
     }
 
     def begin(self, stage):
-        """q of all windows, frozen from here on."""
+        """Computes q of all windows, which stays fixed during the stage."""
         if stage in ("low_level", "high_level"):
             self.networks.eval()
             self.known = self._every_window(range(len(self.corpus.lengths)))
@@ -74,7 +74,7 @@ class Training(lads.Training):
         return self.networks.encoder(segments.observations, segments.executed, segments.lengths)
 
     def plans(self, episodes, offsets):
-        """The losses of segments, and q [B, T, 2 D] with marks [B, T] at their starts."""
+        """Computes the losses of segments, and q [B, T, 2 D] with marks [B, T] at their starts."""
         segments = self.corpus.segments(episodes, offsets)
         q = self.networks.encoder(segments.observations, segments.executed, segments.lengths)
         plans = sample(q) if self.networks.encoder.training else split(q)[0]
@@ -86,7 +86,8 @@ class Training(lads.Training):
         return losses, (known, marks)
 
     def high_level(self, episodes, known, marks):
-        """L_h: the divergence of the high level's Gaussian from q where there is a mark, summed over the elements; marks are places in known [B * T]."""
+        """Computes L_h, the divergence of the high level's Gaussian from q where there is a mark, summed over the elements; marks are
+        places in known [B * T]."""
         high_level = self.networks.high_level
         words, marks, observations, executed = self.contexts.take(episodes, marks, high_level.training)
         with self.half():
@@ -94,7 +95,7 @@ class Training(lads.Training):
         return divergence(known.flatten(0, 1)[marks[marks >= 0]], p[marks >= 0]).sum(-1).mean()
 
     def _decisions(self, marks):
-        """Only the marks at multiples of H, where the configuration says so."""
+        """Keeps only the marks at multiples of H, if the configuration asks for that."""
         if self.config.training.ce_at == "decisions":
             marks = marks.clone()
             marks[:, torch.arange(marks.shape[1]) % self.corpus.horizon > 0] = -1
@@ -138,7 +139,7 @@ class Training(lads.Training):
 
     @torch.no_grad()
     def summary(self):
-        """How many elements of the plan carry something over the held-out episodes."""
+        """Counts the elements of the plan that carry something over the held-out episodes."""
         self.networks.eval()
         _, (known, marks) = self.plans(self.corpus.validation, torch.zeros(len(self.corpus.validation), dtype=torch.long))
         each = divergence(known[marks >= 0], None).mean(0)

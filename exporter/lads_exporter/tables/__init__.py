@@ -1,4 +1,5 @@
-"""The paper's tables: every system trained, exported, and run by the same runtime, from one file: `python -m lads_exporter table TABLE.toml`.
+"""Makes the paper's tables: every system trained, exported, and run by the same runtime, from one file: `python -m lads_exporter table
+TABLE.toml`.
 
 | module | what |
 |---|---|

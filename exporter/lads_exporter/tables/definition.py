@@ -1,4 +1,4 @@
-"""A table's file: what is measured, how, in which tracks, and by which systems.
+"""Reads a table's file: what is measured, how, in which tracks, and by which systems.
 
 Everything in it is checked before anything runs: unknown keys, systems and configurations are named, all at once.
 """
@@ -40,7 +40,7 @@ class System:
 
     @property
     def trained(self):
-        """The id of the system whose run it is exported from."""
+        """Returns the id of the system whose training run this system is exported from."""
         return self.weights or self.id
 
 
@@ -64,19 +64,19 @@ class Table:
         return next(row for row in self.systems if row.id == id)
 
     def rows(self, track):
-        """The systems of a track."""
+        """Returns the systems of a track."""
         return [row for row in self.systems if not row.tracks or track.name in row.tracks]
 
     def seeds(self, system, track):
         return system.seeds.get(track.name, track.seeds)
 
     def configuration(self, track, system):
-        """The files of a system's configuration in a track: base, then the system's."""
+        """Lists the files of a system's configuration in a track: base, then the system's."""
         return [self.path(track.config), self.path(system.config)]
 
 
 def _row(kind, table, where):
-    """A dataclass from a TOML table; fields with a default may be left out."""
+    """Makes a dataclass from a TOML table; fields with a default may be left out."""
     fields = {field.name: field for field in dataclasses.fields(kind)}
     problems = [f"unknown key {key!r}" for key in table if key not in fields]
     for name, field in fields.items():

@@ -1,4 +1,4 @@
-"""One system and one seed in one track: train, export, evaluate, each by the command that a person would type.
+"""Runs a job, one system and one seed in one track: train, export, evaluate, each by the command that a person would type.
 
 A job's folder carries the hash of all that its weights depend on (configuration, dataset, language encoder, seed), so other inputs mean another
 folder, and nothing is overwritten. What is finished is kept; an interrupted training goes on. What can fail: a command ends with an
@@ -27,7 +27,7 @@ class Stopped(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where a table's jobs find and leave things."""
+    """Folders where a table's jobs find and leave things."""
 
     runs: Path
     data: Path
@@ -37,7 +37,7 @@ class Place:
 
 
 class Processes:
-    """The commands that run; `stop` ends them in good order."""
+    """Commands that run; `stop` ends them in good order."""
 
     def __init__(self):
         self.running, self.stopped, self.lock = set(), False, threading.Lock()
@@ -80,7 +80,7 @@ class Job:
 
     @property
     def trained(self):
-        """The system whose run this is."""
+        """Returns the system whose run this is."""
         return self.table.system(self.system.trained)
 
     @property
@@ -89,7 +89,7 @@ class Job:
 
     @cached_property
     def inputs(self):
-        """The hash of all that the trained weights depend on."""
+        """Hashes all that the trained weights depend on."""
         setting = config.load(*self.table.configuration(self.track, self.trained))
         tables = json.loads(json.dumps(setting.tables))
         own = tables[0].get("system", {})
@@ -112,7 +112,7 @@ class Job:
         return self.results.is_file() and self.bundle.is_file()
 
     def run(self, processes):
-        """Does what is not done yet."""
+        """Runs the steps of the job that are not done yet."""
         self.folder.mkdir(parents=True, exist_ok=True)
         log = self.folder / "log.txt"
         exporter = [sys.executable, "-m", "lads_exporter"]
@@ -129,7 +129,7 @@ class Job:
         self.numbers()
 
     def numbers(self):
-        """Results and training time of a finished job."""
+        """Returns results and training time of a finished job."""
         sha256 = hashlib.sha256(self.bundle.read_bytes()).hexdigest()
         found = checked_results(self.table, self.results, sha256)
         try:
@@ -150,7 +150,7 @@ def evaluate(table, bundle, results, place, processes, log, uniform=False):
 
 
 def checked_results(table, path, sha256=None):
-    """A results file that is of this table's protocol, and of the bundle; else what it is of instead."""
+    """Reads a results file; refuses one that is not of this table's protocol or not of the bundle, with what differs."""
     found = card.read_results(path)
     asked = table.evaluation
     pairs = [("seed", found.get("seed"), asked.seed), ("noise", found.get("noise"), asked.noise)]
@@ -165,7 +165,7 @@ def checked_results(table, path, sha256=None):
 
 
 def all_jobs(table, place):
-    """Track by track, seed by seed; those that export another's run come after it."""
+    """Lists all jobs track by track, seed by seed; those that export another's run come after it."""
     return [
         Job(table, track, system, seed, place)
         for track in table.tracks

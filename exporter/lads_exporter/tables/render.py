@@ -1,4 +1,5 @@
-"""models/tables.json and models/TABLES.md: the paper's number, ours with mean and deviation over seeds, and the uncertainty within them.
+"""Writes models/tables.json and models/TABLES.md: the paper's number, ours with mean and deviation over seeds, and the uncertainty within
+them.
 
 `tables.json` holds every table that was ever run, one key each; a run replaces its own only. TABLES.md is written from it alone.
 """
@@ -19,7 +20,7 @@ Z = 1.959963984540054  # of 95 %
 
 
 def wilson(count, total):
-    """The Wilson score interval of a share, 95 %."""
+    """Computes the Wilson score interval of a share, 95 %."""
     if total == 0:
         return [0.0, 1.0]
     share, z2 = count / total, Z * Z
@@ -29,7 +30,7 @@ def wilson(count, total):
 
 
 def summarise(splits):
-    """One split of several seeds' results: means over the seeds, intervals within them."""
+    """Sums up one split of several seeds' results: means over the seeds, intervals within them."""
     rates, full = [row["n_rate"] for row in splits], [row["full_success"] for row in splits]
     episodes, count = sum(row["episodes"] for row in splits), sum(row["full_success_count"] for row in splits)
     errors = [row["n_rate_standard_error"] for row in splits]
@@ -49,7 +50,8 @@ def summarise(splits):
 
 
 def expert(place):
-    """How often the scripted expert carried out all of an instruction while the data were collected; None where no expert made them."""
+    """Computes how often the scripted expert carried out all of an instruction while the data were collected; None where no expert made
+    them."""
     with safe_open(place.data, "numpy") as file:
         notes = file.metadata() or {}
     counts = [json.loads(notes.get(key, "0")) for key in ("attempts", "discarded")]
@@ -60,7 +62,7 @@ def expert(place):
 
 
 def entry(table, place, jobs, uniform):
-    """What tables.json says of one table. jobs: [(job, its numbers or None)]."""
+    """Makes the entry of one table in tables.json. jobs: [(job, its numbers or None)]."""
     tracks = []
     for track in table.tracks:
         rows = []
@@ -121,7 +123,7 @@ def _published(values, measure):
 
 
 def _ours(split, measure):
-    """Mean ± deviation over seeds (interval within)."""
+    """Formats the mean ± deviation over seeds (interval within)."""
     if measure == "success":
         deviation = "" if split["success_deviation"] is None else f" ± {100 * split['success_deviation']:.1f}"
         low, high = split["success_interval"]
@@ -153,7 +155,7 @@ def _row(table, row):
 
 
 def _others(table):
-    """The rows that no track trains."""
+    """Formats the rows that no track trains."""
     width = 2 * len(table["splits"])
     lines = []
     if table["uniform"]:
@@ -175,7 +177,7 @@ MEASURES = {
 
 
 def markdown(found):
-    """TABLES.md."""
+    """Renders TABLES.md."""
     lines = ["# The paper's tables", ""]
     lines += ["Every system trained here, exported as one bundle, and run by the same runtime in `lads-run`. Written by `make table ENV=kitchen|lorel`"]
     lines += ["(`python -m lads_exporter table`) from tables.json; do not edit. The paper's numbers stand beside ours, on other data than its own."]

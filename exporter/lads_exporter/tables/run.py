@@ -1,4 +1,4 @@
-"""All jobs of a table, some at a time on this machine, and the numbers of those that are finished.
+"""Runs all jobs of a table, some at a time on this machine, and writes the numbers of those that are finished.
 
 After every job the tables are written anew, so that a reader always sees what is known. An interrupt stops trainings at their next step, in
 their checkpoints.
@@ -24,7 +24,7 @@ def duration(seconds):
 
 
 class Progress:
-    """One line per event, with the time that is left by what the finished jobs took."""
+    """Prints one line per event, with the time that is left by what the finished jobs took."""
 
     def __init__(self, count, done):
         self.count, self.done, self.took = count, done, []
@@ -54,7 +54,7 @@ def _stoppable(processes):
 
 
 def floor(table, place, jobs, processes):
-    """Uniform random actions in the same episodes: needs a bundle for its limits, whichever is finished."""
+    """Evaluates uniform random actions in the same episodes: needs a bundle for its limits, whichever is finished."""
     path = place.runs / table.name / "uniform.results.json"
     if not path.is_file():
         job = next((job for job in jobs if job.finished), None)

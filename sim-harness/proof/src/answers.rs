@@ -1,4 +1,5 @@
-//! Is it the same policy? What it answered to the reference's questions, judged.
+//! Judges whether a policy is the reference's by its answers to the reference's questions. What it answered to the reference's questions,
+//! judged.
 //!
 //! Open loop: at each control step of a traced episode the policy got the observation that the reference saw, and its history held the
 //! actions that the reference executed. So a difference is the policy's own, however chaotic the physics. Judged are the steps that decide, the
@@ -14,23 +15,23 @@ use serde::Serialize;
 use crate::numbering::Numbering;
 use crate::reference::{Episode, Reference, Trace};
 
-/// Difference of a logit that is allowed: one percent of a probability at most. Logits of the shipped policies agree with PyTorch's to 1e-5, and to
+/// Allowed difference of a logit: one percent of a probability at most. Logits of the shipped policies agree with PyTorch's to 1e-5, and to
 /// 1e-2 with weights of 16 bits.
 pub const LOGIT_TOLERANCE: f64 = 1e-2;
 
-/// Margin of a decision that may fall out otherwise where the reference recorded no logits to judge instead.
+/// Margin up to which a decision may differ where the reference recorded no logits to judge instead.
 pub const CLOSE_CALL: f64 = 1e-3;
 
-/// Largest difference of an action element that is allowed, whatever tolerance a bundle states: what is judged does not set the bar.
+/// Largest allowed difference of an action element, whatever tolerance a bundle states: what is judged does not set the bar.
 pub const ACTION_TOLERANCE: f64 = 1e-4;
 
-/// So many times the reference's own float noise is allowed too: what noise of a size does is not the same each time.
+/// Factor on the reference's own float noise that is allowed too: noise of one size does not always have the same effect.
 pub const NOISE_FACTOR: f64 = 2.0;
 
-/// A segment whose nearest two codes are as near as this, in squared distance relative to the nearer, may be encoded as either.
+/// Relative gap of squared distances up to which a segment's two nearest codes are a close call, so that either may be its encoding.
 pub const ENCODER_CLOSE_CALL: f64 = 1e-3;
 
-/// Where a policy first answered otherwise.
+/// Place of a policy's first different answer.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Answer {
     /// Id of the instruction.
@@ -39,7 +40,7 @@ pub struct Answer {
     pub episode: usize,
     /// Control step, from 0.
     pub step: usize,
-    /// What was different.
+    /// Description of the difference.
     pub what: String,
 }
 
@@ -58,70 +59,71 @@ impl fmt::Display for Answer {
     }
 }
 
-/// What a policy answered at one control step.
+/// Answer of a policy at one control step.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Reply {
-    /// Whether it decided a plan.
+    /// Whether the policy decided a plan at this step.
     pub decided: bool,
-    /// The plan in force; `None` of a policy that selects none.
+    /// Plan in force; `None` if the policy selects none.
     pub plan: Option<u32>,
-    /// The logits of a step that decided.
+    /// Logits of a step that decided.
     pub logits: Vec<f32>,
-    /// By how much the best of them leads the second one; `None` where there are not two.
+    /// Lead of the best logit over the second; `None` where there are not two.
     pub margin: Option<f32>,
-    /// Its action.
+    /// Action of the step.
     pub action: Vec<f32>,
 }
 
-/// The replay of one traced episode.
+/// Answers of a policy to one traced episode.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Replay {
     /// Index of the instruction.
     pub instruction: usize,
     /// Number of the episode.
     pub episode: usize,
-    /// The replies in order; fewer than the trace's steps where the policy refused.
+    /// Replies in order; fewer than the trace's steps where the policy refused.
     pub replies: Vec<Reply>,
-    /// Why it refused the next step, if it did.
+    /// Why the policy refused the next step, if it did.
     pub refused: Option<String>,
-    /// The plan that its trajectory encoder sees in each segment of the reference's, fewer where it refused one; `None` if it has no encoder.
+    /// Plan that the trajectory encoder sees in each segment of the reference's trace, fewer where it refused one; `None` without an
+    /// encoder.
     pub encoded: Option<Vec<u32>>,
 }
 
-/// What came of asking.
+/// Summary of the policy's answers beside the reference's.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Answers {
-    /// Episodes replayed.
+    /// Number of episodes replayed.
     pub episodes: usize,
-    /// Control steps of the longest.
+    /// Number of control steps of the longest episode.
     pub longest_episode: usize,
-    /// Control steps in them.
+    /// Number of control steps in all episodes.
     pub steps: usize,
-    /// Steps with the same plan in force, whose actions were compared.
+    /// Number of steps with the same plan in force, whose actions were compared.
     pub compared_steps: usize,
-    /// Largest absolute difference of an action element in these.
+    /// Largest absolute difference of an action element in the compared steps.
     pub largest_action_difference: f64,
-    /// What it may be.
+    /// Allowed difference of an action element.
     pub action_tolerance: f64,
-    /// Decisions of the reference in them; none where it selects nothing, or says nothing about what it selects.
+    /// Number of the reference's decisions in the compared episodes; none where it selects nothing, or says nothing about what it selects.
     pub decisions: usize,
-    /// Decisions whose logits were compared.
+    /// Number of decisions whose logits were compared.
     pub compared_decisions: usize,
-    /// Largest difference of a logit in these, up to a constant added to all of a decision's.
+    /// Largest difference of a logit in the compared decisions, up to a constant added to all of a decision's.
     pub largest_logit_difference: f64,
-    /// What it may be.
+    /// Allowed difference of a logit.
     pub logit_tolerance: f64,
-    /// Decisions that fell out otherwise within rounding.
+    /// Number of decisions that differ within rounding.
     pub close_calls: usize,
-    /// Segments whose encoding by the trajectory encoder was compared.
+    /// Number of segments whose encoding by the trajectory encoder was compared.
     pub compared_segments: usize,
-    /// How many of these were encoded as another plan.
+    /// Number of compared segments that were encoded as another plan.
     pub differing_segments: usize,
     /// Whether the plans are the reference's in another order.
     pub renumbered: bool,
-    /// Episodes with any difference beyond these bounds.
+    /// Number of episodes with any difference beyond the tolerances.
     pub differing_episodes: usize,
-    /// The first difference.
+    /// First difference beyond the tolerances.
     pub first_difference: Option<Answer>,
 }
 
@@ -169,7 +171,7 @@ impl Answers {
         (answers, numbering)
     }
 
-    /// The margin of a decision in the reference up to which it may fall out otherwise: two logits may be off.
+    /// Largest reference margin at which a decision may differ: two logits may be off.
     fn close_call(&self, decision: &Decision<'_>) -> f64 {
         if decision.reference_logits.is_empty() {
             CLOSE_CALL
@@ -179,28 +181,28 @@ impl Answers {
     }
 }
 
-/// One decision in both.
+/// One decision of both policies.
 #[derive(Debug, Clone, Copy)]
 pub struct Decision<'d> {
-    /// What the policy decided.
+    /// Plan that the policy decided.
     pub plan: u32,
-    /// What the reference did.
+    /// Plan that the reference decided.
     pub reference: u32,
-    /// By which margin.
+    /// Margin of the reference's decision.
     pub margin: f64,
-    /// The policy's logits.
+    /// Logits of the policy.
     pub logits: &'d [f32],
-    /// The reference's; empty where it recorded none.
+    /// Logits of the reference; empty where it recorded none.
     pub reference_logits: &'d [f32],
 }
 
-/// A replay beside its trace.
+/// A replay with its trace.
 struct Traced<'t> {
     instruction: &'t str,
     episode: &'t Episode,
     trace: &'t Trace,
     replay: &'t Replay,
-    /// The control steps at which the reference decided.
+    /// Control steps at which the reference decided.
     decided_at: Vec<usize>,
 }
 
@@ -227,7 +229,7 @@ impl<'t> Traced<'t> {
         })
     }
 
-    /// The decisions of the same steps.
+    /// Pairs the decisions of the same steps.
     fn decisions(&self) -> impl Iterator<Item = Decision<'t>> {
         self.decided_at
             .iter()
@@ -242,7 +244,7 @@ impl<'t> Traced<'t> {
             })
     }
 
-    /// The first difference; everything is measured all the same.
+    /// Returns the first difference; measures everything all the same.
     fn judge(&self, numbering: &Numbering, answers: &mut Answers) -> Option<(usize, String)> {
         let mut first = None;
         let mut found = |step: usize, what: Option<String>| {
@@ -396,7 +398,7 @@ impl Answers {
     }
 }
 
-/// The largest of differences once the constant is taken off that makes it smallest; infinite where one is no number.
+/// Largest of differences, once the constant is subtracted that makes it smallest; infinite if one is NaN.
 pub fn largest_up_to_a_constant(differences: impl Iterator<Item = f64>) -> f64 {
     let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
     for difference in differences {

@@ -1,15 +1,15 @@
-//! The certificate: what was compared, what came out, and the verdict with its reasons. Its JSON form is documented in
+//! The certificate of a verification: what was compared, the results, and the verdict with its reasons. Its JSON form is documented in
 //! certificate.schema.json.
 //!
 //! The rules, in this order:
 //!
 //! 1. **DIFFERENT** if the contract says otherwise than the reference's did, or the image otherwise than the bundle; if the policy answers the
-//!    reference's questions otherwise (a logit or an action beyond its tolerance, another plan although the reference's margin is no close call,
+//!    reference's questions otherwise (a logit or an action beyond its tolerance, another plan although the reference's margin is not a close call,
 //!    decisions at other steps, another encoding of a trajectory); if the reference's actions lead through other states; or if a test finds a paired
 //!    difference larger than its margin (1 % over all of them together).
 //! 2. **EQUIVALENT** if none of this holds, contract, actions, states and, where the reference decides, logits were compared at all, and every paired difference is
 //!    equivalent: two one-sided tests at 5 %, within 0.05 for rates and 0.1 for the N-rate.
-//! 3. **INCONCLUSIVE** otherwise; then it says how many more episodes of each instruction would decide, if it stays as it is.
+//! 3. **INCONCLUSIVE** otherwise; then it says how many more episodes of each instruction would decide, at these rates.
 //!
 //! A difference that is significant (McNemar's test, 5 % over all rates together) and yet negligible is noted as such: with enough episodes
 //! every difference is significant, and the margin says which ones matter. What was not looked at is listed.
@@ -31,27 +31,27 @@ pub const FORMAT: &str = "lads-certificate";
 /// Version of the JSON form; changes when a field changes its meaning or goes.
 pub const FORMAT_VERSION: u32 = 2;
 
-/// Chance of McNemar's tests together to call something different that is not.
+/// Chance of a false alarm of McNemar's tests, all together.
 const SIGNIFICANCE: f64 = 0.05;
-/// Chance of all tests of a difference beyond its margin together to find one that is not.
+/// Chance of a false alarm of all tests of a difference beyond its margin, together.
 pub(crate) const DIFFERENCE: f64 = 0.01;
-/// So many of a list of differing fields are named.
+/// Number of differing fields that are named before the rest is only counted.
 const NAMED: usize = 5;
 
-/// What a verification says in a word.
+/// Verdict of a verification.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "UPPERCASE")]
 pub enum Verdict {
-    /// The policy is the reference's, as far as it was looked.
+    /// The policy is the reference's, as far as it was compared.
     Equivalent,
-    /// It is another.
+    /// The policy is not the reference's.
     Different,
     /// The episodes were too few to tell.
     Inconclusive,
 }
 
 impl Verdict {
-    /// Exit code of the program that found it.
+    /// Exit code of the program that reached this verdict.
     pub fn exit_code(self) -> u8 {
         match self {
             Self::Equivalent => 0,
@@ -60,7 +60,7 @@ impl Verdict {
         }
     }
 
-    /// In capitals.
+    /// The verdict as a word in capitals.
     pub fn word(self) -> &'static str {
         match self {
             Self::Equivalent => "EQUIVALENT",
@@ -70,59 +70,59 @@ impl Verdict {
     }
 }
 
-/// Where the reference came from.
+/// Origin of the reference.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ReferenceUsed {
-    /// SHA-256 of the bundle whose weights it ran; empty where it is not known to be any bundle's.
+    /// SHA-256 of the bundle whose weights the reference ran; empty where it is not known to be any bundle's.
     pub bundle_sha256: String,
-    /// Whether that is the verified bundle.
+    /// Whether the reference's bundle is the verified bundle.
     pub same_bundle: bool,
-    /// Where its weights came from.
+    /// Where the reference's weights came from.
     pub weights_from: String,
-    /// Where its word embeddings came from.
+    /// Where the reference's word embeddings came from.
     pub words_from: String,
-    /// Where the weights came from that made its logits, if those were added later.
+    /// Where the weights that made the recorded logits came from, if those were added later.
     pub logits_from: Option<String>,
     /// Versions of everything that took part.
     pub versions: BTreeMap<String, String>,
 }
 
 impl ReferenceUsed {
-    /// Whether the weights were read back from the bundle that is to be proved, instead of from where they were trained.
+    /// Whether the reference's weights were read back from the bundle that is to be verified, instead of from where they were trained.
     fn circular(&self) -> bool {
         let from = |source: &str| source.contains("bundle");
         from(&self.weights_from) || self.logits_from.as_deref().is_some_and(from)
     }
 }
 
-/// What was run.
+/// Setting of the run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Setting {
     /// Id of the environment.
     pub environment: String,
     /// SHA-256 of the verified bundle.
     pub bundle_sha256: String,
-    /// SHA-256 of the program image that ran: what may be put into the machine.
+    /// SHA-256 of the program image that ran, which may be put into the machine.
     pub image_sha256: String,
-    /// How its weights and caches are stored.
+    /// Formats of the image's weights and caches.
     pub image_stored: String,
-    /// The rule that decided plans, the contract's.
+    /// Rule that decided plans, as in the contract.
     pub decision: String,
-    /// The instruction set that the kernels ran on.
+    /// Instruction set that the kernels ran on.
     pub isa: String,
-    /// Seed of the whole run, the reference's.
+    /// Seed of the whole run, the same as the reference's.
     pub seed: u64,
-    /// Noise level, the reference's.
+    /// Noise level, the same as the reference's.
     pub noise: String,
     /// Episodes of each instruction.
     pub episodes_per_instruction: u32,
-    /// Instructions.
+    /// Number of instructions.
     pub instructions: usize,
-    /// Versions of what ran.
+    /// Versions of the software that ran.
     pub versions: BTreeMap<String, String>,
 }
 
-/// A whole verification.
+/// Certificate of a verification.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Certificate {
     /// [`FORMAT`].
@@ -131,30 +131,31 @@ pub struct Certificate {
     pub format_version: u32,
     /// The verdict.
     pub verdict: Verdict,
-    /// Why, one sentence each.
+    /// Reasons of the verdict, one sentence each.
     pub reasons: Vec<String>,
-    /// Episodes of each instruction that would decide, beyond those that were run; only where inconclusive, and only if any number would.
+    /// Further episodes of each instruction that would decide, beyond those that were run; only where inconclusive, and only if any number
+    /// would.
     pub more_episodes_per_instruction: Option<u32>,
-    /// What was run.
+    /// Setting of the run.
     pub setting: Setting,
-    /// What it was compared with.
+    /// Origin of the reference.
     pub reference: ReferenceUsed,
-    /// What is to be known beside the verdict, one sentence each.
+    /// Notes beside the verdict, one sentence each.
     pub notes: Vec<String>,
-    /// What nothing of this says anything about.
+    /// What the certificate says nothing about, one sentence each.
     pub not_covered: Vec<String>,
-    /// The contract, field by field.
+    /// Comparison of the contracts, field by field.
     pub contract: Compared,
-    /// Open loop, the policy alone.
+    /// Open-loop comparison of the policy alone.
     pub policy: Answers,
-    /// Open loop, the environment alone.
+    /// Open-loop comparison of the environment alone.
     pub environment: Physics,
-    /// Closed loop, both together.
+    /// Closed-loop comparison of policy and environment together.
     pub rollouts: Paired,
 }
 
 impl Certificate {
-    /// Judges what was found; `not_covered` is what the program that ran it knows that it did not look at.
+    /// Judges the comparisons; `not_covered` lists what the caller knows that it did not look at.
     pub fn new(
         setting: Setting,
         reference: ReferenceUsed,
@@ -259,7 +260,7 @@ fn differences(
     reasons
 }
 
-/// The first of the fields that differ, and how many more there are.
+/// Lists the first fields that differ, and how many more there are.
 fn list(differing: &[FieldDifference]) -> String {
     let named = differing.iter().take(NAMED);
     let named = named.map(|it| format!("{} ({}, the other {})", it.field, it.run, it.reference));
@@ -270,7 +271,7 @@ fn list(differing: &[FieldDifference]) -> String {
     }
 }
 
-/// What is to be known beside the verdict.
+/// Lists the notes beside the verdict.
 fn notes(
     reference: &ReferenceUsed,
     contract: &Compared,
@@ -312,7 +313,7 @@ fn notes(
     notes
 }
 
-/// What nothing was found about: silence is no agreement.
+/// Lists the comparisons that had nothing to compare: silence is not agreement.
 fn uncompared(contract: &Compared, policy: &Answers, environment: &Physics) -> Vec<String> {
     let counts = [
         ("action", policy.compared_steps, true),
@@ -332,7 +333,7 @@ fn uncompared(contract: &Compared, policy: &Answers, environment: &Physics) -> V
     none.chain(unrecorded).collect()
 }
 
-/// What no verification looks at, and what this one could not.
+/// Lists what no verification looks at, and what this one could not.
 fn unseen(reference: &ReferenceUsed, policy: &Answers) -> Vec<String> {
     let mut unseen = vec![
         "observations other than those of the reference's episodes".to_owned(),
@@ -393,7 +394,8 @@ fn agreement(policy: &Answers, environment: &Physics, rollouts: &Paired) -> Stri
     )
 }
 
-/// How many more episodes of each instruction narrow every interval into its margin; `None` where some estimate leaves no room.
+/// Computes how many more episodes of each instruction would narrow every interval into its margin; `None` where some estimate leaves no
+/// room.
 fn more_episodes(rollouts: &Paired, episodes: u32) -> Option<u32> {
     let differences = rollouts.rates.iter().map(|rate| &rate.paired);
     let growth = differences

@@ -1,25 +1,25 @@
-//! Does the contract say what the reference's said? Field by field, whatever fields a contract has.
+//! Compares two contracts field by field, whatever fields they have. Field by field, whatever fields a contract has.
 //!
 //! A policy is more than its networks: the rule that decides, limits, context and units run too. Nothing here can fail.
 
 use serde::Serialize;
 use serde_json::Value;
 
-/// Fields that say where a policy comes from, not what it does.
+/// Contract fields that say where a policy comes from, not what it does.
 const HISTORY: [&str; 2] = ["version", "provenance"];
 
-/// A field that differs.
+/// A contract field that differs.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FieldDifference {
-    /// Where it stands, such as `action[gripper].max`.
+    /// Place of the field, such as `action[gripper].max`.
     pub field: String,
-    /// What the contract of the run says, as JSON; `null` for nothing.
+    /// Value in the run's contract, as JSON; `null` if absent.
     pub run: String,
-    /// What it is compared with says.
+    /// Value that the run's value is compared with, as JSON; `null` if absent.
     pub reference: String,
 }
 
-/// What came of comparing contracts.
+/// Result of comparing contracts.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Compared {
     /// Names of the contract's fields that were compared; empty where the reference records no contract.
@@ -30,7 +30,7 @@ pub struct Compared {
     pub image_differing: Vec<FieldDifference>,
     /// Fields that differ and say only where the policy comes from.
     pub history: Vec<FieldDifference>,
-    /// What to do where no field was compared.
+    /// Remedy where no field was compared.
     #[serde(skip)]
     pub remedy: &'static str,
 }
@@ -80,7 +80,7 @@ impl Compared {
     }
 }
 
-/// The name of the contract's field that a place is in.
+/// Name of the contract's top-level field that contains a place.
 fn top(place: &str) -> &str {
     place.split(['.', '[']).next().unwrap_or_default()
 }
@@ -93,7 +93,7 @@ fn inside(place: &str, name: &str) -> String {
     }
 }
 
-/// An element of a list by its name or id, if it has one.
+/// Names an element of a list by its name or id, if it has one.
 fn element(place: &str, index: usize, value: &Value) -> String {
     let name = ["name", "id"]
         .iter()
@@ -142,7 +142,7 @@ fn differences(place: String, run: &Value, reference: &Value, found: &mut Vec<Fi
     }
 }
 
-/// The same for what `image` says alone.
+/// Compares the fields that `image` has with those of the bundle's contract; fields that the image lacks are not compared.
 fn restricted(place: String, image: &Value, bundle: &Value, found: &mut Vec<FieldDifference>) {
     match (image, bundle) {
         (Value::Object(ours), theirs) => {

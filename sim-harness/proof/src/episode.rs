@@ -1,15 +1,15 @@
-//! What happened in one episode, in numbers. Nothing here can fail.
+//! Outcome of one episode, in numbers. Nothing here can fail.
 
 /// A sub-task that was completed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Completion {
-    /// Index in the environment's list.
+    /// Index of the sub-task in the environment's list.
     pub sub_task: usize,
-    /// The first control step after which it was done, counted from 1.
+    /// First control step after which the sub-task was done, counted from 1.
     pub step: usize,
 }
 
-/// What happened in one episode.
+/// Outcome of one episode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Episode {
     /// Control steps executed.
@@ -18,7 +18,7 @@ pub struct Episode {
     pub success: bool,
     /// Completed sub-tasks, in order of time.
     pub completions: Vec<Completion>,
-    /// The indices that were selected, such as those of plans, in order; none of a policy that selects none.
+    /// Selected indices, such as those of plans, in order; empty if the policy selects none.
     pub plans: Vec<u32>,
     /// Noise-free state after the last step.
     pub final_state: Vec<f64>,

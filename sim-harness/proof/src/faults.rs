@@ -1,14 +1,14 @@
-//! What was set wrong between policy and environment in a run: late, lost and noisier observations, sluggish actuators.
+//! Faults between policy and environment in a run: late, lost and noisier observations, sluggish actuators.
 //!
 //! What can fail: settings that mean nothing.
 
 use serde::Serialize;
 use thiserror::Error;
 
-/// The most control steps that an observation can be late: ten seconds or more on any robot that has such a policy.
+/// Largest delay of an observation in control steps: ten seconds or more on any robot that has such a policy.
 pub const LONGEST_DELAY: usize = 1_000;
 
-/// What is wrong between policy and environment.
+/// Faults between policy and environment; the default has none.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Faults {
     /// Control steps by which observations come late; the first one is seen until then.
@@ -32,26 +32,26 @@ impl Default for Faults {
     }
 }
 
-/// A setting that means nothing.
+/// Why a fault setting is meaningless.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 #[non_exhaustive]
 pub enum FaultError {
-    /// Longer than any episode.
+    /// The delay is longer than any episode.
     #[error("--delay-steps {0}: give at most {LONGEST_DELAY} control steps")]
     Delay(usize),
-    /// No share.
+    /// The drop rate is not a share from 0 to 1.
     #[error("--drop-rate {0}: give a share from 0 to 1")]
     Drop(f64),
-    /// No factor.
+    /// The noise scale is not a finite factor from 0.
     #[error("--noise-scale {0}: give a finite factor that is not negative")]
     Noise(f64),
-    /// No time.
+    /// The action lag is not a finite time from 0.
     #[error("--action-lag {0}: give a finite number of control steps that is not negative")]
     Lag(f64),
 }
 
 impl Faults {
-    /// Refuses settings that mean nothing.
+    /// Refuses meaningless settings.
     pub fn check(&self) -> Result<(), FaultError> {
         let not_negative = |x: f64| x.is_finite() && x >= 0.0;
         if self.delay_steps > LONGEST_DELAY {

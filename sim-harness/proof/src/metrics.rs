@@ -29,14 +29,15 @@ impl Display for Interval {
     }
 }
 
-/// The Wilson score interval at 95 % of `successes` out of `trials` (Wilson 1927; method 3 of Newcombe 1998), no continuity correction.
+/// Computes the Wilson score interval at 95 % of `successes` out of `trials` (Wilson 1927; method 3 of Newcombe 1998), no continuity
+/// correction.
 ///
 /// Over no trials it is `[0, 1]`.
 pub fn wilson(successes: usize, trials: usize) -> Interval {
     wilson_at(successes, trials, Z_95)
 }
 
-/// The Wilson score interval whose limits are `z` standard errors away.
+/// Computes the Wilson score interval whose limits are `z` standard errors away.
 pub fn wilson_at(successes: usize, trials: usize, z: f64) -> Interval {
     if trials == 0 {
         return Interval(0.0, 1.0);
@@ -64,9 +65,9 @@ pub fn wilson_at(successes: usize, trials: usize, z: f64) -> Interval {
 /// A share of episodes with its interval.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Rate {
-    /// Episodes in which it happened.
+    /// Number of episodes in which the event happened.
     pub count: usize,
-    /// Episodes in which it could.
+    /// Number of episodes in which the event could happen.
     pub episodes: usize,
     /// `count` over `episodes`; `None` without episodes.
     pub rate: Option<f64>,
@@ -75,7 +76,7 @@ pub struct Rate {
 }
 
 impl Rate {
-    /// `count` out of `episodes`.
+    /// Makes the rate `count` out of `episodes`.
     pub fn new(count: usize, episodes: usize) -> Self {
         Self {
             count,
@@ -86,7 +87,7 @@ impl Rate {
     }
 }
 
-/// What a set of episodes achieved.
+/// Scores of a set of episodes.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Score {
     /// Number of episodes.
@@ -103,25 +104,25 @@ pub struct Score {
     pub full_success: Option<f64>,
     /// Wilson 95 % interval of `full_success`.
     pub full_success_interval: Interval,
-    /// Episodes that carried out the instruction.
+    /// Number of episodes that carried out the instruction.
     pub full_success_count: usize,
     /// Sub-tasks completed though the instruction did not command them, summed over the episodes.
     pub un_instructed: usize,
 }
 
-/// What one episode achieved, as far as the rates are concerned.
+/// Outcome of one episode, as the rates need it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Outcome {
-    /// How many of the commanded sub-tasks were completed within the episode.
+    /// Number of commanded sub-tasks completed within the episode.
     pub completed: usize,
-    /// How many others were.
+    /// Number of other sub-tasks completed within the episode.
     pub un_instructed: usize,
     /// Whether the instruction was carried out: that all were completed, unless the environment asks for more.
     pub success: bool,
 }
 
 impl Score {
-    /// The score of a set of episodes.
+    /// Scores a set of episodes.
     pub fn of(outcomes: impl IntoIterator<Item = Outcome>) -> Self {
         let (mut episodes, mut full, mut un_instructed) = (0, 0, 0);
         let (mut sum, mut sum_of_squares) = (0_usize, 0_usize);
@@ -151,7 +152,7 @@ impl Score {
 }
 
 impl Score {
-    /// Of episodes that nothing was asked of: no rates.
+    /// Scores episodes without commanded sub-tasks: counts, but no rates.
     pub fn unasked(episodes: usize, completions: usize) -> Self {
         Self {
             episodes,
@@ -165,7 +166,7 @@ fn share(count: usize, episodes: usize) -> Option<f64> {
     (episodes > 0).then(|| count as f64 / episodes as f64)
 }
 
-/// Standard error of a mean of whole numbers: `sqrt(Σ(x - mean)² / (n - 1) / n)`.
+/// Computes the standard error of a mean of whole numbers: `sqrt(Σ(x - mean)² / (n - 1) / n)`.
 fn standard_error(sum: usize, sum_of_squares: usize, episodes: usize) -> Option<f64> {
     if episodes < 2 {
         return None;

@@ -1,4 +1,4 @@
-//! Are the plans numbered as the reference's are? The order of plans means nothing, if everything that uses it keeps to it.
+//! Detects plans that are the reference's under other numbers. The order of plans means nothing, if everything that uses it keeps to it.
 //!
 //! Invariant: a numbering is one to one. Nothing here can fail.
 
@@ -6,13 +6,13 @@ use std::collections::BTreeMap;
 
 use crate::answers::Decision;
 
-/// Which of the run's plans each of the reference's is; empty where the numbers are the same.
+/// Maps each plan of the reference to the run's number of it; empty where the numbers are the same.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Numbering(Vec<u32>);
 
 impl Numbering {
-    /// The numbering that explains all decisions, if the reference's own does not and another does: by the logits, which must be the reference's
-    /// in another order within `tolerance`; without recorded logits by the plans, where margins are larger than `close_call`.
+    /// Finds the numbering that explains all decisions, if the reference's own does not and another does: by the logits, which must be the
+    /// reference's in another order within `tolerance`; without recorded logits by the plans, where margins are larger than `close_call`.
     pub fn of<'d>(
         decisions: impl Iterator<Item = Decision<'d>>,
         tolerance: f64,
@@ -36,18 +36,18 @@ impl Numbering {
         Self(found.unwrap_or_default())
     }
 
-    /// Whether the numbers are others than the reference's.
+    /// Whether the run's numbers differ from the reference's.
     pub fn is_another(&self) -> bool {
         !self.0.is_empty()
     }
 
-    /// The run's number of a plan of the reference.
+    /// Returns the run's number of a plan of the reference.
     pub fn of_run(&self, reference: u32) -> u32 {
         self.0.get(reference as usize).copied().unwrap_or(reference)
     }
 }
 
-/// Logits with their mean taken off, which no order changes.
+/// Subtracts the mean from logits, which does not depend on their order.
 fn centred(logits: &[f32]) -> Vec<f64> {
     let mean = logits.iter().map(|&x| f64::from(x)).sum::<f64>() / logits.len().max(1) as f64;
     logits.iter().map(|&x| f64::from(x) - mean).collect()

@@ -1,11 +1,11 @@
-//! The certificate as one HTML page, with nothing that has to be fetched. What can fail: nothing.
+//! Renders the certificate as one HTML page, with nothing that has to be fetched. What can fail: nothing.
 
 use askama::Template;
 
 use super::certificate::Certificate;
 use super::statistics::Difference;
 
-/// The page of a certificate.
+/// HTML page of a certificate.
 #[derive(Template)]
 #[template(path = "certificate.html")]
 pub struct Page<'c> {
@@ -13,13 +13,13 @@ pub struct Page<'c> {
 }
 
 impl<'c> Page<'c> {
-    /// Of this certificate.
+    /// Makes the page of a certificate.
     pub fn new(certificate: &'c Certificate) -> Self {
         Self { certificate }
     }
 }
 
-/// A share as a percentage.
+/// Formats a share as a percentage.
 #[expect(
     clippy::trivially_copy_pass_by_ref,
     reason = "templates pass references"
@@ -28,7 +28,7 @@ fn percent(share: &f64) -> String {
     format!("{:.1} %", 100.0 * share)
 }
 
-/// An estimate with its interval.
+/// Formats an estimate with its interval.
 fn difference(difference: &Difference) -> String {
     let Difference {
         estimate, interval, ..
@@ -36,7 +36,7 @@ fn difference(difference: &Difference) -> String {
     format!("{estimate:+.3} ({:+.3} to {:+.3})", interval.0, interval.1)
 }
 
-/// A small number.
+/// Formats a small number.
 #[expect(
     clippy::trivially_copy_pass_by_ref,
     reason = "templates pass references"

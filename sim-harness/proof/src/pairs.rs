@@ -1,4 +1,5 @@
-//! Does it achieve the same? The same episodes, each driven by the policy itself, beside the reference's.
+//! Compares the policy's episodes, driven by itself, with the reference's, in pairs. The same episodes, each driven by the policy itself,
+//! beside the reference's.
 //!
 //! Closed loop with the reference's seeds: paired, because episode `n` of an instruction starts alike and sees the same noise in both.
 //! Nothing here can fail.
@@ -20,58 +21,58 @@ pub const TRAJECTORY_TOLERANCE: f64 = 1e-6;
 /// Difference of a state element (rad or m) up to which two episodes ended alike.
 pub const FINAL_TOLERANCE: f64 = 1e-3;
 
-/// One rate in both.
+/// A rate in run and reference.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RatePair {
-    /// Sub-task, or `full success`.
+    /// Name of the sub-task, or `full success`.
     pub name: String,
     /// Pairs of episodes by outcome.
     pub pairs: Pairs,
     /// Two-sided p-value of McNemar's exact test.
     pub mcnemar_p: f64,
-    /// Difference, the pairing used; this one is judged.
+    /// Difference of the rates as pairs; this one is judged.
     pub paired: Difference,
-    /// Difference as of two samples.
+    /// Difference of the rates as of two independent samples.
     pub unpaired: Difference,
 }
 
-/// The N-rate in both.
+/// N-rate of run and reference.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct NRatePair {
-    /// The run's.
+    /// N-rate of the run.
     pub run: f64,
-    /// The reference's.
+    /// N-rate of the reference.
     pub reference: f64,
-    /// Difference, the pairing used; this one is judged.
+    /// Difference of the N-rates as pairs; this one is judged.
     pub paired: Difference,
-    /// Difference as of two samples.
+    /// Difference of the N-rates as of two independent samples.
     pub unpaired: Difference,
 }
 
-/// All episodes, beside the reference's.
+/// Comparison of all episodes with the reference's.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Paired {
-    /// Pairs of episodes.
+    /// Number of pairs of episodes.
     pub episodes: usize,
-    /// Share of them in which the same sub-tasks were completed, in the same order.
+    /// Share of pairs in which the same sub-tasks were completed, in the same order.
     pub identical_completions: f64,
-    /// Share in which they were also completed at the same control steps.
+    /// Share of pairs in which they were also completed at the same control steps.
     pub identical_steps: f64,
-    /// Share with the same plans from beginning to end.
+    /// Share of pairs with the same plans from beginning to end.
     pub identical_plans: f64,
-    /// Share whose noise-free states at the end differ by less than [`FINAL_TOLERANCE`].
+    /// Share of pairs whose noise-free states at the end differ by less than [`FINAL_TOLERANCE`].
     pub same_final_state: f64,
-    /// First control steps at which plans differ, median over the episodes in which they do; `None` where they never do.
+    /// First control step at which plans differ, median over the episodes in which they do; `None` where they never do.
     pub median_first_plan_difference: Option<usize>,
-    /// The earliest of them.
+    /// Earliest control step at which plans differ; `None` where they never do.
     pub earliest_plan_difference: Option<usize>,
     /// Largest absolute action difference in traced episodes while trajectories agree.
     pub largest_action_difference: f64,
-    /// Control steps over which trajectories of traced episodes agreed, and all of them.
+    /// Number of control steps over which trajectories of traced episodes agreed, and of all their steps.
     pub agreeing_steps: [usize; 2],
-    /// Number of completed sub-tasks.
+    /// N-rate, the mean number of completed sub-tasks.
     pub n_rate: NRatePair,
-    /// Each sub-task that is commanded, then full success.
+    /// Rates of each sub-task that is commanded, then of full success.
     pub rates: Vec<RatePair>,
 }
 
@@ -116,29 +117,29 @@ impl Paired {
     }
 }
 
-/// The run's episodes of one instruction.
+/// Episodes of one instruction in the run.
 #[derive(Debug, Clone, Copy)]
 pub struct Episodes<'r> {
     /// Index of the instruction.
     pub instruction: usize,
-    /// The environment's indices of the sub-tasks that it commands.
+    /// The environment's indices of the sub-tasks that the instruction commands.
     pub commanded: &'r [usize],
-    /// In order of their numbers.
+    /// Episodes in order of their numbers.
     pub episodes: &'r [Episode],
 }
 
-/// One of the run's episodes, step by step.
+/// A traced episode of the run.
 #[derive(Debug, Clone)]
 pub struct Traced<'r> {
     /// Index of the instruction.
     pub instruction: usize,
     /// Number of the episode.
     pub episode: usize,
-    /// What was seen and done at each control step.
+    /// Observation and action of each control step.
     pub steps: Vec<[&'r [f32]; 2]>,
 }
 
-/// The reference's plans in the run's numbers, and the control steps at which they were decided.
+/// Plans of the reference in the run's numbers, and the control steps at which they were decided.
 struct Decided {
     plans: Vec<u32>,
     at: Vec<usize>,
@@ -209,7 +210,7 @@ impl Sum {
         }
     }
 
-    /// Compares actions as long as both trajectories are the same.
+    /// Compares actions for as long as both trajectories are the same.
     fn follow(
         &mut self,
         ours: &[[&[f32]; 2]],
@@ -274,7 +275,7 @@ impl Sum {
 }
 
 impl RatePair {
-    /// Rates of run and reference with nothing else.
+    /// Rates of run and reference.
     pub fn shares(&self) -> [f64; 2] {
         self.pairs.shares()
     }

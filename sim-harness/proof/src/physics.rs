@@ -1,4 +1,5 @@
-//! Is it the same environment? The reference's actions must lead through the reference's states.
+//! Checks that the environment is the reference's: its actions must lead through its states. The reference's actions must lead through the
+//! reference's states.
 //!
 //! One machine and one version of MuJoCo give the same bits; another CPU's libm moves them by less than the tolerance. Nothing here can fail.
 
@@ -6,29 +7,29 @@ use serde::Serialize;
 
 use crate::answers::Answer;
 
-/// Largest difference of a state element (rad or m) that counts as the same: thousand times the 2e-9 that another libm makes of
-/// the first two seconds, far below what a policy could notice.
+/// Largest difference of a state element (rad or m) that counts as the same: a thousand times the 2e-9 that another libm makes of the first
+/// two seconds, far below what a policy could notice.
 pub const STATE_TOLERANCE: f64 = 1e-6;
 
-/// What came of the recorded actions.
+/// Comparison of the states that the recorded actions lead to.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Physics {
-    /// Episodes replayed.
+    /// Number of episodes replayed.
     pub episodes: usize,
-    /// States compared.
+    /// Number of states compared.
     pub states: usize,
-    /// Whether all had the same bits.
+    /// Whether all states had the same bits.
     pub identical_bits: bool,
-    /// Largest difference of an element.
+    /// Largest difference of a state's element.
     pub largest_state_difference: f64,
-    /// What it may be.
+    /// Allowed difference of a state's element.
     pub state_tolerance: f64,
-    /// The first state beyond it.
+    /// First state beyond the tolerance.
     pub first_difference: Option<Answer>,
 }
 
 impl Physics {
-    /// Nothing seen yet.
+    /// Starts a comparison without states.
     pub fn new() -> Self {
         Self {
             identical_bits: true,
@@ -37,7 +38,7 @@ impl Physics {
         }
     }
 
-    /// Compares one state; `place` says where it is from.
+    /// Compares one state; `place` names its origin.
     pub fn compare(&mut self, state: &[f64], expected: &[f64], place: impl Fn() -> Answer) {
         self.states += 1;
         for (index, (&ours, &theirs)) in state.iter().zip(expected).enumerate() {

@@ -1,4 +1,4 @@
-//! What a policy is for, as one hash: equal for two bundles that can be compared, whatever networks are inside.
+//! Hashes a policy's purpose: equal for two bundles that can be compared, whatever networks are inside.
 //!
 //! The same function as `purpose_sha256` of the exporter's `reference` module. Canonical form: `{key value ...}` with keys in order of
 //! their code points, `[value ...]`, texts as `"bytes:UTF-8`, numbers as the 16 hexadecimal digits of their IEEE 754 double, `true`,
@@ -9,7 +9,7 @@ use std::fmt::Write as _;
 use serde_json::Value;
 use sha2::{Digest as _, Sha256};
 
-/// The parts of a contract, version 2, that say what a policy is for; the others say how it is built.
+/// Parts of a contract, version 2, that say what a policy is for; the others say how it is built.
 const PURPOSE: [&str; 6] = [
     "environment",
     "control_period_s",
@@ -19,10 +19,10 @@ const PURPOSE: [&str; 6] = [
     "evaluation",
 ];
 
-/// The channels that the environment gives and takes; the others are the policy's own.
+/// Roles of the channels that the environment gives and takes; the others are the policy's own.
 const ROLES: [&str; 2] = ["observation", "action"];
 
-/// The hash of a contract's purpose, hexadecimal; `None` for what is no JSON object.
+/// Hashes a contract's purpose, hexadecimal; `None` for text that is not a JSON object.
 pub fn sha256(contract: &str) -> Option<String> {
     let contract: Value = serde_json::from_str(contract).ok()?;
     let all = contract.as_object()?;
@@ -33,7 +33,7 @@ pub fn sha256(contract: &str) -> Option<String> {
     Some(digest(canonical(&Value::Object(purpose)).as_bytes()))
 }
 
-/// What of a part counts: of the channels those of the environment, of the language what makes words of a sentence, and not which
+/// Selects what counts of a part: of the channels those of the environment, of the language what makes words of a sentence, and not which
 /// sentences are refused.
 fn part(key: &str, value: &Value) -> Value {
     let mut value = value.clone();
@@ -53,7 +53,7 @@ fn part(key: &str, value: &Value) -> Value {
     value
 }
 
-/// SHA-256 of bytes, hexadecimal.
+/// Computes the SHA-256 of bytes, hexadecimal.
 fn digest(bytes: &[u8]) -> String {
     Sha256::digest(bytes)
         .iter()

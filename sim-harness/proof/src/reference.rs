@@ -1,4 +1,4 @@
-//! Reference rollouts: what `lads_exporter reference` wrote, read and checked.
+//! Reads and checks reference rollouts, which `lads_exporter reference` writes.
 //!
 //! Invariants of a [`Reference`] that was read: every instruction has the same number of episodes, numbered from 0, at least one of them
 //! traced; every trace holds as many observations, actions and states as its lengths say. What can fail: no such file, another format or
@@ -17,7 +17,7 @@ use super::purpose;
 
 /// Value of the JSON's `format`.
 const FORMAT: &str = "lads-reference";
-/// Versions of the JSON form that are read. The first records neither contract nor logits, so that less can be proved by it.
+/// Versions of the JSON form that can be read. The first records neither contract nor logits, so that less can be proved by it.
 const FORMAT_VERSIONS: [u32; 2] = [1, 2];
 
 /// Why a reference is refused.
@@ -27,36 +27,36 @@ pub enum ReferenceError {
     /// The file cannot be read.
     #[error("{path}: cannot be read ({source}); name a reference, or make one: make reference", path = path.display())]
     File {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The system's reason.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// The file is no reference, or is damaged.
+    /// The file is not a reference, or is damaged.
     #[error("{path}: {problem}; make it again: make reference", path = path.display())]
     Content {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong.
+        /// What is wrong with the content.
         problem: String,
     },
     /// The reference is of something else.
     #[error("{path}: the reference's {field} is {reference}, {whose} is {other}; use the reference that was made for this", path = path.display())]
     Other {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What differs.
+        /// Name of the field that differs.
         field: &'static str,
-        /// What the reference says.
+        /// The reference's value.
         reference: String,
-        /// Whose value it is compared with.
+        /// Owner of the value that the reference's is compared with.
         whose: &'static str,
-        /// That value.
+        /// Value that the reference's is compared with.
         other: String,
     },
 }
 
-/// What the exporter's reference rollouts found.
+/// Results of the exporter's reference rollouts.
 #[derive(Debug, Deserialize)]
 pub struct Reference {
     format: String,
@@ -74,21 +74,21 @@ pub struct Reference {
     pub period: Option<usize>,
     /// Episodes of each instruction.
     pub episodes_per_instruction: u32,
-    /// How many of these have a trace.
+    /// Number of episodes per instruction that have a trace.
     pub traced_episodes: u32,
-    /// Where the weights came from.
+    /// Where the reference's weights came from.
     pub weights_from: String,
-    /// Where the embeddings of the words came from.
+    /// Where the reference's word embeddings came from.
     pub words_from: String,
     /// The contract that was rolled out; `None` in files of version 1.
     pub contract: Option<Value>,
     /// Where the weights behind the recorded logits came from, if they were added later.
     pub logits_from: Option<String>,
-    /// What float noise does to the reference itself.
+    /// Effect of float noise on the reference itself.
     pub float_noise: Option<FloatNoise>,
     /// Versions of everything that took part.
     pub versions: std::collections::BTreeMap<String, String>,
-    /// In the contract's order.
+    /// Instructions with their episodes, in the contract's order.
     pub instructions: Vec<Instruction>,
     #[serde(skip)]
     path: PathBuf,
@@ -100,14 +100,14 @@ struct EnvironmentUsed {
     version: String,
 }
 
-/// What small noise on all weights of the reference does to its own answers to the traced questions: the largest differences.
+/// Effect of small noise on all weights of the reference on its own answers to the traced questions: the largest differences.
 #[derive(Debug, Clone, Copy, Default, Deserialize)]
 pub struct FloatNoise {
     /// Standard deviation of the noise, relative to each weight.
     pub relative: f64,
-    /// Of an action element.
+    /// Largest difference of an action element.
     pub action: f64,
-    /// Of a logit, up to a constant.
+    /// Largest difference of a logit, up to a constant.
     pub logit: f64,
 }
 
@@ -116,13 +116,13 @@ pub struct FloatNoise {
 pub struct Instruction {
     /// Id in the contract.
     pub id: String,
-    /// Its words.
+    /// Text of the instruction.
     pub text: String,
-    /// In order of their numbers.
+    /// Episodes in order of their numbers.
     pub episodes: Vec<Episode>,
 }
 
-/// One episode.
+/// An episode of the reference.
 #[derive(Debug, Deserialize)]
 pub struct Episode {
     #[serde(rename = "episode")]
@@ -131,44 +131,44 @@ pub struct Episode {
     pub steps: usize,
     /// Whether the instruction was carried out.
     pub success: bool,
-    /// In order of time.
+    /// Completed sub-tasks, in order of time.
     pub completions: Vec<Completion>,
     /// Plan indices in the order in which they were decided.
     pub plans: Vec<u32>,
-    /// The control steps at which they were decided; left out where they come once a period from the episode's start.
+    /// Control steps at which the plans were decided; absent where they come once a period from the episode's start.
     pub decided_at: Option<Vec<usize>>,
-    /// Largest logit minus second largest, of each decision.
+    /// Lead of the largest logit over the second largest, for each decision.
     pub margins: Vec<f64>,
     /// Noise-free state after the last step.
     pub final_state: Vec<f64>,
-    /// What was seen and done, in the first episodes of each instruction.
+    /// Observations and actions step by step, in the first episodes of each instruction.
     pub trace: Option<Trace>,
 }
 
 /// A completed sub-task.
 #[derive(Debug, Deserialize)]
 pub struct Completion {
-    /// Its name.
+    /// Name of the sub-task.
     pub sub_task: String,
-    /// Control step, from 1, after which it was done.
+    /// Control step, from 1, after which the sub-task was done.
     pub step: usize,
 }
 
-/// An episode step by step.
+/// A traced episode, step by step.
 #[derive(Debug, Deserialize)]
 #[serde(try_from = "Written")]
 pub struct Trace {
-    /// What the policy saw, `[steps, O]`.
+    /// Observations of the policy, `[steps, O]`.
     pub observations: Vec<f32>,
-    /// What it did, `[steps, A]`.
+    /// Actions of the policy, `[steps, A]`.
     pub actions: Vec<f32>,
     /// Noise-free states before the first steps' actions, `[n, O]`.
     pub states: Vec<f64>,
     /// Logits of each decision, `[decisions, M]`; empty where none were recorded.
     pub logits: Vec<f32>,
-    /// The plan that the trajectory encoder sees in each full segment.
+    /// Plan that the trajectory encoder sees in each full segment.
     pub encoded: Option<Vec<u32>>,
-    /// How much farther the second nearest code was, relative to the nearest's squared distance.
+    /// Extra distance of the second nearest code in each segment, relative to the nearest's squared distance.
     pub encoded_margins: Option<Vec<f64>>,
 }
 
@@ -184,7 +184,7 @@ struct Written {
 }
 
 impl Trace {
-    /// The logits of one of `decisions` decisions; empty where none were recorded.
+    /// Returns the logits of one of `decisions` decisions; empty where none were recorded.
     pub fn logits_of(&self, number: usize, decisions: usize) -> &[f32] {
         let len = self.logits.len() / decisions.max(1);
         self.logits
@@ -208,37 +208,37 @@ impl TryFrom<Written> for Trace {
     }
 }
 
-/// Little-endian numbers in base64.
+/// Decodes little-endian numbers in base64.
 fn numbers<T, const N: usize>(text: &str, read: fn([u8; N]) -> T) -> Result<Vec<T>, String> {
     let bytes = STANDARD.decode(text).map_err(|error| error.to_string())?;
     match bytes.as_chunks::<N>() {
         (whole, []) => Ok(whole.iter().map(|&chunk| read(chunk)).collect()),
         _ => Err(format!(
-            "a trace of {} bytes is no whole number of {N}-byte numbers",
+            "a trace of {} bytes is not a whole number of {N}-byte numbers",
             bytes.len()
         )),
     }
 }
 
-/// What is to be verified, as far as a reference must be of the same.
+/// Description of the policy to verify, as far as its reference must agree with it.
 #[derive(Debug, Clone)]
 pub struct Subject<'s> {
-    /// The contract as JSON, as it stands in the bundle.
+    /// Contract as JSON, exactly as in the bundle.
     pub contract: &'s str,
     /// Texts of the contract's instructions.
     pub instructions: Vec<&'s str>,
     /// Id of the environment.
     pub environment_id: &'s str,
-    /// The environment's version.
+    /// Version of the environment.
     pub environment_version: &'s str,
-    /// Elements of its observations.
+    /// Number of elements of an observation.
     pub observation_len: usize,
-    /// Elements of its actions.
+    /// Number of elements of an action.
     pub action_len: usize,
 }
 
 impl Reference {
-    /// Reads and checks a file.
+    /// Reads and checks a reference file.
     pub fn open(path: &Path) -> Result<Self, ReferenceError> {
         let bytes = lads_host::input::read(path).map_err(|source| ReferenceError::File {
             path: path.into(),
@@ -247,7 +247,7 @@ impl Reference {
         Self::read(&bytes, path)
     }
 
-    /// Reads and checks the bytes of a file; `path` names it where they are refused.
+    /// Reads and checks the bytes of a reference file; `path` names it in errors.
     pub fn read(bytes: &[u8], path: &Path) -> Result<Self, ReferenceError> {
         let content = |problem: String| ReferenceError::Content {
             path: path.into(),
@@ -304,7 +304,7 @@ impl Reference {
         Ok(())
     }
 
-    /// The control steps at which the plans of an episode were decided.
+    /// Control steps at which the plans of an episode were decided.
     pub fn decided_at(&self, episode: &Episode) -> Vec<usize> {
         let grid = || {
             let period = self.period.map(|period| period.max(1));

@@ -1,4 +1,4 @@
-//! Episodes summed up per instruction and per split.
+//! Sums up episodes per instruction and per split.
 //!
 //! Invariants: the order is that of the instructions and then of the episodes. Nothing here can fail.
 
@@ -12,16 +12,16 @@ use crate::metrics::{Outcome, Rate, Score};
 pub struct Completion {
     /// Name of the sub-task.
     pub sub_task: String,
-    /// Control step, counted from 1, after which it held for the first time.
+    /// First control step, counted from 1, after which the sub-task was done.
     pub step: usize,
-    /// Whether the instruction commands it.
+    /// Whether the instruction commands the sub-task.
     pub commanded: bool,
 }
 
-/// One episode.
+/// One episode of an instruction.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Run {
-    /// Number of the episode within its instruction; with the seed it names the episode's random streams.
+    /// Number of the episode within its instruction; with the seed it identifies the episode's random streams.
     pub episode: usize,
     /// Control steps executed.
     pub steps: usize,
@@ -29,16 +29,16 @@ pub struct Run {
     pub success: Option<bool>,
     /// Completed sub-tasks in the order of their completion.
     pub completions: Vec<Completion>,
-    /// The indices that were selected, such as those of latent plans, in order; none of a policy that selects none.
+    /// Selected indices, such as those of latent plans, in order; empty if the policy selects none.
     pub plans: Vec<u32>,
 }
 
-/// How often one sub-task was completed.
+/// Rate at which one sub-task was completed.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SubTaskRate {
     /// Name of the sub-task.
     pub sub_task: String,
-    /// How often, with a Wilson 95 % interval.
+    /// Share of episodes that completed the sub-task, with a Wilson 95 % interval.
     #[serde(flatten)]
     pub rate: Rate,
 }
@@ -46,33 +46,33 @@ pub struct SubTaskRate {
 /// An instruction, as far as its episodes are judged by it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Asked<'a> {
-    /// Its id in the contract.
+    /// Id of the instruction in the contract.
     pub id: &'a str,
-    /// Its text.
+    /// Text of the instruction.
     pub text: &'a str,
-    /// The split it belongs to.
+    /// Split that the instruction belongs to.
     pub split: &'a str,
-    /// The sub-tasks that it commands, in its order.
+    /// Sub-tasks that the instruction commands, in its order.
     pub sub_tasks: Vec<&'a str>,
 }
 
-/// All episodes of one instruction.
+/// Results of all episodes of one instruction.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct InstructionResult {
-    /// The instruction's id in the contract.
+    /// Id of the instruction in the contract.
     pub id: String,
-    /// Its text.
+    /// Text of the instruction.
     pub text: String,
-    /// The split it belongs to, in the contract's name.
+    /// Split that the instruction belongs to, in the contract's name.
     pub split: String,
-    /// Its score; the field `episodes` is among these.
+    /// Scores of the episodes, whose fields include `episodes`.
     #[serde(flatten)]
     pub score: Score,
     /// Rate of every commanded sub-task, in the order of the instruction.
     pub completions: Vec<SubTaskRate>,
     /// Rate of every other sub-task that was completed at least once, in the environment's order.
     pub un_instructed_completions: Vec<SubTaskRate>,
-    /// The episodes.
+    /// Episodes of the instruction.
     pub runs: Vec<Run>,
 }
 
@@ -110,7 +110,7 @@ impl InstructionResult {
     }
 }
 
-/// One episode in the environment's names.
+/// Describes one episode with the environment's names.
 fn run(number: usize, episode: &Episode, watched: &[&str], commanded: &[&str]) -> Run {
     let named = |completion: &crate::episode::Completion| {
         let &sub_task = watched.get(completion.sub_task)?;
@@ -129,7 +129,7 @@ fn run(number: usize, episode: &Episode, watched: &[&str], commanded: &[&str]) -
     }
 }
 
-/// The score of episodes that all command sub-tasks, or none of them.
+/// Scores episodes that all command sub-tasks, or none of them.
 fn score<'r>(runs: impl Iterator<Item = &'r Run> + Clone) -> Score {
     let outcomes: Option<Vec<_>> = runs.clone().map(outcome).collect();
     outcomes.map_or_else(
@@ -141,7 +141,7 @@ fn score<'r>(runs: impl Iterator<Item = &'r Run> + Clone) -> Score {
     )
 }
 
-/// `None` where nothing was commanded.
+/// Outcome of an episode for the rates; `None` where nothing was commanded.
 fn outcome(run: &Run) -> Option<Outcome> {
     let completed = run.completions.iter().filter(|c| c.commanded).count();
     Some(Outcome {
@@ -151,10 +151,10 @@ fn outcome(run: &Run) -> Option<Outcome> {
     })
 }
 
-/// All instructions of one split together.
+/// Results of all instructions of one split together.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SplitResult {
-    /// Its score; the field `episodes` is among these.
+    /// Scores of the episodes, whose fields include `episodes`.
     #[serde(flatten)]
     pub score: Score,
     /// Rate of every sub-task over the episodes that commanded it.
@@ -163,7 +163,7 @@ pub struct SplitResult {
     pub un_instructed_completions: Vec<SubTaskRate>,
 }
 
-/// The contract's splits in its order, by name; in JSON an object.
+/// Results of the contract's splits in its order, by name; in JSON an object.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Splits(pub Vec<(String, SplitResult)>);
 
@@ -178,7 +178,7 @@ impl Splits {
         Self(names.iter().map(of_split).collect())
     }
 
-    /// The result of a split.
+    /// Returns the result of a split.
     pub fn get(&self, name: &str) -> Option<&SplitResult> {
         let found = self.0.iter().find(|(known, _)| known == name);
         found.map(|(_, result)| result)

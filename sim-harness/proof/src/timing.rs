@@ -1,4 +1,4 @@
-//! How long calls and episodes took: durations, and their percentiles.
+//! Durations of calls and episodes, and their percentiles.
 //!
 //! Nothing here can fail: over no durations a percentile is `None`.
 
@@ -6,14 +6,14 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-/// How long everything took, over all episodes of one driver.
+/// Durations of everything, over all episodes of one driver.
 #[derive(Debug, Clone, Default)]
 pub struct Timing {
-    /// Every control step that selected nothing, in nanoseconds.
+    /// Durations of the control steps that selected nothing, in nanoseconds.
     pub ordinary_ns: Vec<u64>,
-    /// Every control step that selected an index, such as that of a plan, in nanoseconds.
+    /// Durations of the control steps that selected an index, such as that of a plan, in nanoseconds.
     pub decision_ns: Vec<u64>,
-    /// Every change of instruction, in nanoseconds.
+    /// Durations of the changes of instruction, in nanoseconds.
     pub instruct_ns: Vec<u64>,
     /// CPU time inside the environment's reset and step, which is physics but for noise and task checks.
     pub simulator_cpu: Duration,
@@ -40,16 +40,16 @@ impl Timing {
 pub struct Latency {
     /// Number of durations.
     pub count: usize,
-    /// Median; `None` without durations, as the next two.
+    /// Median; `None` without durations, like the other percentiles.
     pub p50: Option<f64>,
-    /// 99th percentile.
+    /// 99th percentile; `None` without durations.
     pub p99: Option<f64>,
-    /// Largest.
+    /// Largest duration; `None` without durations.
     pub max: Option<f64>,
 }
 
 impl Latency {
-    /// Percentiles of durations in nanoseconds, by nearest rank: the smallest duration that at least `p` percent do not exceed.
+    /// Computes percentiles of durations in nanoseconds, by nearest rank: the smallest duration that at least `p` percent do not exceed.
     pub fn of_ns(durations_ns: &[u64]) -> Self {
         let mut durations_ns = durations_ns.to_vec();
         durations_ns.sort_unstable();
@@ -80,7 +80,7 @@ pub struct LatencyByKind {
 }
 
 impl LatencyByKind {
-    /// Percentiles of all calls.
+    /// Computes percentiles of all calls.
     pub fn of(timing: &Timing) -> Self {
         Self {
             ordinary: Latency::of_ns(&timing.ordinary_ns),
@@ -90,12 +90,12 @@ impl LatencyByKind {
     }
 }
 
-/// Where the time went; CPU times are summed over the threads and do not depend on what else the machine does.
+/// Use of time; CPU times are summed over the threads and do not depend on what else the machine does.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TimeUse {
     /// Wall time from the first episode to the last, in seconds.
     pub wall_s: f64,
-    /// Threads that ran episodes.
+    /// Number of threads that ran episodes.
     pub threads: usize,
     /// CPU time inside episodes, in seconds.
     pub episodes_cpu_s: f64,
@@ -108,7 +108,7 @@ pub struct TimeUse {
 }
 
 impl TimeUse {
-    /// Sums up what was measured.
+    /// Sums up the measured durations.
     pub fn of(timing: &Timing, wall: Duration, threads: usize) -> Self {
         let (simulator_cpu_s, episodes_cpu_s) = (
             timing.simulator_cpu.as_secs_f64(),

@@ -1,4 +1,4 @@
-//! What a policy answers to a reference's questions: what is judged, what is harmless, and what is left to the reader.
+//! Tests how a policy's answers to a reference's questions are judged: what counts, what is harmless, and what is left to the reader.
 
 use std::path::Path;
 
@@ -22,7 +22,7 @@ fn text<T: Copy, const N: usize>(numbers: &[T], bytes: fn(T) -> [u8; N]) -> Stri
     )
 }
 
-/// A reference of one instruction and one traced episode of one observation and one action.
+/// Makes a reference of one instruction and one traced episode of one observation and one action.
 fn file() -> Value {
     let numbers: Vec<f32> = (0..STEPS).map(|step| step as f32).collect();
     let states: Vec<f64> = vec![0.0; STEPS];
@@ -60,7 +60,7 @@ fn read(file: &Value) -> Reference {
     Reference::read(file.to_string().as_bytes(), Path::new("r.json")).unwrap()
 }
 
-/// The answers of the reference's own policy.
+/// Makes the answers of the reference's own policy.
 fn own() -> Replay {
     let replies = (0..STEPS).map(|step| Reply {
         decided: step.is_multiple_of(HORIZON),
@@ -220,7 +220,7 @@ fn a_bundle_does_not_set_its_own_bar() {
     assert_eq!(answers.action_tolerance, 1e-4);
 }
 
-/// A context that is no multiple of the horizon: the restart decides at a step that is on no grid.
+/// Case: a context that is not a multiple of the horizon, so that the restart decides at a step that is on no grid.
 #[test]
 fn decisions_off_the_grid_are_judged_where_they_were() {
     let mut restarted = file();

@@ -1,4 +1,4 @@
-//! The references that ship: they can be read, are what their own contracts say, and record all that is compared.
+//! Tests the shipped references: they can be read, are what their own contracts say, and record all that is compared.
 
 use std::path::Path;
 

@@ -1,4 +1,4 @@
-//! Steps the kitchen from a pipe at full precision: what the parity test compares with the official environment.
+//! Steps the kitchen from a pipe at full precision, for the parity test against the official environment.
 //!
 //! Each input line is either `reset NOISE SEED INSTRUCTION EPISODE` (NOISE: none, v0 or v1) or an action as a JSON array of nine numbers.
 //! Each answer is one line of JSON: `{"observation": [...], "state": [...], "completions": [["kettle", 40], ...]}`.
@@ -74,7 +74,7 @@ fn demonstrate(scene: &Scene, sub_tasks: &str) -> Result<Vec<Vec<f32>>, String> 
     let mut performer = Performer::with_style(&mut kitchen, seed, stream, Style::PLAIN, MAX_STEPS);
     for name in sub_tasks.split(',') {
         let index = SUB_TASK_NAMES.iter().position(|known| *known == name);
-        let index = index.ok_or_else(|| format!("\"{name}\" is no sub-task of the kitchen"))?;
+        let index = index.ok_or_else(|| format!("\"{name}\" is not a sub-task of the kitchen"))?;
         performer
             .perform(index)
             .map_err(|_| format!("the time ran out during \"{name}\""))?;
@@ -105,7 +105,8 @@ fn parse_reset(text: &str) -> Result<(Noise, EpisodeSeed), String> {
     Ok((noise.parse()?, seed))
 }
 
-/// Reads the numbers with the standard library, which rounds correctly; the JSON reader may be off by one unit in the last place.
+/// Parses an action with the standard library's number parser, which rounds correctly; the JSON reader may be off by one unit in the last
+/// place.
 fn parse_action(line: &str) -> Result<Vec<f64>, String> {
     let inner = line
         .trim()

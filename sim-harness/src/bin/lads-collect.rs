@@ -1,5 +1,5 @@
-//! Collects demonstrations into one safetensors file, see [`lads_sim::dataset`] for its layout: scripted ones in the kitchen, labelled
-//! random trajectories on the `LOReL` table.
+//! Collects demonstrations into one safetensors file (layout: [`lads_sim::dataset`]): scripted ones in the kitchen, labelled random
+//! trajectories on the `LOReL` table.
 
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
@@ -17,7 +17,7 @@ use lads_sim::{command, lorel, output};
 #[derive(Parser)]
 #[command(version)]
 struct Arguments {
-    /// The environment.
+    /// The environment to collect in.
     #[arg(long, value_enum, default_value = "kitchen")]
     env: EnvironmentName,
     /// The dataset to write (safetensors); left out, data/ENV.safetensors.
@@ -51,14 +51,14 @@ enum EnvironmentName {
     Lorel,
 }
 
-/// What is asked for, in one environment's terms.
+/// What to collect, in the terms of one environment.
 enum Order {
     Kitchen(Settings),
     Lorel(lorel::collect::Settings),
 }
 
 impl Order {
-    /// Refuses the options of the other environment.
+    /// Turns the arguments into an order; refuses the options of the other environment.
     fn new(arguments: &Arguments) -> Result<Self, String> {
         let given = [
             (
@@ -134,7 +134,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     }
 }
 
-/// Random trajectories of the `LOReL` table.
+/// Collects random trajectories of the `LOReL` table into `output`.
 fn wander(
     settings: &lorel::collect::Settings,
     output: &Path,
@@ -158,7 +158,7 @@ fn wander(
     Ok(())
 }
 
-/// Scripted demonstrations of the kitchen.
+/// Collects scripted demonstrations of the kitchen into `output`.
 fn demonstrate(settings: &Settings, output: &Path) -> Result<(), Box<dyn std::error::Error>> {
     let scene = Scene::load(&vendor_dir())?;
     let instructions = Instructions::kitchen().seen;

@@ -20,12 +20,12 @@ use crate::instructions::Instruction;
 use crate::kitchen::spec::{ACTION_NAMES, CONTROL_PERIOD_S, OBSERVATION_NAMES, SUB_TASK_NAMES};
 use crate::kitchen::{self, Kitchen, Noise, Scene};
 
-/// Demonstrations are shorter than an episode of 280 steps, so that a policy that is a little slower still finishes.
+/// Longest demonstration in control steps: shorter than an episode of 280 steps, so that a policy that is a little slower still finishes.
 pub const MAX_STEPS: usize = 270;
-/// The first episode number of demonstrations. Evaluations count from 0, so that they never repeat a demonstration's noise.
+/// Episode number of the first demonstration. Evaluations count from 0, so that they never repeat a demonstration's noise.
 pub const FIRST_EPISODE: u64 = 1 << 32;
 
-/// What to collect.
+/// Settings of a collection.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Settings {
     /// Successful demonstrations of each instruction.
@@ -40,21 +40,21 @@ pub struct Settings {
     pub threads: NonZeroUsize,
 }
 
-/// How an instruction's attempts went.
+/// Counts of one instruction's attempts.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Tally {
-    /// Episodes that were run.
+    /// Number of episodes that were run.
     pub attempts: usize,
-    /// Those that failed.
+    /// Number of failed attempts, which are discarded.
     pub discarded: usize,
-    /// Control steps of the successful ones.
+    /// Control steps of the successful attempts.
     pub steps: usize,
 }
 
-/// Collection cannot go on.
+/// Why a collection cannot go on.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 pub enum CollectError {
-    /// Nothing was asked for.
+    /// No episodes were asked for.
     #[error("zero episodes per instruction: ask for at least 1 with --episodes-per-instruction")]
     NoEpisodes,
     /// The noise is negative or not finite.
@@ -69,7 +69,7 @@ pub enum CollectError {
         id: String,
         /// Successful attempts.
         successes: usize,
-        /// All attempts.
+        /// Number of all attempts.
         attempts: usize,
     },
 }
@@ -133,11 +133,11 @@ type Demonstrated = Option<(Vec<Demonstration>, Tally)>;
 enum Message {
     /// An attempt ended; true if it succeeded.
     Attempt(bool),
-    /// All demonstrations of an instruction are there.
+    /// All demonstrations of an instruction are complete.
     Instruction(usize, Result<Demonstrated, CollectError>),
 }
 
-/// Demonstrates one instruction until enough attempts succeeded; nothing when `report` says that nobody listens any more.
+/// Demonstrates one instruction until enough attempts succeeded; `None` when `report` says that the receiver has gone.
 fn demonstrate(
     kitchen: &mut Kitchen,
     index: usize,
@@ -174,7 +174,7 @@ fn demonstrate(
     Ok(Some((demonstrations, tally)))
 }
 
-/// One attempt; nothing if it failed.
+/// Runs one attempt; `None` if it failed.
 fn attempt(
     kitchen: &mut Kitchen,
     index: usize,

@@ -34,11 +34,11 @@ use crate::instructions::Instruction;
 use crate::kitchen::spec::{ACTION_LEN, OBSERVATION_LEN};
 use crate::output;
 
-/// `format` of the metadata.
+/// Value of the metadata's `format`.
 pub const FORMAT: &str = "lads-dataset";
-/// `version` of the metadata.
+/// Value of the metadata's `version`.
 pub const FORMAT_VERSION: &str = "1";
-/// Sub-tasks of an instruction.
+/// Number of sub-tasks of an instruction.
 pub const SUB_TASKS_PER_INSTRUCTION: usize = 4;
 
 /// One successful demonstration.
@@ -46,52 +46,52 @@ pub const SUB_TASKS_PER_INSTRUCTION: usize = 4;
 pub struct Demonstration {
     /// Index of the instruction.
     pub instruction: usize,
-    /// Episode number of its random stream.
+    /// Episode number of the demonstration's random stream.
     pub episode: u64,
-    /// The control steps.
+    /// Control steps of the demonstration.
     pub transitions: Vec<Transition>,
     /// Steps after which each sub-task's routine had ended.
     pub sub_task_ends: [usize; SUB_TASKS_PER_INSTRUCTION],
     /// Standard deviation of the recovery noise.
     pub recovery_noise: f64,
-    /// Speed factor.
+    /// Speed factor of the expert.
     pub speed: f64,
 }
 
 /// A dataset: demonstrations and what is known about them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Dataset {
-    /// Free strings, see the module's documentation.
+    /// Free strings, listed in the module's documentation.
     pub metadata: HashMap<String, String>,
     /// The instructions that the demonstrations point to.
     pub instructions: Vec<Instruction>,
-    /// The demonstrations, ordered by instruction.
+    /// Demonstrations, ordered by instruction.
     pub demonstrations: Vec<Demonstration>,
 }
 
-/// A dataset cannot be written or read.
+/// Why a dataset cannot be written or read.
 #[derive(Debug, Error)]
 pub enum DatasetError {
-    /// The file system refuses.
+    /// The file system refused an operation.
     #[error("{}: {source}", .path.display())]
     Io {
-        /// The file.
+        /// The file's path.
         path: PathBuf,
-        /// Why.
+        /// The file system's error.
         source: std::io::Error,
     },
-    /// The file is no dataset of this format.
+    /// The file is not a dataset of this format.
     #[error("{}: {reason}; make one with lads-collect", .path.display())]
     Format {
-        /// The file.
+        /// The file's path.
         path: PathBuf,
-        /// What is wrong.
+        /// What is wrong with the file.
         reason: String,
     },
 }
 
 impl Dataset {
-    /// Control steps of all demonstrations.
+    /// Number of control steps of all demonstrations.
     pub fn steps(&self) -> usize {
         self.demonstrations
             .iter()
@@ -204,7 +204,7 @@ impl Dataset {
 
     fn from_bytes(bytes: &[u8]) -> Result<Self, String> {
         let (_, header) = SafeTensors::read_metadata(bytes)
-            .map_err(|error| format!("no safetensors file ({error})"))?;
+            .map_err(|error| format!("not a safetensors file ({error})"))?;
         let metadata = header.metadata().clone().unwrap_or_default();
         for (key, expected) in [("format", FORMAT), ("version", FORMAT_VERSION)] {
             if metadata.get(key).map(String::as_str) != Some(expected) {
@@ -360,7 +360,7 @@ impl Columns {
     }
 }
 
-/// The header with sorted keys; the library writes the metadata in an order that differs from run to run.
+/// Header of the file with sorted keys; the library writes the metadata in an order that differs from run to run.
 #[derive(Serialize, Deserialize)]
 struct Header {
     #[serde(rename = "__metadata__")]
@@ -369,7 +369,7 @@ struct Header {
     tensors: BTreeMap<String, serde_json::Value>,
 }
 
-/// Makes the file of the same tensors and metadata the same bytes: sorts the header in place, which keeps its length.
+/// Sorts the file's header in place, which keeps its length, so that the same tensors and metadata always give the same bytes.
 fn sort_header(mut file: Vec<u8>) -> Vec<u8> {
     let header_len = file
         .first_chunk::<8>()
@@ -438,12 +438,12 @@ fn elements<'t>(tensors: &'t SafeTensors, name: &str, dtype: Dtype) -> Result<&'
     }
 }
 
-/// Elements as a tensor holds them.
+/// Bytes of `f32` elements as a tensor stores them, little endian.
 pub(crate) fn f32_bytes(values: impl Iterator<Item = f32>) -> Vec<u8> {
     values.flat_map(f32::to_le_bytes).collect()
 }
 
-/// Elements as a tensor holds them.
+/// Bytes of `i64` elements as a tensor stores them, little endian.
 pub(crate) fn i64_bytes(values: impl Iterator<Item = i64>) -> Vec<u8> {
     values.flat_map(i64::to_le_bytes).collect()
 }

@@ -1,21 +1,21 @@
-//! The instructions of an environment: texts, their sub-tasks in order, and the split into seen and unseen.
+//! Instructions of an environment: texts, their sub-tasks in order, and the split into seen and unseen.
 
 use serde::{Deserialize, Serialize};
 
 const KITCHEN: &str = include_str!("../../../models/kitchen.instructions.json");
 
-/// One instruction.
+/// An instruction of an environment.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Instruction {
     /// Short name, the sub-tasks' initials.
     pub id: String,
     /// Names of the commanded sub-tasks, in the order of execution.
     pub sub_tasks: Vec<String>,
-    /// What the policy is told.
+    /// The sentence that the policy is given.
     pub text: String,
 }
 
-/// The two splits.
+/// Instructions in two splits, seen and unseen.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 pub struct Instructions {
     /// Instructions with demonstrations.
@@ -25,7 +25,7 @@ pub struct Instructions {
 }
 
 impl Instructions {
-    /// Franka Kitchen's 22 and 3, from models/kitchen.instructions.json.
+    /// Loads Franka Kitchen's 22 seen and 3 unseen instructions from models/kitchen.instructions.json.
     ///
     /// # Panics
     /// If that file, which is compiled in, is malformed: a test reads it.

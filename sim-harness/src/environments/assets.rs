@@ -1,26 +1,26 @@
-//! Where the simulator's files lie: `vendor/` in the project's root, which `make setup` fills.
+//! Locates the simulator's files: `vendor/` in the project's root, which `make setup` fills.
 
 use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-/// Overrides the folder that `make setup` fills, for installations elsewhere.
+/// Environment variable that overrides the folder that `make setup` fills, for installations elsewhere.
 pub const VENDOR_VARIABLE: &str = "LADS_VENDOR";
 
-/// The MuJoCo that the harness was made for: another one has other layouts in memory.
+/// Version of MuJoCo that the harness was built for: another one has other layouts in memory.
 pub const MUJOCO: &str = "3.17.0";
 
-/// Another MuJoCo was loaded than the one that the harness was made for.
+/// Another version of MuJoCo was loaded than the harness was built for.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[error(
     "MuJoCo {got} was loaded, this program needs {MUJOCO}: take it out of LD_LIBRARY_PATH and LD_PRELOAD, and run \"make setup\""
 )]
 pub struct OtherMujoco {
-    /// Its version.
+    /// Version of the loaded MuJoCo.
     pub got: &'static str,
 }
 
-/// Whether the loaded MuJoCo is the right one; its functions may be called only then.
+/// Checks the version of the loaded MuJoCo; its other functions may be called only after that.
 pub fn check_mujoco() -> Result<(), OtherMujoco> {
     match mujoco_rs::mujoco_version() {
         MUJOCO => Ok(()),
@@ -28,7 +28,7 @@ pub fn check_mujoco() -> Result<(), OtherMujoco> {
     }
 }
 
-/// What to do about a scene that MuJoCo refuses for a reason that it gives.
+/// Remedy for a scene that MuJoCo refuses, chosen by the reason that it gives.
 pub fn remedy(reason: &str) -> &'static str {
     let reason = reason.to_lowercase();
     if reason.contains("memory") || reason.contains("alloc") {
@@ -38,15 +38,15 @@ pub fn remedy(reason: &str) -> &'static str {
     }
 }
 
-/// A file of the simulator is not there.
+/// A file of the simulator is missing.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[error("the simulator's assets are missing ({}): run \"make setup\"", .path.display())]
 pub struct MissingAssets {
-    /// What was looked for.
+    /// Path of the missing file.
     pub path: PathBuf,
 }
 
-/// The vendor folder: `LADS_VENDOR` if set, else the one in the project that this program was built in.
+/// Returns the vendor folder: `LADS_VENDOR` if set, else the one in the project that this program was built in.
 pub fn vendor_dir() -> PathBuf {
     let project = || {
         Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -57,7 +57,7 @@ pub fn vendor_dir() -> PathBuf {
     std::env::var_os(VENDOR_VARIABLE).map_or_else(project, PathBuf::from)
 }
 
-/// The path of a file below the vendor folder, if it exists.
+/// Returns the path of a file below the vendor folder, if it exists.
 pub fn asset(vendor: &Path, file: &str) -> Result<PathBuf, MissingAssets> {
     let path = vendor.join(file);
     if path.is_file() {

@@ -1,4 +1,4 @@
-//! What a rollout needs of a simulated environment, and nothing of any particular one.
+//! Interface of a simulated environment, as a rollout needs it; independent of any particular one.
 //!
 //! Invariants of every implementation: the same [`EpisodeSeed`] and actions give the same observations, bit for bit, on one machine;
 //! completions are latched (a sub-task that is undone later still counts) and chronological; an action that is refused changes nothing.
@@ -10,33 +10,33 @@ use thiserror::Error;
 
 pub use lads_proof::episode::Completion;
 
-/// What there is to look at, for pictures.
+/// Simulator state and viewpoint, for pictures.
 pub struct Stage<'e> {
     /// The simulator's state; drawing it changes nothing that the next control step depends on.
     pub data: &'e mut MjData<Arc<MjModel>>,
-    /// From where.
+    /// Viewpoint of the camera.
     pub view: View,
 }
 
-/// Where a camera stands.
+/// Viewpoint of a camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum View {
     /// A camera of the scene, by its name.
     Camera(&'static str),
-    /// A free camera.
+    /// A camera outside the scene's description.
     Free {
-        /// The point that it looks at, in metres in the world's frame.
+        /// Point that the camera looks at, in metres in the world's frame.
         look_at: [f64; 3],
-        /// Its distance from there, in metres.
+        /// Distance of the camera from `look_at`, in metres.
         distance: f64,
-        /// Degrees around the vertical.
+        /// Azimuth of the camera, degrees around the vertical.
         azimuth: f64,
-        /// Degrees above the horizon.
+        /// Elevation of the camera, degrees above the horizon.
         elevation: f64,
     },
 }
 
-/// Names one episode's random stream: the run's seed, the index of the instruction, the number of the episode.
+/// Identifies one episode's random stream: the run's seed, the index of the instruction, the number of the episode.
 ///
 /// An environment draws everything random from `numpy.random.default_rng([seed, instruction, episode])`, see [`crate::random`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -50,13 +50,13 @@ pub struct EpisodeSeed {
 }
 
 impl EpisodeSeed {
-    /// The three numbers, as numpy's `default_rng` takes them.
+    /// Entropy of the stream: seed, instruction and episode, as numpy's `default_rng` takes them.
     pub fn entropy(self) -> [u64; 3] {
         [self.seed, self.instruction, self.episode]
     }
 }
 
-/// An action that cannot be executed. The environment is as it was before.
+/// Why an action cannot be executed. The environment is unchanged.
 #[derive(Clone, Copy, Debug, PartialEq, Error)]
 pub enum ActionError {
     /// The action has another length than the environment's.
@@ -70,7 +70,7 @@ pub enum ActionError {
     /// An element is NaN or infinite.
     #[error("element {index} of the action is not finite")]
     NotFinite {
-        /// The first such element.
+        /// Index of the first such element.
         index: usize,
     },
 }
@@ -95,34 +95,34 @@ pub trait Environment: Send {
     fn max_steps(&self, split: &str) -> usize;
 
     /// Starts an episode that is to complete the sub-tasks `commanded` (indices in [`Environment::sub_tasks`]) and returns its first
-    /// observation. Benchmarks prepare the objects that an instruction speaks of; with none commanded, the start is any.
+    /// observation. Benchmarks prepare the objects that an instruction speaks of; without commanded sub-tasks the start is random.
     fn reset(&mut self, seed: EpisodeSeed, commanded: &[usize]) -> &[f64];
     /// Applies `action` for one control period and returns the observation after it.
     fn step(&mut self, action: &[f64]) -> Result<&[f64], ActionError>;
 
     /// The latest observation, as a policy sees it.
     fn observation(&self) -> &[f64];
-    /// The noise-free quantities that the latest observation shows, in the same order.
+    /// Noise-free quantities behind the latest observation, in the same order.
     fn state(&self) -> &[f64];
-    /// Control steps since the reset.
+    /// Number of control steps since the reset.
     fn steps(&self) -> usize;
     /// Completions since the reset, in the order in which they happened.
     fn completions(&self) -> &[Completion];
 
-    /// Whether an instruction that commands these sub-tasks is carried out now: each was completed at some time, unless the environment
-    /// asks for more.
+    /// Whether an instruction that commands these sub-tasks is carried out at this moment: each was completed at some time, unless the
+    /// environment asks for more.
     fn succeeded(&self, commanded: &[usize]) -> bool {
         commanded
             .iter()
             .all(|&sub_task| self.completed_at(sub_task).is_some())
     }
 
-    /// Where the gripper is, in metres in the world's frame, for pictures; `None` in an environment without one.
+    /// Position of the gripper, in metres in the world's frame, for pictures; `None` in an environment without one.
     fn gripper(&self) -> Option<[f64; 3]> {
         None
     }
 
-    /// What there is to look at; `None` in an environment without a simulator.
+    /// Simulator state and viewpoint for pictures; `None` in an environment without a simulator.
     fn stage(&mut self) -> Option<Stage<'_>> {
         None
     }
@@ -135,7 +135,7 @@ pub trait Environment: Send {
     fn action_len(&self) -> usize {
         self.action_names().len()
     }
-    /// The step at which a sub-task was completed, if it was.
+    /// Control step at which a sub-task was completed, if it was.
     fn completed_at(&self, sub_task: usize) -> Option<usize> {
         self.completions()
             .iter()

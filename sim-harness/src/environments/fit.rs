@@ -1,4 +1,4 @@
-//! Does a bundle's contract fit an environment? Every difference is refused by name, before anything moves.
+//! Checks whether a bundle's contract fits an environment. Every difference is refused by name, before anything moves.
 //!
 //! A policy that is driven with the elements of its observation in another order, or at another rate, does not fail: it moves the wrong
 //! joint. So id, version, control period and every element must agree, and every sub-task must be one that is watched. Environments name
@@ -10,7 +10,7 @@ use thiserror::Error;
 
 use crate::environment::Environment;
 
-/// Relative difference up to which two control periods are the same: four times the rounding of the contract's `f32`.
+/// Relative difference up to which two control periods count as equal: four times the rounding of the contract's `f32`.
 const PERIOD_TOLERANCE: f64 = 2.4e-7;
 
 /// The first difference between a contract and an environment.
@@ -19,33 +19,33 @@ pub enum Misfit {
     /// A text differs: the environment's id or version.
     #[error("the contract's {field} is '{contract}', the environment's is '{environment}'")]
     Text {
-        /// The contract's field.
+        /// Name of the contract's field.
         field: &'static str,
-        /// What the contract says.
+        /// The contract's value.
         contract: String,
-        /// What the environment says.
+        /// The environment's value.
         environment: String,
     },
     /// The control periods differ.
     #[error("the contract's control_period_s is {contract}, the environment's is {environment}")]
     ControlPeriod {
-        /// The contract's, in seconds.
+        /// The contract's control period, in seconds.
         contract: f64,
-        /// The environment's, in seconds.
+        /// The environment's control period, in seconds.
         environment: f64,
     },
-    /// The policy observes more than one vector, or something else.
+    /// The policy observes something other than one vector.
     #[error(
         "the contract's observation channels are {contract}, the environment gives one vector of numbers"
     )]
     Channels {
-        /// Their names.
+        /// Names of the contract's observation channels.
         contract: String,
     },
     /// Observation or action have different lengths.
     #[error("the contract's {field} has {contract} elements, the environment's has {environment}")]
     Len {
-        /// The contract's field.
+        /// Name of the contract's field.
         field: &'static str,
         /// Elements in the contract.
         contract: usize,
@@ -57,13 +57,13 @@ pub enum Misfit {
         "element {index} of the contract's {field} is '{contract}', the environment's is '{environment}'"
     )]
     Name {
-        /// The contract's field.
+        /// Name of the contract's field.
         field: &'static str,
         /// Index of the element, from 0.
         index: usize,
-        /// Its name in the contract.
+        /// Element's name in the contract.
         contract: String,
-        /// Its name in the environment.
+        /// Element's name in the environment.
         environment: String,
     },
     /// An instruction commands a sub-task that the environment does not watch.
@@ -78,8 +78,8 @@ pub enum Misfit {
     },
 }
 
-/// Compares `contract` with `environment`; on success gives, for each instruction of the contract, the environment's indices of the
-/// sub-tasks that it commands.
+/// Compares `contract` with `environment`; returns, for each instruction of the contract, the environment's indices of the sub-tasks that
+/// it commands.
 pub fn check(
     contract: &Contract,
     environment: &dyn Environment,
@@ -124,7 +124,7 @@ pub fn check(
         .collect()
 }
 
-/// The names in a list of sub-tasks that a person wrote.
+/// Splits a comma-separated list of sub-tasks, as a person writes it, into names.
 pub fn sub_tasks(list: &str) -> impl Iterator<Item = &str> {
     list.split(',')
         .map(str::trim)

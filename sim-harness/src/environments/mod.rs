@@ -1,4 +1,4 @@
-//! Simulated environments: what one is, the two there are, and whether a policy fits into one.
+//! Simulated environments: their interface, the two implementations, and the check whether a policy fits one.
 
 pub mod assets;
 pub mod environment;

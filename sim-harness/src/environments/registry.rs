@@ -1,4 +1,4 @@
-//! Which environments there are, by the id that a bundle's contract names.
+//! Registry of the environments, by the id that a bundle's contract names.
 //!
 //! The one place that knows them all: everything else works with the [`Environment`] trait. A scene is loaded once and opened once per
 //! thread. What can fail: an id or noise level that nobody knows, assets that were not set up.
@@ -11,10 +11,10 @@ use crate::environment::Environment;
 use crate::kitchen::{self, Kitchen};
 use crate::lorel::{self, Lorel};
 
-/// A loaded scene; calling it opens one environment in it.
+/// Opens one more environment in a loaded scene.
 pub type Opener = Box<dyn Fn() -> Box<dyn Environment> + Send + Sync>;
 
-/// The noise level of an environment that is asked for by nothing else; `None` for an id that nobody knows.
+/// Default noise level of an environment; `None` for an unknown id.
 pub fn default_noise(id: &str) -> Option<&'static str> {
     let found = ENVIRONMENTS.iter().find(|known| known.id == id);
     found.map(|known| known.noise)
@@ -25,7 +25,7 @@ type Loader = fn(&Path, &str) -> Result<Opener, LoadError>;
 
 struct Known {
     id: &'static str,
-    /// Its usual noise level.
+    /// Default noise level of the environment.
     noise: &'static str,
     load: Loader,
 }
@@ -49,9 +49,9 @@ pub enum LoadError {
     /// No environment has this id.
     #[error("no environment is called '{id}' (known: {known})")]
     UnknownId {
-        /// What was asked for.
+        /// The id that was asked for.
         id: String,
-        /// All there are.
+        /// All known ids.
         known: String,
     },
     /// The environment has no such noise level.

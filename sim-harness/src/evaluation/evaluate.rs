@@ -1,4 +1,4 @@
-//! Many episodes over many threads, with the same result whatever their number.
+//! Runs many episodes on many threads, with the same result whatever their number.
 //!
 //! Each thread has its own environment and its own controller and takes the next episode from one queue. Every episode draws from streams
 //! of its own (seed, instruction, episode), and results are put in the order of the queue, so scheduling cannot show. What can fail: an
@@ -18,52 +18,52 @@ use crate::faults::Faults;
 use crate::plans::PlanBook;
 use crate::random::Stream;
 use crate::results::{self, Asked};
-use crate::rollout::{Actor, Driver, Episode, Onlooker, RolloutError, Task, Timing};
+use crate::rollout::{Actor, Driver, Episode, Observer, RolloutError, Task, Timing};
 use crate::spoken::WordBook;
 use crate::trace::Trace;
 
 /// Fourth number of the entropy of the stream that seeds plan sampling; the environment's noise has only the first three.
 const DECISION_STREAM: u64 = 1;
 
-/// The same of the stream that seeds what a policy draws at random.
+/// Fourth number of the entropy of the stream that seeds what a policy draws at random.
 const NOISE_STREAM: u64 = 5;
 
-/// One instruction to run.
+/// An instruction to run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Assignment {
-    /// Index of the instruction in the policy's table; beyond it, of a sentence whose words the setup has.
+    /// Index of the instruction in the policy's table; beyond the table, of a sentence whose word embeddings the setup has.
     pub instruction: u32,
-    /// The environment's indices of the sub-tasks that it commands.
+    /// The environment's indices of the sub-tasks that the instruction commands.
     pub commanded: Vec<usize>,
-    /// Control steps of its episodes.
+    /// Number of control steps of the instruction's episodes.
     pub max_steps: usize,
 }
 
-/// How episodes run besides policy, seed and decision; the default is the plain benchmark.
+/// Setup of episodes besides policy, seed and decision; the default is the plain benchmark.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Setup<'e> {
-    /// What is wrong between policy and environment.
+    /// Faults between policy and environment.
     pub faults: Faults,
     /// Plans that the policy is to follow, instead of its own.
     pub plans: Option<&'e PlanBook>,
-    /// Word embeddings that are heard instead of the table's.
+    /// Word embeddings that replace those of the table.
     pub words: Option<&'e WordBook>,
-    /// Whether an episode in which the controller refuses an observation ends there and counts as it stands, as a machine would stop;
-    /// otherwise it ends everything.
+    /// Whether an episode whose observation the controller refuses ends there and counts with what it has completed, as a machine would
+    /// stop; otherwise it ends everything.
     pub stop_where_refused: bool,
-    /// How many of each instruction's episodes, from the first, keep every control step.
+    /// Number of each instruction's episodes, from the first, that keep every control step.
     pub traced: u32,
-    /// Who looks on at the policy's episodes.
-    pub onlooker: Option<&'e dyn Onlooker>,
+    /// Observer of the policy's episodes.
+    pub observer: Option<&'e dyn Observer>,
 }
 
-/// What to run, and how.
+/// An evaluation to run.
 pub struct Evaluation<'e> {
     /// The compiled policy.
     pub policy: Policy<'e>,
     /// The contract of its bundle, which also says how instructions are evaluated.
     pub contract: &'e Contract,
-    /// Its instructions.
+    /// The instructions to run.
     pub assignments: &'e [Assignment],
     /// Episodes of each instruction.
     pub episodes: u32,
@@ -71,13 +71,13 @@ pub struct Evaluation<'e> {
     pub seed: u64,
     /// How plans are chosen; a sampling seed in it is replaced by one per episode.
     pub decision: Decision,
-    /// Who acts.
+    /// Source of the actions.
     pub actor: Actor,
-    /// The instructions that the kernels run on.
+    /// Instruction set that the kernels run on.
     pub isa: Isa,
-    /// Threads, at least one.
+    /// Number of threads, at least one.
     pub threads: usize,
-    /// Everything else about it.
+    /// Everything else about the episodes.
     pub setup: Setup<'e>,
 }
 
@@ -97,10 +97,10 @@ pub enum EvaluationError {
         instruction: u32,
         /// Number of the episode.
         episode: u32,
-        /// What happened.
+        /// The episode's error.
         source: RolloutError,
     },
-    /// It was told to stop.
+    /// The evaluation was stopped by the caller.
     #[error("interrupted")]
     Interrupted,
 }
@@ -110,10 +110,10 @@ pub enum EvaluationError {
 pub struct Evaluated {
     /// One list of episodes per assignment.
     pub episodes: Vec<Vec<Episode>>,
-    /// Every control step, in the same order, where the setup asked for it; empty otherwise.
+    /// Traces of the episodes in the order of `episodes`, where the setup asked for them; empty otherwise.
     pub traces: Vec<Trace>,
-    /// The control steps, from 0, at which episodes ended because the controller refused an observation; empty unless the setup lets
-    /// episodes end so.
+    /// Control steps, from 0, at which episodes ended because the controller refused an observation; empty unless the setup lets episodes
+    /// end this way.
     pub refused_at: Vec<usize>,
     /// Durations, summed over the threads.
     pub timing: Timing,
@@ -128,7 +128,7 @@ impl Drop for OnPanic<'_> {
     }
 }
 
-/// What one thread did: its episodes with their places in the queue.
+/// Episodes that one thread ran, with their places in the queue.
 struct Share {
     episodes: Vec<(usize, Episode, Option<Trace>)>,
     refused_at: Vec<usize>,
@@ -141,7 +141,7 @@ impl Evaluation<'_> {
         self.assignments.len() * self.episodes as usize
     }
 
-    /// What an instruction is, be it of the policy's table or a sentence outside it.
+    /// Finds an instruction by index, in the policy's table or as a sentence outside it.
     pub fn instruction(&self, instruction: u32) -> Option<Asked<'_>> {
         let known = results::asked(self.contract, instruction as usize);
         known.or_else(|| Some(self.setup.words?.sentence.as_ref()?.asked()))
@@ -167,7 +167,7 @@ impl Evaluation<'_> {
             .ok_or(EvaluationError::Interrupted)
     }
 
-    /// The same, but work that ends early, also by who looks on, comes to the episodes that were finished.
+    /// Runs episodes like [`run`](Self::run), but if stopped early, also by the observer, returns the finished episodes.
     pub fn run_until(
         &self,
         open: &(dyn Fn() -> Box<dyn Environment> + Sync),
@@ -239,7 +239,7 @@ impl Evaluation<'_> {
         if self.setup.traced > 0 {
             driver.record();
         }
-        driver.show(self.setup.onlooker);
+        driver.set_observer(self.setup.observer);
         let (mut episodes, mut refused_at) = (Vec::new(), Vec::new());
         while let Some(place) = next() {
             let episode = (place % self.episodes as usize) as u32;

@@ -1,4 +1,4 @@
-//! A real robot's imperfections between policy and environment: late, lost and noisier observations, sluggish actuators.
+//! Simulates a real robot's imperfections between policy and environment: late, lost and noisier observations, sluggish actuators.
 //!
 //! Invariants: faults of an episode depend only on its seed and on the faults themselves, never on threads; without faults every number
 //! passes through bit for bit. What can fail: settings that mean nothing, before anything runs.
@@ -13,20 +13,20 @@ const DROP_STREAM: u64 = 4;
 
 pub use lads_proof::faults::{FaultError, Faults, LONGEST_DELAY};
 
-/// The faults of one episode at work.
+/// Simulates the faults in one episode.
 #[derive(Debug)]
 pub struct Link {
     faults: Faults,
     stream: Stream,
-    /// Observations on their way, the oldest first.
+    /// Observations that have not arrived yet, the oldest first.
     late: VecDeque<Vec<f32>>,
     started: bool,
-    /// Share of the last executed action in the next.
+    /// Share of the last executed action in the next one.
     inertia: f64,
 }
 
 impl Link {
-    /// The start of an episode.
+    /// Starts an episode.
     pub fn new(faults: Faults, seed: EpisodeSeed) -> Self {
         let [run, instruction, episode] = seed.entropy();
         let inertia = if faults.action_lag > 0.0 {
@@ -43,7 +43,8 @@ impl Link {
         }
     }
 
-    /// What the policy sees (`seen`, which holds what it saw last) when the environment shows `observation`, which is `state` and noise.
+    /// Computes what the policy sees (`seen`, which holds what it saw last) when the environment shows `observation`, which is `state` plus
+    /// noise.
     pub fn sense(&mut self, observation: &[f64], state: &[f64], seen: &mut [f32]) {
         let scale = self.faults.noise_scale;
         let noisy = observation.iter().zip(state).map(|(&shown, &truth)| {
@@ -70,7 +71,7 @@ impl Link {
         }
     }
 
-    /// What the actuators do (`executed`, which holds what they did last, zero at first) when the policy asks for `action`.
+    /// Computes what the actuators do (`executed`, which holds what they did last, zero at first) when the policy asks for `action`.
     pub fn actuate(&self, action: &[f32], executed: &mut [f32]) {
         for (done, &asked) in executed.iter_mut().zip(action) {
             *done = if self.inertia > 0.0 {
@@ -94,7 +95,7 @@ mod tests {
         episode: 4,
     };
 
-    /// What is seen of the observations 0, 1, 2, ... of a state that is always half of them.
+    /// Returns what is seen of the observations 0, 1, 2, ... of a state that is always half of them.
     fn seen(faults: Faults, steps: usize) -> Vec<f32> {
         let mut link = Link::new(faults, SEED);
         let mut seen = [f32::NAN];

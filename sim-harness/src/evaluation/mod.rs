@@ -1,4 +1,4 @@
-//! Policies in environments: one episode, many of them, and what they come to.
+//! Policies in environments: single episodes, evaluations of many, and their results.
 
 pub mod evaluate;
 pub mod faults;

@@ -1,4 +1,4 @@
-//! What `lads-run` reports: episodes of this simulator in the words of [`lads_proof::results`].
+//! Results of `lads-run`: episodes of this simulator in the types of [`lads_proof::results`].
 //!
 //! Nothing here can fail.
 
@@ -18,7 +18,7 @@ pub use lads_proof::timing::{LatencyByKind, TimeUse};
 use crate::environment::Environment;
 use crate::rollout::{Actor, Episode};
 
-/// Instruction number `index` of a contract and how it is evaluated.
+/// Returns instruction number `index` of a contract and how it is evaluated.
 pub fn asked(contract: &Contract, index: usize) -> Option<Asked<'_>> {
     let known = contract.instructions.get(index)?;
     let (sub_tasks, split) = contract.evaluated(index);
@@ -39,7 +39,7 @@ pub fn of_instruction(
     InstructionResult::new(asked, watched, episodes)
 }
 
-/// The names of the contract's splits, in the order in which its instructions first name them.
+/// Names of the contract's splits, in the order in which its instructions first name them.
 pub fn split_names(contract: &Contract) -> Vec<String> {
     let mut names: Vec<String> = Vec::new();
     for index in 0..contract.instructions.len() {
@@ -51,7 +51,7 @@ pub fn split_names(contract: &Contract) -> Vec<String> {
     names
 }
 
-/// How the actions came about.
+/// Describes how the actions were chosen.
 pub fn decision_used(decision: Decision, actor: Actor) -> DecisionUsed {
     let (rule, temperature) = match (actor, decision) {
         (Actor::Uniform, _) => ("uniform", None),
@@ -64,7 +64,7 @@ pub fn decision_used(decision: Decision, actor: Actor) -> DecisionUsed {
     }
 }
 
-/// The environment, with the longest of the splits' episodes.
+/// Describes the environment, with the longest of the splits' episodes.
 pub fn environment_used(environment: &dyn Environment, splits: &[String]) -> EnvironmentUsed {
     let steps = splits.iter().map(|split| environment.max_steps(split));
     EnvironmentUsed {

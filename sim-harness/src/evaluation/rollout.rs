@@ -1,4 +1,4 @@
-//! One episode: the compiled policy drives an environment until its commanded sub-tasks are done or the episode is full.
+//! Runs one episode: the compiled policy drives an environment until its commanded sub-tasks are done or the episode is full.
 //!
 //! Invariants: what happens depends only on the policy, the environment's seed and the decision rule; the controller is the one that runs
 //! on a robot, with memory allocated once per driver. What can fail: the controller refuses an observation, or the environment an action.
@@ -50,27 +50,27 @@ pub enum RolloutError {
         /// The environment's reason.
         error: ActionError,
     },
-    /// Who looks on has seen enough.
-    #[error("stopped while it was looked at")]
+    /// The observer stopped the episode.
+    #[error("stopped by its observer")]
     Stopped,
 }
 
-/// An episode as it stands, for who looks on.
-pub struct Glimpse<'g> {
-    /// Which episode.
+/// State of a running episode, as passed to its [`Observer`].
+pub struct Snapshot<'g> {
+    /// The episode's task: instruction, seed, limits.
     pub task: &'g Task<'g>,
-    /// How far it is.
-    pub stand: Stand,
-    /// To look at, not to change.
+    /// Whether a control step is about to be executed, or the last one was.
+    pub phase: Phase,
+    /// The environment in its present state; mutable only because rendering needs it, not to be changed.
     pub environment: &'g mut dyn Environment,
 }
 
-/// How far an episode is.
+/// Phase of an episode at the moment it is observed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Stand {
+pub enum Phase {
     /// The next action is about to be executed.
     Acting {
-        /// The plan in force; `None` of a policy that selects none.
+        /// Plan in force; `None` if the policy selects none.
         plan: Option<u32>,
     },
     /// The last action was executed.
@@ -80,68 +80,69 @@ pub enum Stand {
     },
 }
 
-/// How an episode that is looked at goes on.
+/// An [`Observer`]'s decision on how its episode continues.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Go {
-    /// With the next control step.
-    On,
-    /// From its start, as it was.
-    Again,
-    /// Not at all.
+pub enum Control {
+    /// Executes the next control step.
+    Continue,
+    /// Runs the same episode again from its start.
+    Restart,
+    /// Ends the run.
     Stop,
 }
 
-/// Looks on while episodes run, at every control step between decision and action, and once after the last. It may take its time.
-pub trait Onlooker: std::fmt::Debug + Sync {
-    /// One control step.
-    fn look(&self, glimpse: Glimpse<'_>) -> Go;
+/// Observes running episodes: at every control step between decision and action, and once after the last. It may block.
+pub trait Observer: std::fmt::Debug + Sync {
+    /// Called at each control step and once at the end of the episode; says how the episode continues.
+    fn observe(&self, snapshot: Snapshot<'_>) -> Control;
 }
 
-/// Who acts.
+/// Source of the actions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Actor {
-    /// The policy.
+    /// The policy chooses the actions.
     #[default]
     Policy,
-    /// Nobody: actions are uniform in the contract's limits. The floor that policies are measured against.
+    /// Actions are uniform in the contract's limits: the floor that policies are measured against. The floor that policies are measured
+    /// against.
     Uniform,
 }
 
 /// Fourth number of the entropy of the stream that uniform actions are drawn from.
 const UNIFORM_STREAM: u64 = 3;
 
-/// Which episode to run.
+/// The episode to run.
 #[derive(Debug, Clone)]
 pub struct Task<'t> {
     /// Index of the instruction in the policy's table.
     pub instruction: u32,
-    /// Word embeddings `[n, E]` that are heard instead of that instruction's.
+    /// Word embeddings `[n, E]` that replace those of the instruction.
     pub words: Option<&'t [f32]>,
-    /// Indices, in the environment's list, of the sub-tasks that the instruction commands; with none there is nothing to carry out, and the
-    /// episode lasts its full time.
+    /// Indices, in the environment's list, of the sub-tasks that the instruction commands; if empty, the episode lasts its full time and
+    /// has no success.
     pub commanded: &'t [usize],
-    /// Control steps after which the episode ends.
+    /// Number of control steps after which the episode ends.
     pub max_steps: usize,
     /// Random streams of the environment.
     pub seed: EpisodeSeed,
-    /// How plans are chosen, with the seed of this episode where they are sampled.
+    /// Decision rule for plans, with the seed of this episode where they are sampled.
     pub decision: Decision,
-    /// What else the policy draws at random, with the seed of this episode.
+    /// Seeds of the other random draws of the policy, with the seed of this episode.
     pub noise: Noise,
-    /// Who acts.
+    /// Source of the actions.
     pub actor: Actor,
-    /// What is wrong between policy and environment.
+    /// Faults between policy and environment.
     pub faults: Faults,
     /// Plans that the policy is to follow; the episode ends with them. `None`: the policy decides.
     pub plans: Option<Commanded<'t>>,
 }
 
-/// Plans that are given.
+/// A sequence of plans for the policy to follow.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Commanded<'t> {
-    /// In order.
+    /// Indices of the plans, in order.
     pub plans: &'t [u32],
-    /// Control steps that each is followed for.
+    /// Number of control steps for which each plan is followed.
     pub period: usize,
 }
 
@@ -156,11 +157,11 @@ fn cpu_since(earlier: Duration) -> Duration {
     cpu_time().saturating_sub(earlier)
 }
 
-/// A controller in an environment, for one episode after the other.
+/// Runs a controller in an environment, one episode after the other.
 pub struct Driver<'a, 'm, 'e> {
     controller: Controller<'a, 'm>,
     environment: &'e mut dyn Environment,
-    /// The channel that the observation goes to.
+    /// Channel that the observation goes to.
     channel: ChannelId,
     observation: Vec<f32>,
     action: Vec<f32>,
@@ -169,15 +170,15 @@ pub struct Driver<'a, 'm, 'e> {
     limits: Vec<(f64, f64)>,
     /// Plans decided in the episode.
     plans: Vec<u32>,
-    /// Control steps of the episode, where they are kept.
+    /// Control steps of the episode, if they are recorded.
     recording: Option<Vec<Step>>,
-    onlooker: Option<&'e dyn Onlooker>,
-    /// What was measured so far.
+    observer: Option<&'e dyn Observer>,
+    /// Durations measured so far.
     pub timing: Timing,
 }
 
 impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
-    /// Joins a controller and an environment that were checked to fit (see [`crate::fit`]).
+    /// Joins a controller and an environment whose fit was checked (see [`crate::fit`]).
     pub fn new(controller: Controller<'a, 'm>, environment: &'e mut dyn Environment) -> Self {
         let contract = controller.policy().contract();
         let limits = contract.action_limits();
@@ -197,17 +198,17 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             limits,
             plans: Vec::new(),
             recording: None,
-            onlooker: None,
+            observer: None,
             timing: Timing::default(),
         }
     }
 
-    /// Keeps the control steps of the episodes to come, for [`take_recording`](Self::take_recording).
+    /// Records the control steps of the episodes that follow, for [`take_recording`](Self::take_recording).
     pub fn record(&mut self) {
         self.recording = Some(Vec::new());
     }
 
-    /// The control steps of the last episode; empty where none were kept.
+    /// Takes the recorded control steps of the last episode; empty unless [`record`](Self::record) was called.
     pub fn take_recording(&mut self) -> Vec<Step> {
         self.recording
             .as_mut()
@@ -215,7 +216,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             .unwrap_or_default()
     }
 
-    /// What the last episode came to as far as it got, also where [`run`](Self::run) has failed.
+    /// Outcome of the last episode as far as it got, also where [`run`](Self::run) has failed.
     pub fn outcome(&self, task: &Task<'_>) -> Episode {
         Episode {
             steps: self.environment.steps(),
@@ -226,9 +227,9 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         }
     }
 
-    /// Lets someone look on at the policy's episodes to come.
-    pub fn show(&mut self, onlooker: Option<&'e dyn Onlooker>) {
-        self.onlooker = onlooker;
+    /// Sets the observer of the episodes that follow; `None` removes it.
+    pub fn set_observer(&mut self, observer: Option<&'e dyn Observer>) {
+        self.observer = observer;
     }
 
     /// Runs one episode to its end: the instruction is carried out, or the steps or the commanded plans are used up.
@@ -243,7 +244,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         Ok(episode)
     }
 
-    /// An episode; `None` if who looks on wants it again.
+    /// Runs the episode once; `None` if the observer asked for a restart.
     fn attempt(&mut self, task: &Task<'_>) -> Result<Option<Episode>, RolloutError> {
         if let Some(recording) = &mut self.recording {
             recording.clear();
@@ -270,10 +271,10 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
                     let fresh = selected.filter(|selected| selected.fresh);
                     self.plans.extend(fresh.map(|selected| selected.index));
                     let plan = selected.map(|selected| selected.index);
-                    match self.look(task, Stand::Acting { plan }) {
-                        Go::On => {}
-                        Go::Again => return Ok(None),
-                        Go::Stop => return Err(RolloutError::Stopped),
+                    match self.observe(task, Phase::Acting { plan }) {
+                        Control::Continue => {}
+                        Control::Restart => return Ok(None),
+                        Control::Stop => return Err(RolloutError::Stopped),
                     }
                     let before_cpu = cpu_time();
                     link.actuate(&self.action, &mut self.executed);
@@ -287,16 +288,16 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             step += 1;
         }
         let success = self.succeeded(task);
-        let go = self.look(task, Stand::Ended { success });
-        Ok((go != Go::Again).then(|| self.outcome(task)))
+        let control = self.observe(task, Phase::Ended { success });
+        Ok((control != Control::Restart).then(|| self.outcome(task)))
     }
 
-    /// Shows the episode as it stands to who looks on.
-    fn look(&mut self, task: &Task<'_>, stand: Stand) -> Go {
-        self.onlooker.map_or(Go::On, |onlooker| {
-            onlooker.look(Glimpse {
+    /// Passes the episode's state to the observer, if there is one.
+    fn observe(&mut self, task: &Task<'_>, phase: Phase) -> Control {
+        self.observer.map_or(Control::Continue, |observer| {
+            observer.observe(Snapshot {
                 task,
-                stand,
+                phase,
                 environment: &mut *self.environment,
             })
         })
@@ -330,7 +331,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         Ok(())
     }
 
-    /// The policy's action for what it sees: what was selected for it, and how long that took in nanoseconds.
+    /// Asks the policy for an action: returns its selection, and the time that it took in nanoseconds.
     fn decide(
         &mut self,
         step: usize,
@@ -373,13 +374,13 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         Ok((selected, elapsed_ns))
     }
 
-    /// Lets what the policy sees follow the environment, as far as the link lets it through.
+    /// Updates what the policy sees from the environment, through the link's faults.
     fn sense(&mut self, link: &mut Link) {
         let (observation, state) = (self.environment.observation(), self.environment.state());
         link.sense(observation, state, &mut self.observation);
     }
 
-    /// Hands the environment the action that the actuators execute.
+    /// Applies the executed action to the environment.
     fn execute(&mut self, step: usize) -> Result<(), RolloutError> {
         for (command, &action) in self.command.iter_mut().zip(&self.executed) {
             *command = f64::from(action);
@@ -390,7 +391,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         Ok(())
     }
 
-    /// Records the step, where steps are kept.
+    /// Records the control step, if steps are recorded.
     fn keep(&mut self, selected: Option<Selected>, controller_ns: u64, commanded: bool) {
         let Some(recording) = &mut self.recording else {
             return;

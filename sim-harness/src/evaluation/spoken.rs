@@ -1,4 +1,4 @@
-//! Instructions that are not taken from the bundle's table: sentences in any words, and known ones that the language encoder hears anew.
+//! Instructions from outside the bundle's table: sentences in any words, and known ones that the language encoder encodes again.
 //!
 //! A sentence outside the table commands no sub-tasks of its own. Without any, its episodes last their full time and have no success rate;
 //! with some, they start, last and succeed as the benchmark's episodes of these sub-tasks. What can fail: a sub-task that nobody knows, and
@@ -19,11 +19,11 @@ use crate::results::{Asked, InstructionResult};
 /// Id and split of a sentence outside the table, in results.
 pub const FREE: &str = "free";
 
-/// Word embeddings by instruction, heard instead of the table's.
+/// Word embeddings by instruction, which replace those of the table.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct WordBook {
     words: BTreeMap<u32, Vec<f32>>,
-    /// The sentence outside the table, if one is said; its number is the table's length.
+    /// The sentence outside the table, if there is one; its number is the table's length.
     pub sentence: Option<Sentence>,
 }
 
@@ -33,32 +33,32 @@ impl WordBook {
         self.words.insert(instruction, words);
     }
 
-    /// The embeddings of an instruction; `None` where the table's are heard.
+    /// Returns the embeddings of an instruction; `None` where those of the table are used.
     pub fn of(&self, instruction: u32) -> Option<&[f32]> {
         self.words.get(&instruction).map(Vec::as_slice)
     }
 }
 
-/// Sub-tasks by which a sentence is judged are named wrongly.
+/// Why the sub-tasks by which a sentence is judged cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum SubTaskError {
-    /// There are none.
+    /// No sub-task was named.
     #[error("no sub-task is named; name some of: {known}")]
     None {
-        /// All that the environment watches.
+        /// All sub-tasks that the environment watches.
         known: String,
     },
-    /// The environment does not watch one.
+    /// The environment does not watch the named sub-task.
     #[error("the environment watches no sub-task '{name}'; name some of: {known}")]
     Unknown {
-        /// The sub-task.
+        /// The named sub-task.
         name: String,
-        /// All that the environment watches.
+        /// All sub-tasks that the environment watches.
         known: String,
     },
 }
 
-/// A sentence outside the table, and what it is judged by.
+/// A sentence outside the table, and the sub-tasks that it is judged by.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Sentence {
     text: String,
@@ -67,7 +67,7 @@ pub struct Sentence {
 }
 
 impl Sentence {
-    /// A sentence with the sub-tasks, separated by commas, that it is judged by.
+    /// Makes a sentence that is judged by the comma-separated `sub_tasks`.
     pub fn new(
         text: &str,
         sub_tasks: Option<&str>,
@@ -100,8 +100,8 @@ impl Sentence {
         })
     }
 
-    /// Its episodes: numbered behind the table, and as long as those of the first known instruction with the same sub-tasks; where there is
-    /// none, as long as the benchmark's longest.
+    /// Assignment of the sentence's episodes: numbered behind the table, and as long as those of the first known instruction with the same
+    /// sub-tasks; where there is none, as long as the benchmark's longest.
     pub fn assignment(&self, contract: &Contract, environment: &dyn Environment) -> Assignment {
         let set = |names: &[String]| names.iter().cloned().collect::<BTreeSet<_>>();
         let own = set(&self.sub_tasks);
@@ -120,7 +120,7 @@ impl Sentence {
         }
     }
 
-    /// As an instruction of the table would be evaluated.
+    /// Describes how the sentence is evaluated, in the same form as an instruction of the table.
     pub fn asked(&self) -> Asked<'_> {
         Asked {
             id: FREE,
@@ -131,7 +131,7 @@ impl Sentence {
     }
 }
 
-/// The number of the known instruction that `words` are most like, and how much: [`similarity::alignment`].
+/// Finds the known instruction that `words` are most like, and their similarity: [`similarity::alignment`].
 pub fn nearest(contract: &lads_core::Contract<'_>, words: &[f32]) -> Option<(usize, f32)> {
     let known = contract.instructions().map(|known| known.words);
     similarity::nearest(words, known, contract.word_dim())
@@ -140,18 +140,18 @@ pub fn nearest(contract: &lads_core::Contract<'_>, words: &[f32]) -> Option<(usi
 /// Why a sentence is not followed.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum Unaccepted {
-    /// It is less like the nearest known instruction than the bundle asks for.
+    /// The similarity to the nearest known instruction is below the bundle's threshold.
     #[error("the bundle follows a sentence from {threshold:.3} on")]
     Below {
         /// The contract's threshold.
         threshold: f32,
     },
-    /// Nobody has calibrated from where on it may be followed.
+    /// The bundle has no calibrated threshold.
     #[error("the bundle's contract does not say from where on it follows one")]
     Uncalibrated,
 }
 
-/// Whether a sentence of this similarity to the nearest known instruction is followed.
+/// Decides whether a sentence of this similarity to the nearest known instruction is followed.
 pub fn accept(acceptance: Option<&Acceptance>, similarity: f32) -> Result<(), Unaccepted> {
     let threshold = acceptance.ok_or(Unaccepted::Uncalibrated)?.threshold;
     if similarity >= threshold {
@@ -161,7 +161,8 @@ pub fn accept(acceptance: Option<&Acceptance>, similarity: f32) -> Result<(), Un
     }
 }
 
-/// What a sentence that names no sub-tasks has completed, as a line: all, and what of it the nearest known instruction does not ask for.
+/// Describes in one line what a sentence that names no sub-tasks has completed: all, and what of it the nearest known instruction does not
+/// ask for.
 ///
 /// Nobody said what the sentence asks for; beside the nearest instruction a person sees what was done un-instructed.
 pub fn completed(nearest: &Asked<'_>, result: &InstructionResult) -> String {

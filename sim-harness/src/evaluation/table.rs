@@ -1,11 +1,11 @@
-//! The report as text, for people. Everything in it is in the JSON too.
+//! Formats results as text, for people. Everything in it is in the JSON too.
 
 use std::fmt::{self, Display, Formatter};
 
 use crate::results::{InstructionResult, Results, SplitResult, SubTaskRate};
 use lads_proof::timing::Latency;
 
-/// Writes itself as a table of a few lines per instruction, then the splits, latency and time.
+/// Formats results as a table of a few lines per instruction, then the splits, latency and time.
 pub struct Table<'r>(pub &'r Results);
 
 impl Display for Table<'_> {
@@ -145,7 +145,7 @@ fn split_block(split: &str, result: &SplitResult, f: &mut Formatter<'_>) -> fmt:
     writeln!(f)
 }
 
-/// Of a sentence that commands nothing.
+/// Writes the completions of a sentence that commands nothing.
 fn completions_alone(result: &SplitResult, f: &mut Formatter<'_>) -> fmt::Result {
     for SubTaskRate { sub_task, rate } in &result.un_instructed_completions {
         writeln!(
@@ -205,7 +205,7 @@ fn time(results: &Results, f: &mut Formatter<'_>) -> fmt::Result {
     writeln!(f)
 }
 
-/// A rate, or a dash without episodes; 5 columns.
+/// Formats a rate, or a dash without episodes, in 5 columns.
 struct Number(Option<f64>);
 
 impl Display for Number {

@@ -1,5 +1,4 @@
-//! A state of the simulator as a picture, drawn off-screen through EGL, for films and for the viewer's window. What can fail: no EGL, no
-//! such camera.
+//! Draws a state of the simulator off-screen through EGL, for films and for the viewer's window. What can fail: no EGL, no such camera.
 //!
 //! Mesa draws in software where there is no GPU; shadows and smoothed edges at the resolution that the scenes ask for would take it a
 //! second per picture, so the camera leaves shadows out and takes fewer samples. Making a camera takes about a second.
@@ -14,33 +13,33 @@ use mujoco_rs::wrappers::{MjData, MjModel};
 use super::FilmError;
 use crate::environment::{Environment, Stage, View};
 
-/// Edge of the shadow map in texels: no shadows.
+/// Edge of the shadow map in texels; 0 draws no shadows.
 const SHADOW_SIZE: i32 = 0;
-/// Samples per pixel.
+/// Number of samples per pixel.
 const SAMPLES: i32 = 4;
 
-/// Draws pictures of one size.
+/// Draws pictures of one size of the simulator's state.
 pub struct Camera {
     renderer: MjRenderer,
     model: MjModel,
     size: [u32; 2],
 }
 
-/// How a free camera moves.
+/// Motions of a free camera.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Motion {
-    /// Around the point that it looks at.
+    /// Turns around the point that the camera looks at.
     Turn,
-    /// With that point, across the picture.
+    /// Moves camera and that point across the picture.
     Shift,
-    /// With that point, over the floor.
+    /// Moves camera and that point over the floor.
     Glide,
-    /// To or from that point.
+    /// Moves the camera towards the point that it looks at, or away from it.
     Zoom,
 }
 
 impl Camera {
-    /// A camera in the scene of `environment`, for pictures of `width` by `height` pixels.
+    /// Makes a camera in the scene of `environment`, for pictures of `width` by `height` pixels.
     pub fn new(environment: &mut dyn Environment, size: [u32; 2]) -> Result<Self, FilmError> {
         let stage = stage(environment)?;
         let model = MjModel::clone(stage.data.model());
@@ -48,7 +47,7 @@ impl Camera {
         Self::build(model, camera, size)
     }
 
-    /// The same, but one that [`steer`](Self::steer) moves: a camera of the scene is replaced by a free one where it is after a reset.
+    /// Makes a camera that [`steer`](Self::steer) can move: a camera of the scene is replaced by a free one at its place after a reset.
     pub fn free(environment: &mut dyn Environment, size: [u32; 2]) -> Result<Self, FilmError> {
         let stage = stage(environment)?;
         let mut model = MjModel::clone(stage.data.model());
@@ -82,13 +81,13 @@ impl Camera {
         })
     }
 
-    /// Takes pictures of another size from now on.
+    /// Sets the size of the following pictures.
     pub fn resize(&mut self, size: [u32; 2]) -> Result<(), FilmError> {
         *self = Self::build(self.model.clone(), self.renderer.camera().clone(), size)?;
         Ok(())
     }
 
-    /// Width and height of its pictures in pixels.
+    /// Width and height of the pictures in pixels.
     pub fn size(&self) -> [u32; 2] {
         self.size
     }
@@ -105,27 +104,28 @@ impl Camera {
         camera.move_(action, &self.model, right, down);
     }
 
-    /// Looks at the state of the simulator as it is now.
+    /// Takes over the simulator's present state, to be drawn.
     pub fn see(&mut self, data: &mut MjData<Arc<MjModel>>) -> Result<(), FilmError> {
         let seen = self.renderer.sync_data(data);
         seen.map_err(|error| FilmError::Draw(whole(&error)))
     }
 
-    /// Draws what it saw last: rows from the top, three bytes (red, green, blue) per pixel.
+    /// Draws the state that [`see`](Self::see) took over: rows from the top, three bytes (red, green, blue) per pixel.
     pub fn draw(&mut self) -> Result<&[u8], FilmError> {
         let drawn = self.renderer.render();
         drawn.map_err(|error: RendererError| FilmError::Draw(whole(&error)))?;
         Ok(self.renderer.rgb_flat().unwrap_or_default())
     }
 
-    /// The state of `environment` as it is now, as [`draw`](Self::draw) gives it.
+    /// Draws the present state of `environment`, in the form of [`draw`](Self::draw).
     pub fn shoot(&mut self, environment: &mut dyn Environment) -> Result<&[u8], FilmError> {
         self.see(stage(environment)?.data)?;
         self.draw()
     }
 }
 
-/// A free camera where a fixed one is, with its field of view; it turns around the point before it that is nearest to the scene's middle.
+/// Makes a free camera at the place of a fixed one, with its field of view; it turns around the point before it that is nearest to the
+/// scene's middle.
 fn freed(fixed: &MjvCamera, data: &MjData<Arc<MjModel>>, model: &mut MjModel) -> MjvCamera {
     let (at, forward, ..) = fixed.frame(data);
     let middle = &model.stat().center;
@@ -176,7 +176,7 @@ fn camera(model: &MjModel, view: View) -> Result<MjvCamera, FilmError> {
     }
 }
 
-/// An error with its causes, in one line.
+/// Formats an error with its causes, in one line.
 fn whole(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut cause = error.source();

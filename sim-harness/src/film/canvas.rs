@@ -7,7 +7,7 @@ use embedded_graphics::draw_target::DrawTarget;
 use embedded_graphics::geometry::{OriginDimensions, Size};
 use embedded_graphics::pixelcolor::{Rgb888, RgbColor as _};
 
-/// A picture.
+/// A picture of red, green and blue bytes.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Canvas {
     width: u32,
@@ -16,23 +16,23 @@ pub struct Canvas {
 }
 
 impl Canvas {
-    /// A black picture.
+    /// Makes a black picture.
     pub fn new(width: u32, height: u32) -> Self {
         let rgb = vec![0; 3 * width as usize * height as usize];
         Self { width, height, rgb }
     }
 
-    /// Its width and height in pixels.
+    /// Width and height of the picture in pixels.
     pub fn size(&self) -> [u32; 2] {
         [self.width, self.height]
     }
 
-    /// Three bytes per pixel.
+    /// Bytes of the picture, three per pixel.
     pub fn rgb(&self) -> &[u8] {
         &self.rgb
     }
 
-    /// The pixel in column `x` and row `y` as the number `0xRRGGBB`; black outside.
+    /// Returns the pixel in column `x` and row `y` as the number `0xRRGGBB`; black outside.
     pub fn pixel(&self, x: u32, y: u32) -> u32 {
         let start = 3 * (y as usize * self.width as usize + x as usize);
         match self.rgb.get(start..start + 3) {
@@ -41,12 +41,12 @@ impl Canvas {
         }
     }
 
-    /// Makes it black.
+    /// Makes the picture black.
     pub fn clear(&mut self) {
         self.rgb.fill(0);
     }
 
-    /// Lays another picture of `width` pixels per row over it, with its upper left corner at (`left`, `top`).
+    /// Copies a picture of `width` pixels per row into this one, with its upper left corner at (`left`, `top`).
     pub fn paste(&mut self, rgb: &[u8], width: u32, left: u32, top: u32) {
         let row_len = 3 * self.width as usize;
         let rows = self.rgb.chunks_exact_mut(row_len).skip(top as usize);

@@ -1,5 +1,5 @@
-//! What is written around a picture: above, the instruction; below, control step and plan, the sub-tasks, and the plans as a strip of
-//! colours along the episode. What can fail: nothing; text that does not fit ends in "...".
+//! Captions around a picture: above, the instruction; below, control step and plan, the sub-tasks, and the plans as a strip of colours
+//! along the episode. What can fail: nothing; text that does not fit ends in "...".
 
 use embedded_graphics::Drawable;
 use embedded_graphics::geometry::{Point, Size};
@@ -11,11 +11,11 @@ use embedded_graphics::text::{Alignment, Baseline, Text, TextStyleBuilder};
 
 use super::canvas::Canvas;
 use crate::environment::Completion;
-use crate::rollout::Stand;
+use crate::rollout::Phase;
 
-/// Height above the picture, in pixels.
+/// Height of the caption above the picture, in pixels.
 pub const HEAD: u32 = 48;
-/// Height below it.
+/// Height of the caption below the picture, in pixels.
 pub const FOOT: u32 = 80;
 
 /// Height of a line that [`line()`] writes.
@@ -30,9 +30,9 @@ const PAPER: Rgb888 = Rgb888::new(22, 24, 29);
 const INK: Rgb888 = Rgb888::new(240, 240, 240);
 const FAINT: Rgb888 = Rgb888::new(130, 134, 142);
 const DONE: Rgb888 = Rgb888::new(80, 200, 120);
-/// Done without having been asked for.
+/// Colour of sub-tasks that were completed without having been commanded.
 const UNASKED: Rgb888 = Rgb888::new(240, 150, 60);
-/// Colours of plans, which they share in turn: those of Okabe and Ito.
+/// Colours of plans, by Okabe and Ito; plans share them in turn.
 const PLANS: [Rgb888; 7] = [
     Rgb888::new(86, 180, 233),
     Rgb888::new(230, 159, 0),
@@ -43,38 +43,38 @@ const PLANS: [Rgb888; 7] = [
     Rgb888::new(204, 121, 167),
 ];
 
-/// Every colour that captions have.
+/// All colours that captions use.
 pub fn colors() -> impl Iterator<Item = [u8; 3]> {
     let own = [PAPER, INK, FAINT, DONE, UNASKED];
     let all = own.into_iter().chain(PLANS);
     all.map(|color| [color.r(), color.g(), color.b()])
 }
 
-/// What there is to write about an episode.
+/// Texts and sizes of the captions of an episode.
 pub struct Caption<'c> {
-    /// The instruction's text.
+    /// Text of the instruction.
     pub instruction: &'c str,
     /// Names of all sub-tasks.
     pub sub_tasks: &'c [&'static str],
-    /// Which of them the instruction commands.
+    /// Indices of the sub-tasks that the instruction commands.
     pub commanded: &'c [usize],
-    /// Control steps in all: the width of the strip.
+    /// Number of control steps in all: the width of the strip.
     pub steps: usize,
     /// Control period in seconds.
     pub period_s: f64,
-    /// Written beside the status.
+    /// Note beside the status.
     pub note: &'c str,
 }
 
-/// An episode at a state on its way.
+/// Progress of an episode at one of its states.
 #[derive(Debug, Clone, Copy)]
 pub struct Progress<'p> {
-    /// The plan of every control step that was executed, where there is one.
+    /// Plan of every control step that was executed, where there is one.
     pub plans: &'p [Option<u32>],
     /// Completions so far.
     pub completions: &'p [Completion],
-    /// What comes next.
-    pub stand: Stand,
+    /// Phase of the episode: what comes next.
+    pub phase: Phase,
 }
 
 /// Writes a line across the picture whose upper edge is at `top`.
@@ -90,7 +90,7 @@ pub fn line(text: &str, top: u32, canvas: &mut Canvas) {
     );
 }
 
-/// A sub-task as it stands.
+/// A sub-task's text and colour in its present state.
 struct Mark {
     text: String,
     color: Rgb888,
@@ -98,7 +98,7 @@ struct Mark {
 }
 
 impl Caption<'_> {
-    /// Writes everything around the picture, down to `bottom`.
+    /// Draws all captions around the picture, down to `bottom`.
     pub fn draw(&self, progress: Progress<'_>, bottom: u32, canvas: &mut Canvas) {
         let [width, _] = canvas.size();
         let foot = bottom.saturating_sub(FOOT);
@@ -120,17 +120,17 @@ impl Caption<'_> {
     fn status(&self, progress: Progress<'_>, top: i32, canvas: &mut Canvas) {
         let (number, all) = (progress.plans.len(), self.steps);
         let at = number as f64 * self.period_s;
-        let state = match progress.stand {
-            Stand::Acting { plan } => {
+        let state = match progress.phase {
+            Phase::Acting { plan } => {
                 plan.map_or_else(String::new, |plan| format!("plan {plan:>3}"))
             }
-            Stand::Ended { .. } if self.commanded.is_empty() => "ended".to_owned(),
-            Stand::Ended { success: true } => "carried out".to_owned(),
-            Stand::Ended { success: false } => "not carried out".to_owned(),
+            Phase::Ended { .. } if self.commanded.is_empty() => "ended".to_owned(),
+            Phase::Ended { success: true } => "carried out".to_owned(),
+            Phase::Ended { success: false } => "not carried out".to_owned(),
         };
         let text = format!("step {number:>3} of {all}  {at:>5.2} s  {state}");
         write(canvas, &FONT_8X13, INK, Point::new(MARGIN, top), &text);
-        if let Stand::Acting { plan: Some(plan) } = progress.stand {
+        if let Phase::Acting { plan: Some(plan) } = progress.phase {
             let x = MARGIN + FONT_8X13.character_size.width as i32 * (text.len() as i32 + 1);
             fill(canvas, Point::new(x, top + 1), [11, 11], plan_color(plan));
         }
@@ -145,7 +145,7 @@ impl Caption<'_> {
         }
     }
 
-    /// The sub-tasks, commanded ones first, in as many rows as there are.
+    /// Draws the sub-tasks, commanded ones first, in as many rows as there are.
     fn marks(&self, progress: Progress<'_>, mut top: i32, strip: u32, canvas: &mut Canvas) {
         let [width, _] = canvas.size();
         let mut left = MARGIN;
@@ -199,7 +199,7 @@ impl Caption<'_> {
         asked.chain(unasked).collect()
     }
 
-    /// The plan in force at each step so far, as a colour, and completions as white lines.
+    /// Draws the plan in force at each step so far, as a colour, and completions as white lines.
     fn strip(&self, progress: Progress<'_>, top: u32, canvas: &mut Canvas) {
         let width = canvas.size()[0];
         let all = self.steps.max(1);
@@ -219,7 +219,7 @@ impl Caption<'_> {
     }
 }
 
-/// The colour of a plan in pictures; plans share the few colours that stay apart for most eyes.
+/// Colour of a plan in pictures; plans share the few colours that stay apart for most eyes.
 fn plan_color(plan: u32) -> Rgb888 {
     PLANS[plan as usize % PLANS.len()]
 }
@@ -236,7 +236,7 @@ fn write(canvas: &mut Canvas, font: &MonoFont<'_>, color: Rgb888, at: Point, tex
     let Ok(_) = Text::with_baseline(text, at, style, Baseline::Top).draw(canvas);
 }
 
-/// Lines of at most `columns` characters, broken at spaces; what does not fit into `lines` of them ends in "...".
+/// Breaks text at spaces into lines of at most `columns` characters; what does not fit into `lines` of them ends in "...".
 fn wrap(text: &str, columns: usize, lines: usize) -> Vec<String> {
     let mut wrapped = vec![String::new()];
     for word in text.split_whitespace() {

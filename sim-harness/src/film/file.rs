@@ -1,4 +1,4 @@
-//! Pictures on file: an animated GIF, an MP4, or a folder of PNG; whole or not at all.
+//! Writes pictures to an animated GIF, an MP4, or a folder of PNG; complete or not at all.
 //!
 //! Everything goes to a temporary place beside the target, which is renamed when it is complete. What can fail: the file's name, an existing
 //! folder with something in it, no ffmpeg, no room.
@@ -15,31 +15,31 @@ use super::gif::Gif;
 use super::mp4::{self, Mp4};
 use crate::output::{self, Draft};
 
-/// No picture is shown for less than this, in seconds: browsers do not show GIFs faster, and eyes see nothing.
+/// Shortest time that a picture is shown, in seconds: browsers do not show GIFs faster, and eyes see nothing.
 pub const SHORTEST_S: f64 = 0.05;
-/// How long the last picture stays, in seconds.
+/// Time that the last picture stays, in seconds.
 const LAST_S: f64 = 2.0;
 
-/// What pictures become.
+/// Output format of pictures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Form {
-    /// Animated.
+    /// Animated GIF.
     Gif,
-    /// Compressed by ffmpeg.
+    /// MP4, compressed by ffmpeg.
     Mp4,
-    /// A folder of PNG.
+    /// Folder of PNG files.
     Folder,
 }
 
-/// Why pictures cannot go to a place.
+/// Why pictures cannot be written to a path.
 #[derive(Debug, thiserror::Error)]
 pub enum PlaceError {
-    /// The name says no form.
+    /// The path's name implies no format.
     #[error(
         "its name ends neither in .gif nor in .mp4 nor in a slash; end it in a slash for a folder of PNG"
     )]
     Form,
-    /// The folder has something in it.
+    /// The folder is not empty.
     #[error("the folder is not empty; name a new one")]
     NotEmpty,
     /// ffmpeg cannot be run.
@@ -47,13 +47,13 @@ pub enum PlaceError {
         "an MP4 needs the program ffmpeg, which cannot be run ({0}); install it (Debian: apt-get install ffmpeg), or record a .gif"
     )]
     NoFfmpeg(io::Error),
-    /// Nothing can be written there.
+    /// The path cannot be written to.
     #[error("cannot be written ({0}); name a file in an existing, writable folder")]
     Unwritable(io::Error),
 }
 
 impl Form {
-    /// The form that a path asks for, if pictures can go there.
+    /// Finds the format that a path asks for, if pictures can be written there.
     pub fn of(path: &Path) -> Result<Self, PlaceError> {
         let slash = path.as_os_str().as_encoded_bytes().ends_with(b"/");
         let form = match path.extension().and_then(|ending| ending.to_str()) {
@@ -78,7 +78,7 @@ impl Form {
     }
 }
 
-/// The folder behind a symbolic link, where there is one.
+/// Resolves a symbolic link to the folder behind it, where there is one.
 fn behind_link(path: &Path) -> PathBuf {
     fs::canonicalize(path).unwrap_or_else(|_| path.to_owned())
 }
@@ -96,10 +96,10 @@ fn temporary_folder(path: &Path) -> io::Result<TempDir> {
     builder.tempdir_in(folder)
 }
 
-/// Takes pictures, all of one size.
+/// Writes pictures, all of one size.
 pub struct Sink {
     kind: Kind,
-    /// How long a picture is shown, in seconds.
+    /// Time that each picture is shown, in seconds.
     shown_s: f64,
 }
 
@@ -109,16 +109,16 @@ enum Kind {
     Folder { folder: TempDir, count: usize },
 }
 
-/// Complete, and still at a temporary place.
+/// Complete pictures that are still at a temporary path.
 pub enum Finished {
-    /// A file.
+    /// A single file.
     File(Draft),
-    /// A folder.
+    /// A folder of files.
     Folder(TempDir),
 }
 
 impl Sink {
-    /// Opens a temporary place beside `path`. Pictures follow each other after `period_s`, or slower: see [`SHORTEST_S`].
+    /// Opens a temporary file or folder beside `path`. Pictures follow each other after `period_s`, or slower: see [`SHORTEST_S`].
     pub fn new(form: Form, path: &Path, size: [u32; 2], period_s: f64) -> Result<Self, FilmError> {
         let shown_s = shown_s(period_s);
         let kind = match form {
@@ -137,14 +137,14 @@ impl Sink {
         matches!(self.kind, Kind::Gif(_))
     }
 
-    /// Looks at a picture for the colours that there will be.
+    /// Adds the colours of a sample picture to the palette to come.
     pub fn learn(&mut self, canvas: &Canvas) {
         if let Kind::Gif(gif) = &mut self.kind {
             gif.learn(canvas);
         }
     }
 
-    /// Adds a picture; the last one stays.
+    /// Adds a picture; `last` gives it [`LAST_S`].
     pub fn add(&mut self, canvas: &Canvas, last: bool) -> Result<(), FilmError> {
         let seconds = if last { LAST_S } else { self.shown_s };
         match &mut self.kind {
@@ -161,7 +161,7 @@ impl Sink {
         }
     }
 
-    /// Completes what was added.
+    /// Completes the output.
     pub fn finish(self) -> Result<Finished, FilmError> {
         match self.kind {
             Kind::Gif(gif) => gif.finish().map(Finished::File),
@@ -172,7 +172,7 @@ impl Sink {
 }
 
 impl Finished {
-    /// Moves it to its place.
+    /// Moves the complete output to `path`.
     pub fn persist(self, path: &Path) -> Result<(), FilmError> {
         match self {
             Self::File(file) => {
@@ -187,12 +187,12 @@ impl Finished {
     }
 }
 
-/// How long a picture is shown if control steps take `period_s`.
+/// Time that a picture is shown if control steps take `period_s`.
 pub fn shown_s(period_s: f64) -> f64 {
     period_s.max(SHORTEST_S)
 }
 
-/// A picture as PNG.
+/// Encodes a picture as PNG.
 pub fn png(canvas: &Canvas) -> Result<Vec<u8>, FilmError> {
     let mut bytes = Vec::new();
     let [width, height] = canvas.size();
@@ -210,7 +210,7 @@ pub fn png(canvas: &Canvas) -> Result<Vec<u8>, FilmError> {
 mod tests {
     use super::*;
 
-    /// A picture in two colours, which part at column `at`.
+    /// Makes a picture in two colours, which part at column `at`.
     fn picture(at: usize) -> Canvas {
         let mut canvas = Canvas::new(8, 6);
         let ink = super::super::caption::colors().nth(3).unwrap();

@@ -1,4 +1,4 @@
-//! An animated GIF. It has one palette, got from sample pictures, and each picture holds only what changed, so that minutes of a resting
+//! Writes an animated GIF with one palette, made from sample pictures; each picture holds only what changed, so that minutes of a resting
 //! camera stay small. What can fail: no room.
 
 use std::io::BufWriter;
@@ -12,15 +12,15 @@ use super::canvas::Canvas;
 use super::caption;
 use crate::output::{self, Draft};
 
-/// Entries of the palette. The last means "as before"; captions have the ones before it.
+/// Entries of the palette. The last means "unchanged"; captions have the ones before it.
 const ENTRIES: usize = 256;
 const UNCHANGED: u8 = 255;
-/// Bits of each colour channel that the search for the nearest palette entry looks at.
+/// Bits of each colour channel that the search for the nearest palette entry uses.
 const CHANNEL_BITS: u32 = 6;
 
-/// An animated GIF on its way.
+/// An animated GIF that is being written.
 pub(super) struct Gif {
-    /// Until the first picture.
+    /// The file; taken by the encoder at the first picture.
     file: Option<Draft>,
     encoder: Option<Encoder<BufWriter<Draft>>>,
     /// Pixels of sample pictures, four bytes each.
@@ -28,7 +28,7 @@ pub(super) struct Gif {
     quantiser: Option<NeuQuant>,
     /// Nearest palette entry by colour, each sought when it is first seen.
     nearest: Vec<Option<u8>>,
-    /// What is shown.
+    /// The picture that is shown at present.
     shown: Vec<u8>,
 }
 
@@ -50,7 +50,7 @@ impl Gif {
         self.sample.extend(opaque);
     }
 
-    /// Begins the file, with a palette of the sample's colours and the captions'.
+    /// Starts the file, with a palette of the sample's and the captions' colours.
     fn begin(&mut self, file: Draft, size: [u16; 2]) -> Result<(), FilmError> {
         let captions: Vec<[u8; 3]> = caption::colors().collect();
         let colors = ENTRIES - 1 - captions.len();
@@ -106,7 +106,7 @@ impl Gif {
         }
     }
 
-    /// The palette entry nearest to a colour.
+    /// Index of the palette entry nearest to a colour.
     fn index(&mut self, color: [u8; 3]) -> u8 {
         let (quantiser, [r, g, b]) = (&self.quantiser, color);
         let nearest = || {
@@ -128,7 +128,7 @@ impl Gif {
     }
 }
 
-/// Where the palette entry nearest to a colour is kept.
+/// Index in `nearest` of a colour's nearest palette entry.
 fn place(color: [u8; 3]) -> usize {
     color.iter().fold(0, |place, &channel| {
         (place << CHANNEL_BITS) | (channel >> (8 - CHANNEL_BITS)) as usize

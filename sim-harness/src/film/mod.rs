@@ -1,4 +1,4 @@
-//! Pictures of an episode, drawn after it ran.
+//! Films an episode after it ran.
 //!
 //! A film runs the executed actions of a [`Trace`] once more, in an environment of its own, and looks at every state on the way. So
 //! filming cannot change or slow down the rollout, and what is shown is what happened: a second run that ends elsewhere is refused.
@@ -24,35 +24,35 @@ use self::canvas::Canvas;
 use self::caption::{Caption, Progress};
 use self::file::{Finished, Form, Sink, shown_s};
 use crate::environment::{ActionError, Environment, EpisodeSeed};
-use crate::rollout::Stand;
+use crate::rollout::Phase;
 use crate::trace::{Step, Trace};
 
-/// Why there are no pictures.
+/// Why an episode cannot be filmed or drawn.
 #[derive(Debug, Error)]
 pub enum FilmError {
-    /// The environment has nothing to look at.
+    /// The environment has no simulator to draw.
     #[error("environment {0} has no simulator to look into")]
     NoStage(&'static str),
     /// The scene lacks the camera that its environment names.
     #[error("the scene has no camera '{0}' (run \"make setup\" to restore the assets)")]
     NoCamera(&'static str),
-    /// OpenGL without a display cannot be had.
+    /// OpenGL without a display is not available.
     #[error(
         "pictures need OpenGL without a display, by EGL: {0}; install it (Debian: apt-get install libegl1 libgl1-mesa-dri)"
     )]
     NoEgl(String),
-    /// Drawing failed later on.
+    /// Drawing failed later than at the start.
     #[error("a picture cannot be drawn: {0}")]
     Draw(String),
-    /// The environment refuses what it once executed.
+    /// The environment refused an action that it executed in the first run.
     #[error("control step {step} cannot be run again: {error}")]
     Action {
         /// Control step, from 0.
         step: usize,
-        /// The environment's reason.
+        /// The environment's error.
         error: ActionError,
     },
-    /// The second run is another episode.
+    /// The second run ended in another state than the first.
     #[error(
         "the episode ended elsewhere when it was run again: it is not the one that was recorded"
     )]
@@ -60,24 +60,24 @@ pub enum FilmError {
     /// The file cannot be written.
     #[error("cannot be written ({0}); name a file in an existing, writable folder with room")]
     Write(#[from] std::io::Error),
-    /// The program that compresses films failed.
+    /// The program that compresses films, ffmpeg, failed.
     #[error("ffmpeg cannot make it: {0}")]
     Ffmpeg(String),
-    /// It was told to stop.
+    /// Filming was stopped by the caller.
     #[error("interrupted")]
     Interrupted,
 }
 
-/// A state on the way: before control step `number`, or, with `step` none, after the last.
+/// A state of the episode: before control step `number`, or, if `step` is `None`, after the last.
 #[derive(Debug, Clone, Copy)]
 pub struct Moment<'t> {
-    /// Control steps executed so far.
+    /// Number of control steps executed so far.
     pub number: usize,
-    /// What the policy does next.
+    /// The policy's next control step.
     pub step: Option<&'t Step>,
 }
 
-/// What is done at every moment.
+/// Callback for every state of a second run.
 pub type Look<'l> = dyn FnMut(Moment<'_>, &mut dyn Environment) -> Result<(), FilmError> + 'l;
 
 /// Runs the executed actions of `trace` again and calls `look` at every state, the first and the last included. `commanded` are the
@@ -125,24 +125,24 @@ pub fn play(
 /// Width and height of the simulator's pictures in a film, in pixels.
 pub const PICTURE: [u32; 2] = [640, 480];
 
-/// Pictures that a GIF's palette is got from.
+/// Number of pictures that a GIF's palette is made from.
 const SAMPLES: usize = 8;
 
 /// An episode to be filmed.
 pub struct Scene<'s> {
-    /// What happened.
+    /// Recorded control steps of the episode.
     pub trace: &'s Trace,
-    /// Text of its instruction.
+    /// Text of the episode's instruction.
     pub instruction: &'s str,
-    /// The environment's indices of the sub-tasks that it commands.
+    /// The environment's indices of the sub-tasks that the instruction commands.
     pub commanded: &'s [usize],
     /// Seed of the run.
     pub seed: u64,
 }
 
 impl Scene<'_> {
-    /// Films the episode in `environment`, every control step, with captions; `camera` takes pictures of size [`PICTURE`]. What comes back is
-    /// complete and beside `path`. `taken` is called after each picture, `stop` ends the work early.
+    /// Films the episode in `environment`, every control step, with captions; `camera` takes pictures of size [`PICTURE`]. What comes back
+    /// is complete and beside `path`. `taken` is called after each picture, `stop` ends the work early.
     pub fn film(
         &self,
         environment: &mut dyn Environment,
@@ -200,7 +200,7 @@ impl Scene<'_> {
         sink.finish()
     }
 
-    /// How far the episode is at a moment, with the plans of all its control steps.
+    /// Progress of the episode at a moment, given the plans of all its control steps.
     fn progress<'p>(&'p self, moment: Moment<'_>, plans: &'p [Option<u32>]) -> Progress<'p> {
         let outcome = &self.trace.outcome;
         let done = &outcome.completions;
@@ -209,9 +209,9 @@ impl Scene<'_> {
         Progress {
             plans: plans.get(..moment.number).unwrap_or(plans),
             completions: done.get(..done_len).unwrap_or(done),
-            stand: moment
+            phase: moment
                 .step
-                .map_or(Stand::Ended { success }, |step| Stand::Acting {
+                .map_or(Phase::Ended { success }, |step| Phase::Acting {
                     plan: step.plan,
                 }),
         }

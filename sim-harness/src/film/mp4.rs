@@ -1,5 +1,5 @@
-//! An MP4, compressed by the program `ffmpeg`: no encoder in pure Rust makes what every player and browser shows. What can fail: no ffmpeg,
-//! one that cannot make it, no room.
+//! Writes an MP4 with the program `ffmpeg`: no encoder in pure Rust makes a format that every player and browser shows. What can fail: no
+//! ffmpeg, one that cannot make it, no room.
 
 use std::io::{self, Write as _};
 use std::os::unix::process::CommandExt as _;
@@ -23,13 +23,13 @@ pub(super) fn check() -> io::Result<()> {
     Ok(())
 }
 
-/// An MP4 on its way through ffmpeg.
+/// An MP4 that is being written through ffmpeg.
 pub(super) struct Mp4 {
     ffmpeg: Ffmpeg,
     file: Draft,
 }
 
-/// The running program, which ends with us.
+/// The running program, which is killed when this is dropped.
 struct Ffmpeg(Child);
 
 impl Drop for Ffmpeg {
@@ -96,7 +96,7 @@ impl Mp4 {
         })
     }
 
-    /// Ends the input and takes the last line that it said.
+    /// Closes the program's input and returns the last line that it printed.
     fn said(&mut self) -> String {
         drop(self.ffmpeg.0.stdin.take());
         let text = self.ffmpeg.0.stderr.take().map(io::read_to_string);

@@ -9,14 +9,14 @@ use super::{FilmError, Moment, Scene, play};
 use crate::environment::Environment;
 use crate::report::Still;
 
-/// Width and height of a picture, in pixels; the page shows it small, and in this size when it is enlarged.
+/// Width and height of a picture, in pixels; the page shows it smaller, and in this size when it is enlarged.
 pub const STILL: [u32; 2] = [640, 480];
 
-/// Quality of the pictures in per cent.
+/// JPEG quality of the pictures in per cent.
 const QUALITY: u8 = 80;
 
 impl Scene<'_> {
-    /// The episode in a few pictures; `camera` takes them of size [`STILL`].
+    /// Draws the episode in a few pictures; `camera` takes them of size [`STILL`].
     pub fn strip(
         &self,
         environment: &mut dyn Environment,

@@ -1,4 +1,4 @@
-//! Episodes that are kept: in memory, in files, replayed, and as sequences of plans.
+//! Recorded episodes: in memory, in files, replayed, and as sequences of plans.
 
 pub mod plans;
 pub mod replay;

@@ -1,9 +1,9 @@
-//! Sequences of plans: got from recorded episodes by the trajectory encoder, stored in a file, and given to the policy to follow.
+//! Sequences of plans: derived from recorded episodes by the trajectory encoder, stored in a file, and given to the policy to follow.
 //!
 //! The encoder maps a segment of observations and actions to the plan that it shows (the paper's equation 2 and the nearest plan). Steps of a
 //! recording beyond its last full segment have the plan of the segment that ends with the last step, so that whoever follows the plans
 //! acts until the recording's end. What can fail: a policy without an encoder or that follows no plans, a recording of other lengths, a
-//! file that is none or asks for what the policy does not have.
+//! file that is not one or asks for what the policy does not have.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -24,77 +24,77 @@ pub const FORMAT: &str = "lads-plans";
 /// Version of the file's form.
 pub const FORMAT_VERSION: u32 = 1;
 
-/// The plans of one episode, as in a file.
+/// Plans of one episode, as in a file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PlanSequence {
-    /// The instruction, by its text or its id in the contract.
+    /// Instruction of the episode, by its text or its id in the contract.
     pub instruction: String,
     /// Number of the episode; left out, the plans are for every episode of the instruction.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub episode: Option<u32>,
-    /// Their indices.
+    /// Indices of the plans.
     pub plans: Vec<u32>,
 }
 
-/// A file of plans.
+/// A file of plan sequences.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PlanFile {
-    /// [`FORMAT`].
+    /// Always [`FORMAT`].
     pub format: String,
-    /// [`FORMAT_VERSION`].
+    /// Always [`FORMAT_VERSION`].
     pub format_version: u32,
-    /// Control steps that each plan is for.
+    /// Number of control steps that each plan is for.
     #[serde(rename = "horizon")]
     pub period: usize,
-    /// The sequences.
+    /// Sequences of plans, by episode.
     pub episodes: Vec<PlanSequence>,
 }
 
-/// Why plans cannot be had or followed.
+/// Why plans cannot be derived or followed.
 #[derive(Debug, Error)]
 pub enum PlanError {
     /// The file cannot be read.
     #[error("{0}")]
     Read(std::io::Error),
-    /// It is no file of plans.
-    #[error("it is no {FORMAT} file of version {FORMAT_VERSION} ({0})")]
+    /// The file is not a file of plans.
+    #[error("it is not a {FORMAT} file of version {FORMAT_VERSION} ({0})")]
     Form(String),
-    /// It was made for another policy.
+    /// The plans' period is not the policy's.
     #[error("its plans are for {file} control steps each, the policy's for {policy}")]
     Period {
-        /// What the file says.
+        /// Period in the file, in control steps.
         file: usize,
-        /// The policy's.
+        /// Period of the policy, in control steps.
         policy: usize,
     },
-    /// The policy cannot follow any.
+    /// The policy cannot follow plans.
     #[error("the policy follows no plans: {0}")]
     Follow(FollowError),
     /// The policy does not know an instruction.
     #[error("the policy does not know the instruction '{0}'")]
     Instruction(String),
-    /// The policy does not have a plan.
+    /// A plan's index is beyond the policy's codebook.
     #[error("plan {plan} of '{instruction}': the policy has {size}")]
     Plan {
-        /// The plan.
+        /// Index of the plan.
         plan: u32,
-        /// Whose it is.
+        /// Instruction of the plan's sequence.
         instruction: String,
-        /// Plans of the policy.
+        /// Number of plans of the policy.
         size: usize,
     },
     /// A sequence has no plans.
     #[error("'{0}' has no plans")]
     Empty(String),
-    /// The same episode twice.
+    /// An episode has two sequences.
     #[error("'{0}' has plans for the same episode twice")]
     Twice(String),
     /// There is no memory for the policy's controller.
     #[error(transparent)]
     Memory(MemoryError),
-    /// The encoder refused.
+    /// The trajectory encoder refused a segment.
     #[error("the trajectory encoder: {0}")]
     Encode(EncodeError),
 }
@@ -107,7 +107,7 @@ pub struct PlanBook {
 }
 
 impl PlanFile {
-    /// Plans of episodes, one sequence each.
+    /// Makes a file from sequences of plans, one per episode.
     pub fn new(period: usize, episodes: Vec<PlanSequence>) -> Self {
         Self {
             format: FORMAT.to_owned(),
@@ -117,7 +117,7 @@ impl PlanFile {
         }
     }
 
-    /// Reads a file.
+    /// Reads a plan file.
     pub fn read(path: &Path) -> Result<Self, PlanError> {
         let text = lads_host::input::read_to_string(path).map_err(PlanError::Read)?;
         let file: Self =
@@ -172,7 +172,7 @@ impl PlanFile {
 }
 
 impl PlanBook {
-    /// The plans of an episode: its own, or those for every episode of the instruction.
+    /// Returns the plans of an episode: its own, or those for every episode of the instruction.
     pub fn of(&self, instruction: u32, episode: u32) -> Option<Commanded<'_>> {
         let own = self.sequences.get(&(instruction, Some(episode)));
         let plans = own.or_else(|| self.sequences.get(&(instruction, None)))?;
@@ -182,7 +182,7 @@ impl PlanBook {
         })
     }
 
-    /// Whether it has plans for an instruction.
+    /// Whether the book has plans for an instruction.
     pub fn knows(&self, instruction: u32) -> bool {
         self.sequences
             .keys()
@@ -190,17 +190,17 @@ impl PlanBook {
     }
 }
 
-/// What a trajectory encoder reads: a segment of observations and of actions.
+/// Buffers of a trajectory encoder's input: a segment of observations and of actions.
 #[derive(Debug, Clone, Copy)]
 pub struct Segment {
     observations: ChannelId,
     actions: ChannelId,
-    /// Its control steps.
+    /// Number of control steps of a segment.
     pub steps: usize,
 }
 
 impl Segment {
-    /// Of a policy that has an encoder.
+    /// Makes the buffers for a policy; `None` if it has no trajectory encoder.
     pub fn of(policy: &Policy<'_>) -> Option<Self> {
         let contract: &Contract<'_> = policy.contract();
         let find = |name| {
@@ -216,7 +216,7 @@ impl Segment {
         })
     }
 
-    /// The plan that the encoder sees in it.
+    /// Returns the plan that the encoder sees in this segment.
     pub fn encode(
         &self,
         controller: &mut Controller<'_, '_>,
@@ -230,7 +230,7 @@ impl Segment {
     }
 }
 
-/// The plan that the trajectory encoder sees in each segment of a recording; what was executed counts, not what was asked for.
+/// Encodes each segment of a recording as the plan that the trajectory encoder sees in it; executed actions count, not commanded ones.
 ///
 /// Steps beyond the last full segment are the end of one more, which begins earlier: every step has a plan, unless the recording is
 /// shorter than one segment, which has none.

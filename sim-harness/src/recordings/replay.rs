@@ -1,4 +1,4 @@
-//! Recorded episodes computed again: the same observations through a policy, its actions and plans against the recorded ones.
+//! Replays recorded episodes: the same observations through a policy, and its actions and plans compared with the recorded ones.
 //!
 //! Equal means bit for bit: the runtime promises the same bits on every target, so any difference is another policy, another runtime or a
 //! damaged log. What can fail: a log of a policy with other sizes, an instruction that this policy does not know, an observation that it
@@ -20,17 +20,17 @@ pub enum ReplayError {
     /// The log is from a policy with other sizes or names.
     #[error("the log's {what} is not the policy's: {log} against {policy}")]
     Sizes {
-        /// What differs.
+        /// Name of what differs.
         what: &'static str,
-        /// In the log.
+        /// The value in the log.
         log: String,
-        /// In the policy.
+        /// The value in the policy.
         policy: String,
     },
     /// The policy does not know a recorded instruction.
     #[error("the policy does not know the recorded instruction '{0}'")]
     Instruction(String),
-    /// The policy refused it.
+    /// The policy refused the instruction.
     #[error("the policy refuses the instruction: {0}")]
     Instruct(InstructionError),
     /// There is no memory for the policy's controller.
@@ -39,29 +39,29 @@ pub enum ReplayError {
     /// The controller refused an observation.
     #[error("{episode}: the controller refuses the observation of control step {step}: {error}")]
     Step {
-        /// Which episode.
+        /// Name of the episode.
         episode: String,
         /// Control step, from 0.
         step: usize,
-        /// Its reason.
+        /// The controller's reason.
         error: StepError,
     },
     /// The policy refused a commanded plan.
     #[error("{episode}: the policy gives no action for the plan of control step {step}: {error}")]
     Follow {
-        /// Which episode.
+        /// Name of the episode.
         episode: String,
         /// Control step, from 0.
         step: usize,
-        /// Its reason.
+        /// The controller's reason.
         error: FollowError,
     },
 }
 
-/// The first step of an episode that came out otherwise.
+/// First control step of an episode whose replay differs from the log.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Difference {
-    /// The instruction's id.
+    /// Id of the episode's instruction.
     pub instruction: String,
     /// Number of the episode.
     pub episode: u32,
@@ -73,19 +73,19 @@ pub struct Difference {
     pub action: Option<(String, f32, f32)>,
 }
 
-/// What replaying a log came to.
+/// Result of replaying a log.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Replayed {
-    /// Episodes computed again.
+    /// Number of episodes replayed.
     pub episodes: usize,
-    /// Control steps, in all.
+    /// Number of control steps replayed.
     pub steps: usize,
-    /// The first difference of each episode that has one.
+    /// First difference of each episode that has one.
     pub differences: Vec<Difference>,
 }
 
-/// Computes all episodes of a log again, on the instructions `isa`, by a policy that selects every `period` control steps; `finished` is
-/// called after each.
+/// Replays all episodes of a log on the instruction set `isa`, by a policy that selects every `period` control steps; `finished` is called
+/// after each.
 pub fn replay(
     policy: &Policy<'_>,
     period: Option<usize>,
@@ -152,7 +152,7 @@ pub fn replay(
     Ok(replayed)
 }
 
-/// The contract's temperature, or the 1 that `--sample` takes where the contract's rule is argmax.
+/// Temperature of the contract, or the 1 that `--sample` takes where the contract's rule is argmax.
 fn temperature(contract: &Contract<'_>) -> f32 {
     match contract.decision() {
         Decision::Sample { temperature, .. } => temperature,
@@ -178,7 +178,7 @@ fn fits(contract: &Contract<'_>, period: Option<usize>, log: &Log) -> Result<(),
     sizes("control steps per plan", said(origin.period), said(period))
 }
 
-/// Number and names of the elements; says the first that differs.
+/// Compares number and names of the elements; describes the first difference.
 fn elements(what: &'static str, log: &[String], channel: &Channel<'_>) -> Result<(), ReplayError> {
     let policy: Vec<&str> = channel.elements().map(|element| element.name).collect();
     let sizes = |log: String, policy: String| Err(ReplayError::Sizes { what, log, policy });
@@ -192,7 +192,7 @@ fn elements(what: &'static str, log: &[String], channel: &Channel<'_>) -> Result
     }
 }
 
-/// The policy's index of the recorded instruction, by its text: another bundle may number them otherwise.
+/// Finds the policy's index of the recorded instruction by its text: another bundle may number them otherwise.
 fn find(contract: &Contract<'_>, flight: &Flight) -> Result<u32, ReplayError> {
     let place = contract
         .instructions()

@@ -1,4 +1,4 @@
-//! The charts, each a list of pictures; an empty list where there is nothing to show.
+//! Charts of the report, each a list of pictures; an empty list where there is nothing to show.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -21,48 +21,49 @@ const COLORS: [&str; 6] = [
 /// Completions that are nearer than this share of an episode have one label in a timeline.
 const TOGETHER: f64 = 0.04;
 
-/// Room above the plans of a timeline for the numbers of completions.
+/// Vertical room above the plans of a timeline for the numbers of completions, as a factor.
 const HEADROOM: f64 = 1.12;
 
-/// The colour of what nobody asked for.
+/// Colour of completions that nobody asked for.
 const UNASKED: &str = "#777777";
 
-/// Bars of the latency histogram.
+/// Number of bars of the latency histogram.
 const BINS: usize = 40;
 
 /// Width of a chart that shares its row with another, in pixels.
 const HALF: f64 = 560.0;
 
-/// Width of a chart that has a row to itself.
+/// Width of a chart that has a row to itself, in pixels.
 const WHOLE: f64 = 900.0;
 
-/// How much larger than it was laid out a chart may be shown.
+/// Largest factor by which the page may enlarge a chart.
 const ENLARGED: f64 = 1.3;
 
-/// How much smaller; a narrower page lets it be pushed aside. Its smallest letters are 11 pixels high as laid out.
+/// Smallest factor by which the page may reduce a chart; a narrower page lets it be pushed aside. Its smallest letters are 11 pixels high
+/// as laid out.
 const REDUCED: f64 = 0.85;
 
-/// A picture.
+/// A chart with its texts.
 pub struct Chart {
-    /// Its SVG text.
+    /// SVG text of the chart.
     pub svg: String,
-    /// Whether it wants a row to itself.
+    /// Whether the chart takes a row to itself.
     pub wide: bool,
-    /// What its marks mean, below it.
+    /// Completions that are marked in the chart, explained below it.
     pub marks: Vec<Mark>,
-    /// A remark below it.
+    /// Remark below the chart.
     pub note: String,
 }
 
 /// A completion that is marked in a timeline.
 pub struct Mark {
-    /// Its number in the chart.
+    /// Number of the completion in the chart.
     pub number: usize,
-    /// The sub-task.
+    /// Name of the sub-task.
     pub name: String,
-    /// The control step.
+    /// Control step of the completion.
     pub step: usize,
-    /// Whether the instruction asks for it.
+    /// Whether the instruction commands the sub-task.
     pub asked: bool,
 }
 
@@ -91,7 +92,7 @@ fn sized(plots: &[Plot], title: &str, width: f64, height: f64) -> Layout {
         .with_height(height)
 }
 
-/// Figure 3 of the paper.
+/// Draws the K-rates, Figure 3 of the paper.
 pub fn k_rates(results: &Results) -> Vec<Chart> {
     let splits = results.splits.0.iter();
     let splits = splits.filter(|(_, result)| result.score.episodes > 0);
@@ -132,7 +133,7 @@ pub fn k_rates(results: &Results) -> Vec<Chart> {
     vec![chart(plots, layout)]
 }
 
-/// The plan in force over control steps, with completions.
+/// Draws the plan in force over control steps, with completions.
 pub fn timelines(report: &Report<'_>) -> Vec<Chart> {
     let chosen = super::chosen(report.traces).into_iter();
     chosen.map(|trace| timeline(report, trace)).collect()
@@ -188,7 +189,7 @@ fn timeline(report: &Report<'_>, trace: &Trace) -> Chart {
     }
 }
 
-/// The completions of an episode in their order, and whether the instruction asks for them.
+/// Lists the completions of an episode in their order, and whether the instruction asks for them.
 fn marks(report: &Report<'_>, trace: &Trace) -> Vec<Mark> {
     let known = crate::results::asked(report.contract, trace.instruction as usize);
     let asked = |name: &str| {
@@ -239,7 +240,7 @@ fn starts(report: &Report<'_>) -> BTreeMap<u32, Vec<f64>> {
         .collect()
 }
 
-/// Figure 4 of the paper, and the same for all instructions as a heat map.
+/// Draws the first decision's distribution over plans: Figure 4 of the paper, and a heat map of all instructions.
 pub fn start_distributions(report: &Report<'_>) -> Vec<Chart> {
     let starts = starts(report);
     let id = |i: u32| {
@@ -292,7 +293,7 @@ fn parts(composite: &str, line: &[f64], atoms: [(&String, &Vec<f64>); 2]) -> Cha
     chart(plots, layout)
 }
 
-/// Rows of shares over the plans; plans that no row has are left out.
+/// Draws rows of shares over the plans as a heat map; plans that no row has are left out.
 fn heat_map(title: &str, rows: Vec<(String, Vec<f64>)>, plans: usize) -> Vec<Chart> {
     let share = |row: &[f64], plan: usize| row.get(plan).copied().unwrap_or(0.0);
     let used = |&plan: &usize| rows.iter().any(|(_, row)| share(row, plan) >= 0.005);
@@ -325,7 +326,7 @@ fn heat_map(title: &str, rows: Vec<(String, Vec<f64>)>, plans: usize) -> Vec<Cha
     vec![chart(plots, layout)]
 }
 
-/// Figures 5 and 10 of the paper: the gripper's way while a plan is in force.
+/// Draws the gripper's path while a plan is in force: Figures 5 and 10 of the paper.
 pub fn gripper(report: &Report<'_>) -> Vec<Chart> {
     let Some(period) = report.contract.period() else {
         return Vec::new();
@@ -373,7 +374,7 @@ pub fn gripper(report: &Report<'_>) -> Vec<Chart> {
     vec![chart(plots, layout)]
 }
 
-/// Figure 9 of the paper.
+/// Draws the heat maps of Figure 9 of the paper.
 pub fn heat_maps(report: &Report<'_>) -> Vec<Chart> {
     let size = report.plans;
     let mut by_word: BTreeMap<String, Vec<f64>> = BTreeMap::new();
@@ -436,7 +437,7 @@ fn count(rows: &mut BTreeMap<String, Vec<f64>>, name: &str, plan: Option<u32>, s
     }
 }
 
-/// The next number from `value` upwards that is easy to read: 1, 2, 2.5 or 5 times a power of ten.
+/// Rounds `value` up to the next number that is easy to read: 1, 2, 2.5 or 5 times a power of ten.
 fn round_up(value: f64) -> f64 {
     let power = 10_f64.powf(value.max(f64::MIN_POSITIVE).log10().floor());
     let easy = [1.0, 2.0, 2.5, 5.0].map(|step| step * power);
@@ -444,7 +445,7 @@ fn round_up(value: f64) -> f64 {
     next.unwrap_or(10.0 * power)
 }
 
-/// All control steps by duration.
+/// Draws a histogram of all control steps by duration.
 pub fn latency(report: &Report<'_>) -> Vec<Chart> {
     let steps = report.traces.iter().flat_map(|trace| &trace.steps);
     let mut all: Vec<f64> = steps

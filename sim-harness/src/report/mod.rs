@@ -1,4 +1,4 @@
-//! `--report`: one HTML file that says and shows what a policy did, with nothing to fetch.
+//! Renders `--report`: one self-contained HTML file about what a policy did, with nothing to fetch.
 //!
 //! The charts are SVG inside the page, film strips are JPEG inside it. Everything comes from the results and the traces; an episode's trace is needed for all but the success
 //! table and the K-rates. What can fail: the template, which is compiled in.
@@ -17,15 +17,15 @@ use crate::results::Results;
 use crate::trace::Trace;
 use lads_proof::metrics::{Interval, Score};
 
-/// What a report is made of.
+/// Inputs of a report.
 pub struct Report<'r> {
-    /// The results.
+    /// Results of the evaluation.
     pub results: &'r Results,
-    /// Every episode's control steps.
+    /// Traces of all episodes.
     pub traces: &'r [Trace],
     /// The contract of the policy's bundle.
     pub contract: &'r Contract,
-    /// How many plans the policy has; 0 if it selects none.
+    /// Number of the policy's plans; 0 if it selects none.
     pub plans: usize,
     /// Names of the sub-tasks that the environment watches.
     pub sub_tasks: &'r [&'static str],
@@ -33,26 +33,26 @@ pub struct Report<'r> {
     pub strips: Result<Vec<Strip>, String>,
 }
 
-/// A moment of an episode.
+/// A picture of one moment of an episode.
 pub struct Still {
-    /// What it shows.
+    /// Caption of the picture.
     pub caption: String,
-    /// The picture, as JPEG.
+    /// The picture as JPEG.
     pub jpeg: Vec<u8>,
 }
 
 /// An episode in a few pictures.
 pub struct Strip {
-    /// Which.
+    /// Title: which episode.
     pub title: String,
-    /// From its start to its end.
+    /// Pictures from the episode's start to its end.
     pub stills: Vec<Still>,
 }
 
-/// At most so many episodes are drawn as timelines and film strips.
+/// Largest number of episodes that are drawn as timelines and film strips.
 const CHOSEN: usize = 6;
 
-/// The episodes that are shown one by one: failed ones first, one of each instruction.
+/// Chooses the episodes that are shown one by one: failed ones first, one of each instruction.
 pub fn chosen(traces: &[Trace]) -> Vec<&Trace> {
     let mut chosen: Vec<&Trace> = traces.iter().filter(|t| !t.steps.is_empty()).collect();
     chosen.sort_by_key(|trace| trace.outcome.success);
@@ -62,7 +62,7 @@ pub fn chosen(traces: &[Trace]) -> Vec<&Trace> {
     chosen
 }
 
-/// Instruction, number and end of an episode.
+/// Title of an episode: its instruction, number and end.
 pub fn title(contract: &Contract, trace: &Trace) -> String {
     let known = contract.instructions.get(trace.instruction as usize);
     format!(
@@ -86,13 +86,13 @@ struct Row {
     numbers: Vec<Number>,
 }
 
-/// A number of the table, and how sure it is.
+/// A number of the table, with its interval.
 struct Number {
     value: String,
     within: String,
 }
 
-/// A chart with what it shows.
+/// A chart with its explanation.
 struct Figure {
     title: String,
     about: String,
@@ -119,18 +119,18 @@ struct Page<'r> {
     few: Option<Few>,
 }
 
-/// Few episodes of each instruction, and the widest interval that comes of it.
+/// Note about few episodes of each instruction, with the widest interval that follows.
 struct Few {
     episodes: u32,
     low: f64,
     high: f64,
 }
 
-/// With fewer episodes of each instruction than this, their intervals say little.
+/// Number of episodes per instruction below which their intervals say little.
 const FEW: u32 = 10;
 
 impl Report<'_> {
-    /// The page.
+    /// Renders the page.
     pub fn html(&self) -> Result<String, askama::Error> {
         let results = self.results;
         let decision = match results.decision.temperature {

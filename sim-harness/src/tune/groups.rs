@@ -1,4 +1,4 @@
-//! Layers by the weights that they read, entries by the layers that they share.
+//! Groups layers by the weights that they read, and entries by the layers that they share.
 
 use std::cmp::Reverse;
 use std::collections::BTreeSet;
@@ -8,12 +8,12 @@ use lads_compiler::LayerReport;
 
 use super::search::{Group, Layer};
 
-/// The groups so far.
+/// Groups collected so far, with the ranges of their weights.
 #[derive(Debug, Default)]
 pub(super) struct Groups(Vec<(Group, Vec<Range<usize>>)>);
 
 impl Groups {
-    /// Takes a layer of an entry in.
+    /// Adds a layer of an entry to its group.
     pub fn add(&mut self, entry: &str, layer: &LayerReport, takes_integers: bool) {
         let shares =
             |words: &Range<usize>| words.start < layer.words.end && layer.words.start < words.end;
@@ -46,7 +46,7 @@ impl Groups {
         self.0.push((group, words));
     }
 
-    /// The groups, the one with the most weights first.
+    /// Returns the groups, the one with the most weights first.
     pub fn sorted(self) -> Vec<Group> {
         let mut groups: Vec<_> = self.0.into_iter().map(|(group, _)| group).collect();
         groups.sort_by_key(|group| (Reverse(group.weights()), group.name()));

@@ -1,4 +1,4 @@
-//! Does a policy whose numbers have fewer bits still answer as with 32?
+//! Judges whether a policy stored with fewer bits still answers as with 32.
 //!
 //! What only helps to select an index must select the same one in every decision, its logits must be twice as near as a certificate wants them,
 //! and nearly all decisions must be clear by more than the logits are off: the questions are a sample, and a decision that was a close call
@@ -11,49 +11,49 @@ use std::fmt;
 use lads_compiler::Evidence;
 use lads_proof::answers::{LOGIT_TOLERANCE, Replay, largest_up_to_a_constant};
 
-/// A decision is clear if its margin is more than so many times the largest difference of a logit: two logits may be off.
+/// Factor of a clear decision: its margin is more than this many times the largest difference of a logit, as two logits may be off.
 pub const MARGIN_FACTOR: f64 = 2.0;
 
-/// Half of what a certificate allows a logit: its episodes are others.
+/// Largest allowed difference of a logit: half of what a certificate allows, as its episodes are others.
 pub const LOGIT_BOUND: f64 = LOGIT_TOLERANCE / 2.0;
 
-/// The share of decisions that have to be clear: of a hundred, one may hang on the rounding, if it came to the worst.
+/// Smallest share of decisions that have to be clear: of a hundred, at most one may depend on the rounding.
 pub const CLEAR_SHARE: f64 = 0.99;
 
 /// Why a candidate is not the same policy.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Loss {
-    /// It does not compile, fails the golden episode or refuses a question.
+    /// The candidate does not compile, fails the golden episode or refuses a question.
     Refused(String),
-    /// Decisions selected another index.
+    /// Some decisions selected another index.
     Selected {
-        /// How many.
+        /// Number of decisions that selected another index.
         changed: usize,
-        /// The largest margin of one of them with 32 bits.
+        /// Largest margin, with 32 bits, among the decisions that selected another index.
         margin: f64,
     },
-    /// A logit is off by more than [`LOGIT_BOUND`].
+    /// A logit differs by more than [`LOGIT_BOUND`].
     Logit {
-        /// By so much at most.
+        /// Largest difference of a logit.
         difference: f64,
     },
-    /// Every decision is the same, and too many are close calls.
+    /// Every decision is the same, but too many are close calls.
     Unclear {
-        /// The share that is clear.
+        /// Share of decisions that are clear.
         share: f64,
         /// Largest difference of a logit.
         logit: f64,
     },
-    /// An action is off.
+    /// An action differs by more than its tolerance.
     Action {
-        /// By so much at most.
+        /// Largest difference of an action's element.
         difference: f64,
-        /// What is allowed.
+        /// Allowed difference of an action's element.
         tolerance: f64,
     },
     /// The trajectory encoder sees other plans.
     Encoded {
-        /// In so many segments.
+        /// Number of segments with another plan.
         changed: usize,
     },
 }
@@ -92,17 +92,17 @@ impl fmt::Display for Loss {
     }
 }
 
-/// A candidate's answers beside those with 32 bits.
+/// Comparison of a candidate's answers with those of 32 bits.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Judged {
-    /// What was measured; of which file is for the caller to say.
+    /// Measured differences; the caller adds which file they are of.
     pub evidence: Evidence,
-    /// Why it is not the same policy; `None` if it is.
+    /// Why the candidate is not the same policy; `None` if it is.
     pub loss: Option<Loss>,
 }
 
 impl Judged {
-    /// A candidate that was not asked at all.
+    /// Result of a candidate that could not be asked.
     pub fn refused(why: String) -> Self {
         Self {
             evidence: Evidence {
@@ -114,13 +114,14 @@ impl Judged {
         }
     }
 
-    /// Whether it is the same policy.
+    /// Whether the candidate is the same policy.
     pub fn is_same(&self) -> bool {
         self.loss.is_none()
     }
 }
 
-/// Compares the answers of a candidate with those of the same policy with 32 bits; `tolerance` is that of an action's element.
+/// Compares the answers of a candidate with those of the same policy with 32 bits; `tolerance` is the allowed difference of an action's
+/// element.
 pub fn judge(exact: &[Replay], candidate: &[Replay], tolerance: f64) -> Judged {
     let mut seen = Evidence {
         episodes: exact.len(),
@@ -203,7 +204,7 @@ pub fn judge(exact: &[Replay], candidate: &[Replay], tolerance: f64) -> Judged {
     }
 }
 
-/// The largest difference of an element; infinite where one is no number.
+/// Largest difference of an element; infinite if one is NaN.
 fn largest(wanted: &[f32], got: &[f32]) -> f64 {
     wanted.iter().zip(got).fold(0.0, |largest, (a, b)| {
         let difference = f64::from((a - b).abs());

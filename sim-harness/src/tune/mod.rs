@@ -1,8 +1,8 @@
-//! The smallest image that keeps every plan: formats for weights and caches, chosen by what a policy answers with them.
+//! Finds the smallest image that keeps every plan: formats for weights and caches, chosen by the policy's answers with them.
 //!
 //! The policy answers the recorded questions of a reference (open loop, as in [`verify::policy`](crate::verify::policy)) once with 32 bits
 //! and once with each candidate's; [`mod@judge`] compares the two, [`mod@search`] tries candidates from the smallest up. The golden episode alone
-//! is no evidence: a policy may replay it with the same bits and decide otherwise elsewhere. What can fail: a bundle that does not compile
+//! is not evidence: a policy may replay it with the same bits and decide otherwise elsewhere. What can fail: a bundle that does not compile
 //! even with 32 bits, memory; it can be told to stop.
 
 mod groups;
@@ -25,13 +25,13 @@ use search::{Found, Parts, search};
 /// Why a bundle cannot be tuned.
 #[derive(Debug, thiserror::Error)]
 pub enum TuneError {
-    /// It does not compile with 32 bits.
+    /// The bundle does not compile with 32 bits.
     #[error(transparent)]
     Compile(#[from] CompileError),
     /// The questions cannot be asked, or an interrupt came.
     #[error(transparent)]
     Asking(#[from] EvaluationError),
-    /// The policy with 32 bits refuses a question: the reference is of something else.
+    /// The policy with 32 bits refuses a question: the reference was made for something else.
     #[error(
         "with 32 bits the policy refuses a step of the reference: {0}; make the reference again"
     )]
@@ -43,30 +43,30 @@ pub enum TuneError {
     Unclear(String),
 }
 
-/// What is asked, and of whom.
+/// Inputs of a search for formats.
 #[derive(Debug, Clone, Copy)]
 pub struct Tuning<'t> {
-    /// The bundle.
+    /// The bundle to tune.
     pub bundle: &'t Bundle,
-    /// The questions: its traced episodes.
+    /// The reference whose traced episodes are the questions.
     pub reference: &'t Reference,
-    /// The instructions whose episodes are asked about.
+    /// Instructions whose episodes are asked about.
     pub assignments: &'t [Assignment],
-    /// The instructions that the kernels run on; the answers have the same bits on all.
+    /// Instruction set that the kernels run on; the answers have the same bits on all.
     pub isa: Isa,
 }
 
-/// What came of it.
+/// Result of a search for formats.
 #[derive(Debug)]
 pub struct Tuned {
-    /// The smallest formats that keep every plan, and what was seen with them.
+    /// Smallest formats that keep every plan, with the measured differences.
     pub found: Found,
-    /// What the image has with 32 bits, and with those.
+    /// Description of the image with 32 bits, and with the chosen formats.
     pub images: [Image; 2],
 }
 
 impl Tuning<'_> {
-    /// Looks for the smallest formats. `tried` is told of each candidate before it is asked.
+    /// Searches for the smallest formats. `tried` is called with each candidate before it is asked.
     pub fn run(
         &self,
         stop: &AtomicBool,
@@ -101,8 +101,8 @@ impl Tuning<'_> {
         })
     }
 
-    /// What may be stored otherwise. Entries that read the same weights, as those do that read one token each of one network, are one
-    /// part: stored in two formats, the weights would be there twice. What nobody asked keeps its bits.
+    /// Lists the parts whose storage may change. Entries that read the same weights, as those do that read one token each of one network,
+    /// are one part: stored in two formats, the weights would be there twice. What nobody asked keeps its bits.
     fn parts(&self, exact: &Image, encoder_was_asked: bool) -> Result<Parts, CompileError> {
         let smallest = Options {
             storage: Some(Storage::of_weights(search::WEIGHTS[0])),

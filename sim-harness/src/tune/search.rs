@@ -1,4 +1,4 @@
-//! Candidates from the smallest up: group by group of entries, the largest first, then the caches, then layer by layer.
+//! Searches candidates from the smallest up: group by group of entries, the largest first, then the caches, then layer by layer.
 //!
 //! Every candidate is asked with what was accepted before it in place, so that the last one that was accepted is the result, as it was
 //! seen. The same parts and the same answers give the same result. What can fail: the trial itself.
@@ -13,71 +13,71 @@ use super::judge::Judged;
 pub(super) const WEIGHTS: [WeightFormat; 3] =
     [WeightFormat::Int8, WeightFormat::Int16, WeightFormat::F16];
 
-/// Entry graphs that read the same weights.
+/// A group of entry graphs that read the same weights.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Group {
-    /// Their names.
+    /// Names of the entry graphs.
     pub entries: BTreeSet<String>,
-    /// Their layers.
+    /// Layers of the group.
     pub layers: Vec<Layer>,
 }
 
-/// A matrix, and the ONNX nodes that read it.
+/// A weight matrix, and the ONNX nodes that read it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Layer {
-    /// Names of the nodes.
+    /// Names of the ONNX nodes.
     pub nodes: BTreeSet<String>,
     /// Number of weights.
     pub weights: usize,
-    /// Whether integers store it; one that weighs its inputs very differently keeps its floats.
+    /// Whether integer formats may store it; a matrix that weighs its inputs very differently keeps its floats.
     pub takes_integers: bool,
 }
 
 impl Group {
-    /// Number of weights.
+    /// Number of weights of the group.
     pub fn weights(&self) -> usize {
         self.layers.iter().map(|layer| layer.weights).sum()
     }
 
-    /// The names of its entries.
+    /// Names of the group's entries, as one text.
     pub fn name(&self) -> String {
         let names: Vec<_> = self.entries.iter().map(String::as_str).collect();
         names.join(", ")
     }
 }
 
-/// What of an image may be stored otherwise.
+/// Parts of an image whose storage may change.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Parts {
-    /// The groups, the largest first.
+    /// Groups of entries, the largest first.
     pub groups: Vec<Group>,
-    /// Whether there are KV caches.
+    /// Whether the image has KV caches.
     pub has_cache: bool,
 }
 
-/// What was decided about a part.
+/// The decision about one part.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Choice {
     /// Names of the entry graphs, or `cache`.
     pub part: String,
-    /// The formats in it.
+    /// The chosen formats.
     pub stored: String,
-    /// Smaller ones that are not the same policy, each with the reason.
+    /// Smaller formats that do not give the same policy, each with the reason.
     pub refused: Vec<(String, String)>,
 }
 
-/// The end of a search.
+/// Result of a search.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Found {
-    /// The smallest formats that keep every plan.
+    /// Smallest formats that keep every plan.
     pub storage: Storage,
-    /// What was seen with them.
+    /// Comparison of the chosen formats with 32 bits.
     pub judged: Judged,
-    /// Part by part.
+    /// Decisions, part by part.
     pub choices: Vec<Choice>,
 }
 
-/// Looks for the smallest formats; `exact` is what was seen with 32 bits, `trial` asks one candidate.
+/// Searches for the smallest formats; `exact` is the comparison of 32 bits with themselves, `trial` asks one candidate.
 pub fn search<E>(
     parts: &Parts,
     exact: Judged,
@@ -115,7 +115,7 @@ pub fn search<E>(
 }
 
 impl Found {
-    /// Takes the first candidate that is the same policy, or keeps what is there, under the name `kept`.
+    /// Takes the first candidate that is the same policy, or keeps the present one, under the name `kept`.
     fn choose<E>(
         &mut self,
         part: String,
@@ -144,7 +144,7 @@ impl Found {
     }
 }
 
-/// The same with another format of these parts.
+/// Returns the storage with another format of these parts.
 fn with(storage: &Storage, parts: &BTreeSet<String>, format: WeightFormat) -> Storage {
     let storage = storage.clone();
     parts
@@ -152,7 +152,7 @@ fn with(storage: &Storage, parts: &BTreeSet<String>, format: WeightFormat) -> St
         .fold(storage, |storage, part| storage.with_part(part, format))
 }
 
-/// Gives single layers of a group the smallest format, the one that moves the answers least for its size first; the number of those.
+/// Gives single layers of a group the smallest format, the one that moves the answers least for its size first; returns how many.
 fn layers<E>(
     group: &Group,
     found: &mut Found,
@@ -210,7 +210,7 @@ mod tests {
         }
     }
 
-    /// A policy that is the same while `is_same` says so.
+    /// Searches with a policy that is the same while `is_same` says so.
     fn searched(is_same: impl Fn(&Storage) -> bool) -> (Found, usize) {
         let mut trials = 0;
         let found = search(&parts(), Judged::default(), &mut |storage| {

@@ -1,4 +1,4 @@
-//! What a program image says of itself beside what the bundle says that it was compiled from: everything of a contract that an image holds.
+//! Describes a program image, and the bundle that it was compiled from, by all contract fields that an image holds.
 //!
 //! Both are made alike, so that a field that only one of them has shows. What can fail: a bundle whose table of instructions cannot be evaluated.
 
@@ -7,7 +7,7 @@ use lads_core::{Contract, Decision, Noise, Policy};
 use serde::Serialize;
 use serde_json::Value;
 
-/// The fields.
+/// Contract fields that an image holds.
 #[derive(Serialize)]
 struct Said<'a> {
     bundle_sha256: &'a str,
@@ -19,7 +19,7 @@ struct Said<'a> {
     channels: Vec<Channel<'a>>,
     context: Option<Context>,
     language: [&'a str; 2],
-    /// `None` where no other sentence is followed.
+    /// Least similarity at which a sentence outside the table is followed; `None` if none is.
     acceptance: Option<f32>,
     instructions: Vec<Instruction<'a>>,
 }
@@ -32,7 +32,7 @@ struct Channel<'a> {
     shape: Vec<usize>,
     quaternion_order: String,
     reference: &'a str,
-    /// Of all its elements alike, where they are not described one by one.
+    /// Limits of every element, if the elements are not described one by one.
     limits: Option<[f32; 2]>,
     elements: Vec<Element<'a>>,
 }
@@ -61,9 +61,9 @@ struct Context {
 struct Instruction<'a> {
     id: &'a str,
     text: &'a str,
-    /// Elements of its word embeddings.
+    /// Number of elements of the word embeddings.
     words: usize,
-    /// Of their bits.
+    /// SHA-256 of the bits of the word embeddings.
     words_sha256: String,
 }
 
@@ -79,7 +79,7 @@ impl<'a> Instruction<'a> {
     }
 }
 
-/// The name of a value that both sides call alike.
+/// Name of a value that image and bundle name in the same way.
 fn name(value: impl std::fmt::Debug) -> String {
     format!("{value:?}").to_lowercase()
 }
@@ -106,7 +106,7 @@ impl Said<'_> {
     }
 }
 
-/// What an image says.
+/// Lists the contract fields of an image.
 pub fn of_image(policy: &Policy<'_>) -> Value {
     let contract = policy.contract();
     let channels: Vec<_> = contract.channels().collect();
@@ -161,7 +161,7 @@ fn image_channel<'a>(channel: &lads_core::Channel<'a>) -> Channel<'a> {
     }
 }
 
-/// What an image of the bundle has to say.
+/// Lists the contract fields that an image of the bundle must hold.
 pub fn of_bundle(bundle: &Bundle) -> Result<Value, CompileError> {
     let contract = bundle.contract();
     let language = contract.language.as_ref();
@@ -224,7 +224,7 @@ fn bundle_channel(channel: &lads_compiler::contract::Channel) -> Channel<'_> {
     }
 }
 
-/// The rule that decides plans, in a word or two.
+/// Describes the rule that decides plans, in a word or two.
 pub fn rule(contract: &Contract<'_>) -> String {
     match contract.decision() {
         Decision::Argmax => "argmax".to_owned(),

@@ -1,4 +1,4 @@
-//! Proof that an exported policy is the policy that was trained: the reference's questions, its actions and its episodes, run again.
+//! Verifies that an exported policy is the policy that was trained: the reference's questions, its actions and its episodes, run again.
 //!
 //! Three comparisons, each of which can fail where the others cannot see: the policy alone ([`policy`]: open loop on the reference's
 //! observations), the environment alone ([`physics`]: open loop on the reference's actions), and both together ([`lads_proof::pairs`]: the reference's
@@ -27,13 +27,13 @@ use crate::registry::Opener;
 use certificate::{Certificate, ReferenceUsed, Setting};
 use reference::Reference;
 
-/// How often [`run`] calls `finished`: both open-loop comparisons replay the traced episodes, then all run in closed loop.
+/// Number of calls that [`run`] makes to `finished`: both open-loop comparisons replay the traced episodes, then all run in closed loop.
 pub fn work(evaluation: &Evaluation<'_>) -> usize {
     2 * evaluation.assignments.len() * evaluation.setup.traced as usize + evaluation.len()
 }
 
-/// Runs everything that the reference holds for `evaluation`'s instructions and episodes. `evaluation` has the reference's seed and traces
-/// as many episodes as the reference does; `finished` is called after each episode of each comparison, see [`work`].
+/// Runs all comparisons that the reference holds for `evaluation`'s instructions and episodes. `evaluation` has the reference's seed and
+/// traces as many episodes as the reference does; `finished` is called after each episode of each comparison, see [`work`].
 pub fn run(
     evaluation: &Evaluation<'_>,
     bundle: &Bundle,
@@ -119,7 +119,7 @@ pub fn run(
     ))
 }
 
-/// What a bundle is, as far as its reference must be of the same.
+/// Describes a bundle, as far as its reference must agree with it.
 pub fn subject<'s>(bundle: &'s Bundle, environment: &'s dyn Environment) -> Subject<'s> {
     let known = &bundle.contract().instructions;
     Subject {
@@ -132,7 +132,7 @@ pub fn subject<'s>(bundle: &'s Bundle, environment: &'s dyn Environment) -> Subj
     }
 }
 
-/// What these episodes could not show.
+/// Lists what the episodes of this run could not show.
 fn unseen(evaluation: &Evaluation<'_>, answers: &Answers) -> Vec<String> {
     let contract = evaluation.policy.contract();
     let mut unseen = Vec::new();

@@ -1,4 +1,5 @@
-//! Is it the same environment? The reference's actions must lead through the reference's states.
+//! Checks that the environment is the reference's: the reference's actions must lead through the reference's states. The reference's
+//! actions must lead through the reference's states.
 //!
 //! Open loop over the traced episodes: reset, then the recorded actions, whatever a policy would do. One machine and one version of MuJoCo
 //! give the same bits; another CPU's libm moves them by less than the tolerance. What can fail: an action that the environment refuses; it can

@@ -1,4 +1,4 @@
-//! The compiled policy is asked what the reference policy was asked; [`lads_proof::answers`] judges.
+//! Asks the compiled policy what the reference policy was asked; [`lads_proof::answers`] judges.
 //!
 //! Open loop: at each control step of a traced episode the controller gets the observation that the reference saw, and its history holds
 //! the actions that the reference executed. What can fail: a workspace that is too small for the policy; it can be told to stop.
@@ -99,7 +99,7 @@ fn replay(controller: &mut Controller<'_, '_>, instruction: u32, trace: &Trace) 
     replay
 }
 
-/// What the policy's trajectory encoder sees in each full segment of a trace, up to the first that it refuses.
+/// Plans that the policy's trajectory encoder sees in each full segment of a trace, up to the first that it refuses.
 fn encode(controller: &mut Controller<'_, '_>, trace: &Trace, encoder: Segment) -> Vec<u32> {
     let contract = controller.policy().contract();
     let [observations, actions] =

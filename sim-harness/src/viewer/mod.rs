@@ -26,32 +26,32 @@ use self::window::Screen;
 use crate::environment::{Environment, EpisodeSeed};
 use crate::film::FilmError;
 use crate::film::camera::Camera;
-use crate::rollout::Onlooker;
+use crate::rollout::Observer;
 
-/// Why there is no window.
+/// Why no window can be opened.
 #[derive(Debug, Error)]
 pub enum ViewerError {
-    /// Nothing says where a window could be.
+    /// No display is named by the environment.
     #[error(
         "no display: set DISPLAY to that of an X server (a Wayland desktop brings one, Xwayland), or film an episode with lads-run record"
     )]
     NoDisplay,
-    /// The display does not let a window be opened.
+    /// No window can be opened on the display.
     #[error(
         "no window can be opened on display {display}: {reason}; set DISPLAY to that of a running X server with its client libraries (Debian: apt-get install libx11-6 libx11-xcb1 libxcursor1 libxi6 libxkbcommon-x11-0), or film an episode with lads-run record"
     )]
     NoWindow {
-        /// What `DISPLAY` says.
+        /// Value of `DISPLAY`.
         display: String,
-        /// What is wrong.
+        /// The reason that the display gave.
         reason: String,
     },
-    /// There is nothing to draw with, or nothing to draw.
+    /// The picture cannot be drawn: no EGL, or an environment without a simulator.
     #[error(transparent)]
     Picture(#[from] FilmError),
 }
 
-/// Where windows are, by the environment variable that X11 programs follow.
+/// Returns the display that X11 programs use, from the environment variable `DISPLAY`.
 fn display() -> Result<String, ViewerError> {
     let display = std::env::var("DISPLAY").unwrap_or_default();
     let there = !display.is_empty();
@@ -70,12 +70,12 @@ fn no_window(reason: impl ToString) -> ViewerError {
     ViewerError::NoWindow { display, reason }
 }
 
-/// Whether there may be a display at all, before any work.
+/// Checks early whether there can be a display.
 pub fn check() -> Result<(), ViewerError> {
     display().map(drop)
 }
 
-/// What the window writes around the pictures.
+/// Texts that the window writes around the pictures.
 pub struct Texts {
     /// Index and text of every instruction that may run.
     pub instructions: Vec<(u32, String)>,
@@ -95,7 +95,7 @@ pub struct Viewer {
 }
 
 impl Viewer {
-    /// Connects to the display and opens a camera in the scene of `environment`. On the main thread, once in a program.
+    /// Connects to the display and opens a camera in the scene of `environment`. Must be called on the main thread, once in a program.
     pub fn new(environment: &mut dyn Environment) -> Result<Self, ViewerError> {
         check()?;
         let events = quietly(|| EventLoop::with_user_event().build())?.map_err(no_window)?;
@@ -117,13 +117,13 @@ impl Viewer {
         })
     }
 
-    /// Opens the window and does `work` beside it, with the onlooker that its episodes are to have; closes the window after it. A person who
-    /// closes the window stops the episodes, and so does `stop`.
+    /// Opens the window and runs `work` beside it, passing the observer for its episodes; closes the window afterwards. A person who closes
+    /// the window stops the episodes, and so does `stop`.
     pub fn run<W: Send>(
         self,
         texts: &Texts,
         stop: &AtomicBool,
-        work: impl FnOnce(&dyn Onlooker) -> W + Send,
+        work: impl FnOnce(&dyn Observer) -> W + Send,
     ) -> Result<W, ViewerError> {
         let proxy = self.events.create_proxy();
         let tell = proxy.clone();
@@ -141,7 +141,7 @@ impl Viewer {
                 work(show)
             });
             let ran = self.events.run_app(&mut screen).map_err(no_window);
-            show.ask(|wish| wish.window = show::Window::Closed);
+            show.ask(|request| request.window = show::Window::Closed);
             let worked = worker.join();
             let worked = worked.unwrap_or_else(|panic| panic::resume_unwind(panic));
             screen.failed().map_or(ran, Err).map(|()| worked)
@@ -149,7 +149,7 @@ impl Viewer {
     }
 }
 
-/// Tells the window, when it goes, that there is nothing more to come.
+/// Tells the window, when dropped, that the work has ended.
 struct Done(EventLoopProxy<()>, Arc<AtomicBool>);
 
 impl Drop for Done {
@@ -160,7 +160,8 @@ impl Drop for Done {
     }
 }
 
-/// Opens something by winit, which panics where a library or an extension of the display is missing; that is a reason like any other.
+/// Opens a display through winit, and turns a panic of winit, as it does where a library or an extension of the display is missing, into an
+/// error.
 fn quietly<T>(open: impl FnOnce() -> T) -> Result<T, ViewerError> {
     let hook = panic::take_hook();
     panic::set_hook(Box::new(|_| {}));

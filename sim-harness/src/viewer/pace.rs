@@ -1,24 +1,24 @@
-//! When the next control step is due: at absolute deadlines, a control period apart, so that errors of waiting do not add up. What can
-//! fail: nothing; a step that comes later than a whole period, as after a pause, moves the deadlines after it instead of racing them.
+//! Decides when the next control step is due: at absolute deadlines, a control period apart, so that errors of waiting do not add up. What
+//! can fail: nothing; a step that comes later than a whole period, as after a pause, moves the deadlines after it instead of racing them.
 
 use std::time::{Duration, Instant};
 
-/// Speeds, as powers of two of real time.
+/// Slowest and fastest speed, as powers of two of real time.
 const SLOWEST: i32 = -4;
 const FASTEST: i32 = 4;
 
-/// Deadlines of one episode after the other.
+/// Deadlines of the control steps, one episode after the other.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pace {
     period_s: f64,
-    /// Power of two of the speed.
+    /// Power of two of the speed factor.
     power: i32,
-    /// When the last control step was due.
+    /// Deadline of the last control step.
     last: Option<Instant>,
 }
 
 impl Pace {
-    /// Real time, at this control period in seconds.
+    /// Makes deadlines at real time, `period_s` seconds apart.
     pub fn new(period_s: f64) -> Self {
         Self {
             period_s,
@@ -32,7 +32,7 @@ impl Pace {
         f64::from(self.power).exp2()
     }
 
-    /// Twice the speed for each `power`, half of it for negative ones, within bounds.
+    /// Doubles the speed for each `power`, halves it for negative ones, within bounds.
     pub fn change(&mut self, power: i32) {
         self.power = (self.power + power).clamp(SLOWEST, FASTEST);
     }
@@ -41,7 +41,7 @@ impl Pace {
         Duration::from_secs_f64(self.period_s / self.speed())
     }
 
-    /// When the next control step is due.
+    /// Deadline of the next control step.
     pub fn due(self, now: Instant) -> Instant {
         match self.last.map(|last| last + self.period()) {
             Some(due) if now < due + self.period() => due,
@@ -49,12 +49,12 @@ impl Pace {
         }
     }
 
-    /// A control step begins that was due at `due`.
+    /// Notes that a control step begins that was due at `due`.
     pub fn step(&mut self, due: Instant) {
         self.last = Some(due);
     }
 
-    /// The next control step is due as soon as it comes.
+    /// Drops the deadlines, so that the next control step is due at once.
     pub fn rest(&mut self) {
         self.last = None;
     }

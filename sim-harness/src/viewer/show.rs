@@ -1,6 +1,6 @@
-//! What the window shows and what it asks for, between its thread and the one that runs episodes.
+//! State shared between the window's thread and the one that runs episodes: what to show, and what the person asked for.
 //!
-//! [`Show`] looks on at the episodes ([`Onlooker`]), copies each state and lets the control step begin when it is due. It only reads, so
+//! [`Show`] is the [`Observer`] of the episodes: it copies each state and lets the control step begin when it is due. It only reads, so
 //! an episode is the same with and without it. What can fail: nothing.
 
 use std::fmt;
@@ -12,15 +12,15 @@ use mujoco_rs::wrappers::{MjData, MjModel};
 
 use super::pace::Pace;
 use crate::environment::Completion;
-use crate::rollout::{Glimpse, Go, Onlooker, Stand};
+use crate::rollout::{Control, Observer, Phase, Snapshot};
 
-/// How long the start of an episode stays in view, and its end.
+/// Time that the start of an episode stays in view, and below, that of its end.
 const START: Duration = Duration::from_millis(500);
 const END: Duration = Duration::from_secs(2);
-/// How often an interrupt is looked for.
+/// Interval at which an interrupt is looked for.
 const GLANCE: Duration = Duration::from_millis(50);
 
-/// An episode as it is shown.
+/// State of the episode that the window shows.
 pub struct Shown {
     /// The simulator's state.
     pub data: MjData<Arc<MjModel>>,
@@ -28,53 +28,53 @@ pub struct Shown {
     pub instruction: u32,
     /// Number of the episode.
     pub episode: u64,
-    /// The sub-tasks that the instruction commands.
+    /// Indices of the sub-tasks that the instruction commands.
     pub commanded: Vec<usize>,
-    /// Control steps of a full episode.
+    /// Number of control steps of a full episode.
     pub max_steps: usize,
     /// Plan of every control step that was executed.
     pub plans: Vec<Option<u32>>,
     /// Completions so far.
     pub completions: Vec<Completion>,
-    /// What comes next; `None` before the first control step of all.
-    pub stand: Option<Stand>,
-    /// What the person asked for.
-    pub wish: Wish,
+    /// Phase of the episode; `None` before the first control step of all.
+    pub phase: Option<Phase>,
+    /// Requests of the person at the window.
+    pub request: Request,
 }
 
-/// What a person asked for.
+/// Requests of the person at the window.
 #[derive(Debug, Clone, Copy)]
-pub struct Wish {
-    /// No control step begins.
+pub struct Request {
+    /// Whether control steps wait.
     pub paused: bool,
-    /// Control steps that begin nevertheless.
+    /// Number of control steps to execute nevertheless.
     pub single: u32,
-    /// The episode is to start again.
-    pub again: bool,
-    /// Deadlines of control steps.
+    /// Whether the episode is to start again.
+    pub restart: bool,
+    /// Pace of the control steps.
     pub pace: Pace,
-    /// Whether there is a window that shows it.
+    /// State of the window.
     pub window: Window,
 }
 
-/// A window's life.
+/// State of the viewer's window.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Window {
-    /// Not open yet: episodes wait.
+    /// The window is not open yet: episodes wait.
     Awaited,
-    /// Open.
+    /// The window is open.
     Open,
-    /// Closed: episodes stop.
+    /// The window is closed: episodes stop.
     Closed,
 }
 
-/// What both threads know.
+/// Connection between the window's thread and the episodes' thread.
 pub struct Show<'s> {
     shown: Mutex<Shown>,
     changed: Condvar,
     /// Raised by an interrupt.
     stop: &'s AtomicBool,
-    /// Tells the window that there is something new.
+    /// Tells the window that there is something new to draw.
     tell: Box<dyn Fn() + Send + Sync + 's>,
 }
 
@@ -85,17 +85,18 @@ impl fmt::Debug for Show<'_> {
 }
 
 impl<'s> Show<'s> {
-    /// Nothing to see yet. `model` is the scene's, `period_s` the control period; `tell` is called whenever there is something new.
+    /// Makes a connection with nothing to show yet. `model` is the scene's, `period_s` the control period; `tell` is called whenever there
+    /// is something new.
     pub fn new(
         model: Arc<MjModel>,
         period_s: f64,
         stop: &'s AtomicBool,
         tell: Box<dyn Fn() + Send + Sync + 's>,
     ) -> Self {
-        let wish = Wish {
+        let request = Request {
             paused: false,
             single: 0,
-            again: false,
+            restart: false,
             pace: Pace::new(period_s),
             window: Window::Awaited,
         };
@@ -107,8 +108,8 @@ impl<'s> Show<'s> {
             max_steps: 0,
             plans: Vec::new(),
             completions: Vec::new(),
-            stand: None,
-            wish,
+            phase: None,
+            request,
         };
         Self {
             shown: Mutex::new(shown),
@@ -118,39 +119,39 @@ impl<'s> Show<'s> {
         }
     }
 
-    /// What is shown now, while the other thread waits.
+    /// Locks and returns the shown state; the other thread waits meanwhile.
     pub fn now(&self) -> MutexGuard<'_, Shown> {
         self.shown.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Changes what is asked for.
-    pub fn ask(&self, change: impl FnOnce(&mut Wish)) {
-        change(&mut self.now().wish);
+    /// Changes the person's requests and wakes the episodes' thread.
+    pub fn ask(&self, change: impl FnOnce(&mut Request)) {
+        change(&mut self.now().request);
         self.changed.notify_all();
     }
 
-    /// Waits until the control step is due, or `hold` is over where there is one, or what is shown is to end otherwise.
-    fn wait(&self, mut shown: MutexGuard<'_, Shown>, hold: Option<Duration>) -> Go {
+    /// Waits until the control step is due, or `hold` is over where given, or the episode is to stop or restart.
+    fn wait(&self, mut shown: MutexGuard<'_, Shown>, hold: Option<Duration>) -> Control {
         let come = Instant::now();
         loop {
-            let wish = &mut shown.wish;
-            if self.stop.load(Ordering::Relaxed) || wish.window == Window::Closed {
-                return Go::Stop;
+            let request = &mut shown.request;
+            if self.stop.load(Ordering::Relaxed) || request.window == Window::Closed {
+                return Control::Stop;
             }
-            if wish.again {
-                wish.again = false;
-                wish.pace.rest();
-                return Go::Again;
+            if request.restart {
+                request.restart = false;
+                request.pace.rest();
+                return Control::Restart;
             }
             let now = Instant::now();
-            let held = wish.window == Window::Awaited || (wish.paused && wish.single == 0);
-            let due = hold.map_or_else(|| wish.pace.due(now), |hold| come + hold);
+            let held = request.window == Window::Awaited || (request.paused && request.single == 0);
+            let due = hold.map_or_else(|| request.pace.due(now), |hold| come + hold);
             if held {
-                wish.pace.rest();
-            } else if now >= due || wish.single > 0 {
-                wish.single = wish.single.saturating_sub(1);
-                wish.pace.step(due);
-                return Go::On;
+                request.pace.rest();
+            } else if now >= due || request.single > 0 {
+                request.single = request.single.saturating_sub(1);
+                request.pace.step(due);
+                return Control::Continue;
             }
             let left = due.saturating_duration_since(now);
             let glance = if held { GLANCE } else { left.min(GLANCE) };
@@ -161,14 +162,14 @@ impl<'s> Show<'s> {
 }
 
 impl Shown {
-    /// Takes over what there is to see; `None` if the environment has no simulator.
-    fn take(&mut self, glimpse: Glimpse<'_>) -> Option<()> {
-        let Glimpse {
+    /// Copies the snapshot into the shown state; `None` if the environment has no simulator.
+    fn take(&mut self, snapshot: Snapshot<'_>) -> Option<()> {
+        let Snapshot {
             task,
-            stand,
+            phase,
             environment,
-        } = glimpse;
-        self.stand = Some(stand);
+        } = snapshot;
+        self.phase = Some(phase);
         self.instruction = task.instruction;
         self.episode = task.seed.episode;
         self.max_steps = task.max_steps;
@@ -183,21 +184,21 @@ impl Shown {
     }
 }
 
-impl Onlooker for Show<'_> {
-    fn look(&self, glimpse: Glimpse<'_>) -> Go {
-        let stand = glimpse.stand;
+impl Observer for Show<'_> {
+    fn observe(&self, snapshot: Snapshot<'_>) -> Control {
+        let phase = snapshot.phase;
         let mut shown = self.now();
         // The window's camera has refused an environment without a simulator.
-        let _ = shown.take(glimpse);
+        let _ = shown.take(snapshot);
         (self.tell)();
-        let hold = match stand {
-            Stand::Ended { .. } => Some(END),
-            Stand::Acting { .. } => shown.plans.is_empty().then_some(START),
+        let hold = match phase {
+            Phase::Ended { .. } => Some(END),
+            Phase::Acting { .. } => shown.plans.is_empty().then_some(START),
         };
-        let go = self.wait(shown, hold);
-        if let (Go::On, Stand::Acting { plan }) = (go, stand) {
+        let control = self.wait(shown, hold);
+        if let (Control::Continue, Phase::Acting { plan }) = (control, phase) {
             self.now().plans.push(plan);
         }
-        go
+        control
     }
 }

@@ -1,4 +1,4 @@
-//! The window: pictures into it, mouse and keys out of it. What can fail: the display, and drawing.
+//! The viewer's window: pictures into it, mouse and keys out of it. What can fail: the display, and drawing.
 
 use std::num::NonZeroU32;
 use std::rc::Rc;
@@ -20,13 +20,13 @@ use crate::film::camera::{Camera, Motion};
 use crate::film::canvas::Canvas;
 use crate::film::caption::{self, Caption, Progress};
 
-/// Width and height of the window's inside, at first and at least.
+/// Initial and smallest width and height of the window's inside.
 pub const SIZE: [u32; 2] = [
     800,
     caption::HEAD + 540 + caption::FOOT + caption::LINE_HEIGHT,
 ];
 const LEAST: [u32; 2] = [480, 400];
-/// How long a window keeps its size before the camera follows, which takes it a moment.
+/// Time that a window must keep its size before the camera follows, which is slow.
 const SETTLED: Duration = Duration::from_millis(200);
 /// Share of the picture's height that a notch of the wheel zooms by, and that a pixel of a touch pad does.
 const NOTCH: f64 = 0.05;
@@ -36,13 +36,13 @@ const HELP: &str = "drag: turn, right: shift, wheel: zoom | space: pause | .: st
 
 type Pixels = Surface<OwnedDisplayHandle, Rc<Window>>;
 
-/// Size of the picture in a canvas of a size.
+/// Size of the picture inside a canvas of `width` by `height` pixels.
 pub fn picture([width, height]: [u32; 2]) -> [u32; 2] {
     let around = caption::HEAD + caption::FOOT + caption::LINE_HEIGHT;
     [width.max(1), height.saturating_sub(around).max(1)]
 }
 
-/// What the window does when it is told something.
+/// Handler of the window's events.
 pub struct Screen<'s> {
     show: &'s Show<'s>,
     texts: &'s Texts,
@@ -50,7 +50,7 @@ pub struct Screen<'s> {
     canvas: Canvas,
     opened: Option<(Rc<Window>, Pixels)>,
     mouse: Mouse,
-    /// The window's inside, as it was told; a window that is just being destroyed cannot be asked.
+    /// Size of the window's inside, as last reported; a window that is just being destroyed cannot be asked.
     size: PhysicalSize<u32>,
     resized: Option<Instant>,
     title: String,
@@ -58,7 +58,7 @@ pub struct Screen<'s> {
     failed: Option<ViewerError>,
 }
 
-/// Where the mouse is, and what is pressed.
+/// Position of the mouse, and its pressed button.
 #[derive(Default)]
 struct Mouse {
     at: PhysicalPosition<f64>,
@@ -79,7 +79,7 @@ impl Mouse {
 }
 
 impl<'s> Screen<'s> {
-    /// A window to be, that shows what `camera` sees.
+    /// Prepares a window that shows what `camera` sees.
     pub fn new(show: &'s Show<'s>, camera: Camera, texts: &'s Texts) -> Self {
         Self {
             show,
@@ -96,12 +96,12 @@ impl<'s> Screen<'s> {
         }
     }
 
-    /// To be raised, and the window to be told, when there is nothing more to come.
+    /// Flag to raise, before waking the window, when the work has ended.
     pub fn done(&self) -> Arc<AtomicBool> {
         Arc::clone(&self.done)
     }
 
-    /// Why the window closed by itself, if it did.
+    /// Returns why the window closed by itself, if it did.
     pub fn failed(self) -> Option<ViewerError> {
         self.failed
     }
@@ -121,7 +121,7 @@ impl<'s> Screen<'s> {
         Ok(())
     }
 
-    /// Draws what is shown now into the window.
+    /// Draws the shown state into the window.
     fn draw(&mut self) -> Result<(), ViewerError> {
         let Some((window, pixels)) = &mut self.opened else {
             return Ok(());
@@ -160,15 +160,17 @@ impl<'s> Screen<'s> {
     fn key(&mut self, key: &Key, events: &ActiveEventLoop) {
         match key.as_ref() {
             Key::Named(NamedKey::Space) | Key::Character(" ") => {
-                self.show.ask(|wish| wish.paused = !wish.paused);
+                self.show.ask(|request| request.paused = !request.paused);
             }
-            Key::Character("." | ">") | Key::Named(NamedKey::ArrowRight) => self.show.ask(|wish| {
-                wish.single += u32::from(wish.paused);
-                wish.paused = true;
-            }),
-            Key::Character("+" | "=") => self.show.ask(|wish| wish.pace.change(1)),
-            Key::Character("-") => self.show.ask(|wish| wish.pace.change(-1)),
-            Key::Character("r" | "R") => self.show.ask(|wish| wish.again = true),
+            Key::Character("." | ">") | Key::Named(NamedKey::ArrowRight) => {
+                self.show.ask(|request| {
+                    request.single += u32::from(request.paused);
+                    request.paused = true;
+                })
+            }
+            Key::Character("+" | "=") => self.show.ask(|request| request.pace.change(1)),
+            Key::Character("-") => self.show.ask(|request| request.pace.change(-1)),
+            Key::Character("r" | "R") => self.show.ask(|request| request.restart = true),
             Key::Character("q" | "Q") | Key::Named(NamedKey::Escape) => events.exit(),
             _ => {}
         }
@@ -192,20 +194,20 @@ fn draw(
     canvas: &mut Canvas,
 ) -> Result<String, ViewerError> {
     let mut shown = show.now();
-    let Some(stand) = shown.stand else {
+    let Some(phase) = shown.phase else {
         return Ok("lads".to_owned());
     };
     camera.see(&mut shown.data)?;
     let instructions = &mut texts.instructions.iter();
     let known = instructions.find(|(index, _)| *index == shown.instruction);
     let text = known.map_or("", |(_, text)| text);
-    let (wish, plans) = (shown.wish, shown.plans.clone());
+    let (request, plans) = (shown.request, shown.plans.clone());
     let (completions, commanded) = (shown.completions.clone(), shown.commanded.clone());
     let (episode, steps) = (shown.episode + 1, shown.max_steps);
     // Episodes go on while the picture is drawn.
     drop(shown);
-    let speed = wish.pace.speed();
-    let pace = if wish.paused {
+    let speed = request.pace.speed();
+    let pace = if request.paused {
         "paused".to_owned()
     } else {
         format!("{speed} x real time")
@@ -225,7 +227,7 @@ fn draw(
     let progress = Progress {
         plans: &plans,
         completions: &completions,
-        stand,
+        phase,
     };
     let bottom = canvas.size()[1].saturating_sub(caption::LINE_HEIGHT);
     caption.draw(progress, bottom, canvas);
@@ -237,7 +239,7 @@ impl ApplicationHandler<()> for Screen<'_> {
     fn resumed(&mut self, events: &ActiveEventLoop) {
         if self.opened.is_none() {
             match self.open(events) {
-                Ok(()) => self.show.ask(|wish| wish.window = show::Window::Open),
+                Ok(()) => self.show.ask(|request| request.window = show::Window::Open),
                 Err(error) => {
                     self.failed = Some(error);
                     events.exit();

@@ -15,19 +15,19 @@ static TINY: LazyLock<Opened> = LazyLock::new(|| {
     lads_host::open(&path).unwrap()
 });
 
-/// The small bundle, compiled.
+/// Compiles the small bundle.
 pub fn tiny_policy() -> Policy<'static> {
     TINY.policy()
 }
 
-/// The small bundle's contract.
+/// Returns the contract of the small bundle.
 pub fn tiny_contract() -> &'static Contract {
     TINY.bundle().unwrap().contract()
 }
 
-/// What the environment says of itself; tests change one field at a time.
+/// Identity and shape of the environment; tests change one field at a time.
 #[derive(Clone)]
-pub struct Says {
+pub struct Spec {
     pub id: &'static str,
     pub version: &'static str,
     pub control_period_s: f64,
@@ -36,7 +36,7 @@ pub struct Says {
     pub sub_tasks: &'static [&'static str],
 }
 
-impl Default for Says {
+impl Default for Spec {
     fn default() -> Self {
         Self {
             id: "tiny-bench",
@@ -51,7 +51,7 @@ impl Default for Says {
 
 /// Five numbers that drift with the actions and with noise, inside the contract's limits; a sub-task is done once its number is high.
 pub struct Bench {
-    says: Says,
+    spec: Spec,
     stream: Stream,
     state: [f64; 5],
     observation: [f64; 5],
@@ -60,10 +60,10 @@ pub struct Bench {
 }
 
 impl Bench {
-    pub fn new(says: Says) -> Self {
+    pub fn new(spec: Spec) -> Self {
         let (state, observation) = ([0.0; 5], [0.0; 5]);
         Self {
-            says,
+            spec,
             stream: Stream::new(&[]),
             state,
             observation,
@@ -81,22 +81,22 @@ impl Bench {
 
 impl Environment for Bench {
     fn id(&self) -> &'static str {
-        self.says.id
+        self.spec.id
     }
     fn version(&self) -> &'static str {
-        self.says.version
+        self.spec.version
     }
     fn observation_names(&self) -> &'static [&'static str] {
-        self.says.observation_names
+        self.spec.observation_names
     }
     fn action_names(&self) -> &'static [&'static str] {
-        self.says.action_names
+        self.spec.action_names
     }
     fn sub_tasks(&self) -> &'static [&'static str] {
-        self.says.sub_tasks
+        self.spec.sub_tasks
     }
     fn control_period_s(&self) -> f64 {
-        self.says.control_period_s
+        self.spec.control_period_s
     }
     fn max_steps(&self, _split: &str) -> usize {
         40

@@ -1,11 +1,10 @@
-//! A program that is interrupted while it works.
+//! Runs a program and interrupts it while it works.
 
 use std::io::Read as _;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Starts the program, sends SIGINT once when `ready` says so, and gives its exit code and what it said on stderr; `None` where it ended
-/// before.
+/// Starts the program, sends SIGINT once when `ready` returns true, and returns its exit code and its stderr; `None` if it ended before.
 pub fn when(command: &mut Command, ready: &dyn Fn() -> bool) -> Option<(Option<i32>, String)> {
     let mut child = command
         .stdout(Stdio::null())

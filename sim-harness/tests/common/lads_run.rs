@@ -1,9 +1,9 @@
-//! The program under test.
+//! Makes the command line of the program under test.
 
 use std::path::Path;
 use std::process::Command;
 
-/// `lads-run` with a model that ships.
+/// Makes a `lads-run` command with a shipped model.
 pub fn lads_run(model: &str, arguments: &[&str]) -> Command {
     let model = Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../models")

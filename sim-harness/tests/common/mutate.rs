@@ -1,4 +1,4 @@
-//! Changes to a bundle, and what a verification says of them without its closed loop, which could only find more.
+//! Changes a bundle and verifies the result, without the closed loop, which could only find more.
 //!
 //! The file is changed as protocol-buffer bytes: values of a tensor in place, the contract as a whole. A changed policy is not run by its
 //! self-test, so that what is seen is what the reference sees.
@@ -30,9 +30,9 @@ const CONTRACT: &str = "lads.contract";
 /// A tensor of 32-bit floats inside the file.
 #[derive(Debug, Clone)]
 pub struct Tensor {
-    /// Its name, without `weights/`.
+    /// Name of the tensor, without `weights/`.
     pub name: String,
-    /// Elements of its first dimension.
+    /// Number of elements of the tensor's first dimension.
     pub rows: usize,
     bytes: Range<usize>,
 }
@@ -57,7 +57,7 @@ fn varint(bytes: &[u8], at: &mut usize) -> u64 {
     value
 }
 
-/// The fields of a message: number, the whole field, its content. Fields that are no bytes have their value as content.
+/// Splits a message into its fields: number, the whole field, its content. Fields that are not bytes have their value as content.
 fn fields(bytes: &[u8], message: Range<usize>) -> Vec<(u64, Range<usize>, Range<usize>)> {
     let mut found = Vec::new();
     let mut at = message.start;
@@ -133,7 +133,7 @@ impl Model {
         &self.bytes
     }
 
-    /// The same with the values of a tensor changed.
+    /// Returns a copy of the bundle with the values of a tensor changed.
     pub fn edit(&mut self, name: &str, change: impl FnOnce(&mut [f32])) {
         let tensor = self.tensors.iter().find(|tensor| tensor.name == name);
         let range = tensor
@@ -153,7 +153,7 @@ impl Model {
         }
     }
 
-    /// Rows of a tensor in another order: row `n` of the result is row `order[n]`.
+    /// Reorders the rows of a tensor: row `n` of the result is row `order[n]`.
     pub fn reorder(&mut self, name: &str, order: &[usize]) {
         self.edit(name, |values| {
             let row = values.len() / order.len();
@@ -185,7 +185,7 @@ impl Model {
         serde_json::from_slice(&self.bytes[self.contract_entry().1]).unwrap()
     }
 
-    /// The same with another contract.
+    /// Returns a copy of the bundle with another contract.
     pub fn with_contract(&self, contract: &Value) -> Self {
         let (whole, _) = self.contract_entry();
         let mut entry = Vec::new();
@@ -201,10 +201,10 @@ impl Model {
     }
 }
 
-/// What a verification says.
+/// Outcome of verifying a changed bundle.
 #[derive(Debug, Clone)]
-pub enum Said {
-    /// The bundle is not even opened or compiled.
+pub enum Outcome {
+    /// The bundle was not even opened or compiled.
     Refused(String),
     Judged(Box<Judged>),
 }
@@ -222,7 +222,7 @@ impl Judged {
             || self.answers.first_difference.is_some()
     }
 
-    /// What a verdict names first.
+    /// Returns the reason that a verdict names first.
     pub fn reason(&self) -> String {
         let field = self
             .contract
@@ -242,10 +242,10 @@ impl Judged {
 
 /// Compares a bundle with its reference: the contract, and the policy's answers to the first traced episode of the instructions whose index
 /// is a multiple of `every`.
-pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usize) -> Said {
+pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usize) -> Outcome {
     let opened = match lads_host::from_bytes_with(bytes, options) {
         Ok(opened) => opened,
-        Err(refused) => return Said::Refused(refused.to_string()),
+        Err(refused) => return Outcome::Refused(refused.to_string()),
     };
     let (bundle, policy) = (opened.bundle().unwrap(), opened.policy());
     let known = (0..reference.instructions.len() as u32).step_by(every);
@@ -269,7 +269,7 @@ pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usi
     .unwrap();
     let tolerance = policy.golden().map(|golden| f64::from(golden.tolerance()));
     let stated = serde_json::from_str(bundle.metadata(CONTRACT).unwrap()).unwrap();
-    Said::Judged(Box::new(Judged {
+    Outcome::Judged(Box::new(Judged {
         contract: Compared::new(
             &stated,
             reference.contract.as_ref(),
@@ -282,7 +282,7 @@ pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usi
     }))
 }
 
-/// Every value of a contract changed, one at a time: where it stands, and the contract.
+/// Changes every value of a contract, one at a time: returns its place, and the contract.
 pub fn contracts(contract: &Value) -> Vec<(String, Value)> {
     fn places(value: &Value, pointer: String, found: &mut Vec<String>) {
         match value {
@@ -313,7 +313,7 @@ pub fn contracts(contract: &Value) -> Vec<(String, Value)> {
     found.into_iter().map(changed).collect()
 }
 
-/// Another word where only some are known, so that the bundle still opens.
+/// Returns another word where only some are known, so that the bundle still opens.
 fn other_word(word: &str) -> String {
     match word {
         "argmax" => "sample".to_owned(),
@@ -326,14 +326,14 @@ fn other_word(word: &str) -> String {
     }
 }
 
-/// A tensor times a factor.
+/// Multiplies a tensor by a factor.
 pub fn scale(values: &mut [f32], factor: f32) {
     for x in values {
         *x *= factor;
     }
 }
 
-/// A stream of normals, the same each time.
+/// Stream of normals, the same each time.
 pub struct Normals(lads_sim::random::Stream);
 
 impl Normals {
@@ -347,7 +347,7 @@ impl Normals {
     }
 }
 
-/// Every weight off by relative noise.
+/// Returns the model with relative noise on every weight.
 pub fn noisy(model: &Model, relative: f32, seed: u64) -> Model {
     let (mut model, mut normals) = (model.clone(), Normals::new(seed));
     for tensor in model.tensors.clone() {
@@ -360,7 +360,7 @@ pub fn noisy(model: &Model, relative: f32, seed: u64) -> Model {
     model
 }
 
-/// The plans under other numbers, throughout.
+/// Returns the model with its plans under other numbers, throughout.
 pub fn renumbered(model: &Model, step: usize) -> Model {
     let mut model = model.clone();
     let codes = model

@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 
-/// Panics with the path of the first value that does not fit.
+/// Checks a value; panics with the path of the first value that does not fit.
 pub fn check(value: &Value, schema: &Value, root: &Value, path: &str) {
     for (keyword, rule) in schema.as_object().unwrap() {
         let fits = match keyword.as_str() {
@@ -18,7 +18,7 @@ pub fn check(value: &Value, schema: &Value, root: &Value, path: &str) {
             },
             "const" => value == rule,
             "enum" => rule.as_array().unwrap().contains(value),
-            // A bound says nothing about a value that is no number.
+            // A bound says nothing about a value that is not a number.
             "minimum" => value
                 .as_f64()
                 .is_none_or(|number| number >= rule.as_f64().unwrap()),

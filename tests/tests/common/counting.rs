@@ -6,7 +6,7 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
 thread_local! {
-    /// Allocations, reallocations and deallocations of this thread while counting; `None` while not.
+    /// Number of allocations, reallocations and deallocations of this thread while counting; `None` while not.
     static CALLS: Cell<Option<usize>> = const { Cell::new(None) };
 }
 
@@ -45,7 +45,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// Calls of the allocator while `work` runs on this thread.
+/// Counts the calls of the allocator while `work` runs on this thread.
 pub fn calls_during(work: impl FnOnce()) -> usize {
     CALLS.set(Some(0));
     work();

@@ -1,4 +1,5 @@
-//! Every block of commands is run: short ones here, long ones with the full suite, and of the others it is looked at what they would do.
+//! Tests every block of commands: short ones are run here, long ones with the full suite, and for the others it is checked what they would
+//! do.
 //!
 //! Short blocks run in a folder of their own, whose entries lead to the project's, with the `lads` of this build. The full suite runs
 //! short and long ones, document after document, in a copy of the project, built as a user builds it: hours on a slow machine.
@@ -14,7 +15,7 @@ use lads_tests::project_path;
 /// Languages of blocks that hold no commands.
 const QUIET: [&str; 7] = ["rust", "c", "cpp", "json", "toml", "text", "python"];
 
-/// How a line begins that is a command.
+/// First words of lines that are commands.
 const PROGRAMS: [&str; 13] = [
     "make ",
     "cargo ",
@@ -37,11 +38,11 @@ fn blocks() -> Vec<Block> {
     blocks.collect()
 }
 
-/// Runs a script; its output, if it fails.
+/// Runs a script; returns its output as an error if it fails.
 fn run(folder: &Path, script: &str) -> Result<String, String> {
     let mut bash = Command::new("bash");
     bash.args(["-euo", "pipefail", "-c", script]);
-    // Those of the test's own build are no user's.
+    // Those of the test's own build are not a user's.
     for variable in ["CARGO_TARGET_DIR", "MAKEFLAGS", "MAKELEVEL", "RUSTFLAGS"] {
         bash.env_remove(variable);
     }
@@ -110,16 +111,16 @@ fn every_make_that_is_shown_would_do_something() {
     }
 }
 
-/// What `make` would run.
+/// Returns what `make` would run.
 fn would_run(command: &str) -> Result<String, String> {
     let script = format!("make() {{ command make -n \"$@\"; }}\n{command}");
     run(&project_path("."), &script)
 }
 
-/// What short commands run, as their folders in `target/release` have it.
+/// Programs that short commands run, by their folders in `target/release`.
 const BUILT: [&str; 2] = ["lads", "examples/biped"];
 
-/// A folder that looks like the project and takes what commands write; with the programs of a build of today.
+/// Makes a folder that looks like the project and takes what commands write; with the programs of an up-to-date build.
 fn folder() -> tempfile::TempDir {
     let target = Path::new(env!("CARGO_TARGET_TMPDIR"))
         .parent()
@@ -173,7 +174,7 @@ fn short_commands_run_as_typed() {
     }
 }
 
-/// A copy of what belongs to the project, with what was fetched.
+/// Copies the project's files, with what was fetched.
 fn copy() -> PathBuf {
     let target = Path::new(env!("CARGO_TARGET_TMPDIR"))
         .parent()

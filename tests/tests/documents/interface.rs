@@ -1,4 +1,4 @@
-//! Names of the C interface in comments and documents exist, and C in documents compiles.
+//! Tests that names of the C interface in comments and documents exist, and that C in documents compiles.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -8,7 +8,7 @@ use std::process::Command;
 use lads_tests::documents::{documents, files};
 use lads_tests::project_path;
 
-/// What begins like a name of the interface and is none.
+/// Words that begin like a name of the interface but are not one.
 const OTHER: [&str; 8] = [
     // Environment variables.
     "LADS_CACHE",
@@ -23,7 +23,7 @@ const OTHER: [&str; 8] = [
     "lads_exporter",
 ];
 
-/// Everything that looks like a name of the interface.
+/// Collects everything that looks like a name of the interface.
 fn names(text: &str) -> BTreeSet<&str> {
     let words = text.split(|c: char| !c.is_ascii_alphanumeric() && c != '_');
     words
@@ -32,7 +32,7 @@ fn names(text: &str) -> BTreeSet<&str> {
         .collect()
 }
 
-/// The comments of a source in C, C++ or Rust; a text without its code.
+/// Returns the comments of a source in C, C++ or Rust; a text without its code.
 fn comments(source: &str) -> String {
     let mut found = String::new();
     let mut inside = false;
@@ -49,7 +49,7 @@ fn comments(source: &str) -> String {
     found
 }
 
-/// The names that the headers declare.
+/// Returns the names that the headers declare.
 fn declared(header: &str) -> BTreeSet<&str> {
     let comments = comments(header);
     let in_comments = names(&comments);
@@ -73,7 +73,7 @@ fn text(path: &Path) -> String {
     fs::read_to_string(project_path(".").join(path)).unwrap_or_default()
 }
 
-/// Crates and test helpers that are called `lads_*` in Rust and Python.
+/// Returns the crates and test helpers that are called `lads_*` in Rust and Python.
 fn modules() -> BTreeSet<String> {
     let manifests = files(&["toml"]);
     let manifests = manifests.iter().filter(|path| path.ends_with("Cargo.toml"));
@@ -146,7 +146,7 @@ fn the_header_declares_only_the_interface() {
     );
 }
 
-/// What documents leave to the reader, around what they show.
+/// Code around the documents' examples, which they leave to the reader.
 const AROUND: [&str; 2] = [
     "#include <lads.h>\n#include <stdlib.h>\nvoid fail(const char *text);\n\
      lads_status shown(const uint8_t *image, size_t image_bytes, const float *observation, size_t n, lads_tick tick, float *action, size_t m);\n\

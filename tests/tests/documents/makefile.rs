@@ -1,4 +1,4 @@
-//! The Makefile has the rules that are spoken of.
+//! Tests that the Makefile has the rules that documents mention.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -10,7 +10,7 @@ fn makefile() -> String {
     fs::read_to_string(project_path("Makefile")).expect("the project has a Makefile")
 }
 
-/// The names before a colon that begins a rule.
+/// Returns the names before a colon that begins a rule.
 fn rules(text: &str) -> BTreeSet<&str> {
     let lines = text.lines().filter(|line| {
         !line.starts_with(['\t', '#', ' ']) && !line.starts_with(".PHONY") && !line.contains(":=")
@@ -21,7 +21,7 @@ fn rules(text: &str) -> BTreeSet<&str> {
         .collect()
 }
 
-/// The rules behind every `make ` that stands in the font of code; and the one where people are told to run it.
+/// Returns the rules behind every `make ` in inline code; and those where people are told to run one.
 fn spoken_of(text: &str) -> BTreeSet<String> {
     let mut names = BTreeSet::new();
     for (place, _) in text.match_indices("make ") {
@@ -76,7 +76,7 @@ fn every_rule_with_a_help_line_is_there() {
     for (name, _) in helped {
         assert!(
             name.starts_with(' ') || rules.contains(name),
-            "help of `{name}`, which is no rule"
+            "help of `{name}`, which is not a rule"
         );
     }
 }

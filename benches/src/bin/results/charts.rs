@@ -1,4 +1,4 @@
-//! The charts of the page, as SVG.
+//! Charts of the results page, as SVG.
 
 use kuva::backend::svg::SvgBackend;
 use kuva::plot::LinePlot;
@@ -6,15 +6,15 @@ use kuva::render::layout::Layout;
 use kuva::render::plots::Plot;
 use kuva::render::render::render_multiple;
 
-/// One line colour per contender, readable on white for colour-blind people too.
+/// Line colours, one per contender, readable on white for colour-blind people too.
 const COLOURS: [&str; 8] = [
     "#0072b2", "#56b4e9", "#d55e00", "#e69f00", "#009e73", "#cc79a7", "#999999", "#000000",
 ];
 
-/// A name and its points.
+/// Name of a line, and its points.
 pub type Line = (String, Vec<(f64, f64)>);
 
-/// Lines over a common axis.
+/// Draws lines over a common axis.
 pub fn lines(title: &str, x: &str, y: &str, lines: &[Line], log: bool) -> String {
     let plots: Vec<Plot> = lines
         .iter()
@@ -39,7 +39,7 @@ pub fn lines(title: &str, x: &str, y: &str, lines: &[Line], log: bool) -> String
     SvgBackend.render_scene(&render_multiple(plots, layout))
 }
 
-/// What share of the calls took longer than so many microseconds, of each contender.
+/// Computes the share of calls that took longer than so many microseconds, for one contender.
 pub fn tail(took_us: &mut [f64]) -> Vec<(f64, f64)> {
     took_us.sort_by(f64::total_cmp);
     let count = took_us.len() as f64;

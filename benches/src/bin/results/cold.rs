@@ -1,4 +1,4 @@
-//! The first step of a process. Every sample is a process of its own (this program, called with `--cold`), which opens a compiled
+//! Measures the first step of a process. Every sample is a process of its own (this program, called with `--cold`), which opens a compiled
 //! image, takes its first steps, and then measures the same steps again in warm caches.
 
 use std::path::Path;
@@ -13,15 +13,15 @@ use lads_pace::stats::{median, quantile};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-/// Episodes that are measured again, hot.
+/// Number of episodes that are measured again, hot.
 const AGAIN: usize = 40;
 
-/// One process, in nanoseconds.
+/// Durations of one process, in nanoseconds.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct Start {
     /// Opening the image.
     open: u64,
-    /// Memory and controller.
+    /// Allocating memory and making the controller.
     prepare: u64,
     /// Warming up, where it was asked for.
     warm: u64,
@@ -29,9 +29,9 @@ pub struct Start {
     instruct: u64,
     /// The first control step, which decides.
     first: u64,
-    /// The second, which does not.
+    /// The second control step, which does not decide.
     second: u64,
-    /// The same three, hot.
+    /// Instruction, first and second control step once more, hot.
     hot: [u64; 3],
 }
 
@@ -45,7 +45,7 @@ fn refused(error: impl std::fmt::Display) -> BenchError {
     BenchError::new("the compiled image", error, "compile it again")
 }
 
-/// What the process does that was started with `--cold`; prints its numbers.
+/// Runs the process that was started with `--cold`; prints its durations.
 pub fn child(image: &Path, warm: bool) -> Result<(), BenchError> {
     let file = std::fs::read(image).map_err(refused)?;
     // Words, for the image's alignment.
@@ -91,7 +91,7 @@ pub fn child(image: &Path, warm: bool) -> Result<(), BenchError> {
     Ok(())
 }
 
-/// An instruction and two steps.
+/// Sets an instruction and runs two steps.
 fn begin(controller: &mut Controller<'_, '_>, episode: &Episode) -> Result<[u64; 3], BenchError> {
     let mut action = vec![0.0; episode.limits.len()];
     let instruction = Instruction::Id(episode.instruction.unwrap_or(0));
@@ -104,7 +104,7 @@ fn begin(controller: &mut Controller<'_, '_>, episode: &Episode) -> Result<[u64;
     Ok([instruct, step(0)?, step(1)?])
 }
 
-/// Starts `processes` of either kind in turns and sums them up, in microseconds.
+/// Starts `processes` processes of either kind in turns and sums them up, in microseconds.
 pub fn measure(image: &Path, processes: usize) -> Result<Value, BenchError> {
     let program = std::env::current_exe().map_err(refused)?;
     let run = |warm: bool| -> Result<Start, BenchError> {

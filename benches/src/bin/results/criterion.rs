@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 
-/// All benchmarks below criterion's folder, by name; empty where there is none.
+/// Reads all benchmarks below criterion's folder, by name; empty where there is none.
 pub fn collect(folder: &Path) -> Vec<Value> {
     let mut found = vec![];
     walk(folder, &mut found);

@@ -13,7 +13,7 @@ use crate::page::page;
 use crate::regression::Changes;
 use crate::rows::Row;
 
-/// Everything that was measured.
+/// Measurements that the results page is made of.
 pub struct Measured {
     pub machine: Value,
     pub field: Value,
@@ -31,7 +31,7 @@ pub struct Measured {
     pub seconds: f64,
 }
 
-/// Writes all files.
+/// Writes all files of the results.
 pub fn write(
     folder: &Path,
     measured: &Measured,
@@ -85,7 +85,7 @@ fn as_json(measured: &Measured, rows: &[Row]) -> Value {
     })
 }
 
-/// The charts by file name.
+/// Draws the charts, by file name.
 fn draw(measured: &Measured) -> Vec<(&'static str, String)> {
     let mut drawn = vec![];
     for (file, kind, title) in [

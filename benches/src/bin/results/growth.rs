@@ -1,4 +1,5 @@
-//! What grows with what: random bundles of growing size, which the exporter makes, and the exponents of power laws through them.
+//! Measures how costs grow with a policy's sizes: random bundles of growing size, which the exporter makes, and the exponents of power laws
+//! through them.
 
 use std::path::Path;
 
@@ -16,34 +17,34 @@ use serde::{Deserialize, Serialize};
 use crate::Effort;
 use crate::measure::CONTEXT;
 
-/// One bundle.
+/// Measurements of one bundle.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Point {
     /// Size of the dimension that grows.
     pub value: f64,
-    /// Bytes of the compiled image.
+    /// Size of the compiled image in bytes.
     pub image_bytes: f64,
-    /// Bytes of the controller's memory.
+    /// Size of the controller's memory in bytes.
     pub workspace_bytes: f64,
-    /// Medians in microseconds: lads, then ONNX Runtime.
+    /// Median times of the low level in microseconds: lads, then ONNX Runtime.
     pub act: [f64; 2],
-    /// The same of an ordinary step.
+    /// Median times of an ordinary step in microseconds: lads, then ONNX Runtime.
     pub ordinary: [f64; 2],
-    /// The same of a decision step.
+    /// Median times of a decision step in microseconds: lads, then ONNX Runtime.
     pub decision: [f64; 2],
 }
 
-/// All bundles that differ in one dimension.
+/// Bundles that differ in one dimension.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Series {
-    /// The dimension.
+    /// Name of the dimension.
     pub name: String,
-    /// Its points, in order.
+    /// Measurements, in order of the dimension's size.
     pub points: Vec<Point>,
 }
 
 impl Series {
-    /// The fitted exponent of a column, and R².
+    /// Fits a power law to a column: its exponent, and R².
     pub fn exponent(&self, of: impl Fn(&Point) -> f64) -> Option<(f64, f64)> {
         let points: Vec<_> = self
             .points

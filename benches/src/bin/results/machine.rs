@@ -1,4 +1,4 @@
-//! The machine and the versions that numbers belong to. What a system does not tell is left out.
+//! Describes the machine and the versions that the measurements belong to. What a system does not tell is left out.
 
 use std::fs;
 use std::process::Command;
@@ -11,7 +11,7 @@ fn first_line(program: &str, arguments: &[&str]) -> Option<String> {
     text.lines().next().map(str::to_owned)
 }
 
-/// A field of `/proc/cpuinfo`.
+/// Reads a field of `/proc/cpuinfo`.
 fn cpu(field: &str) -> Option<String> {
     let text = fs::read_to_string("/proc/cpuinfo").ok()?;
     let line = text.lines().find(|line| line.starts_with(field))?;
@@ -33,7 +33,7 @@ fn caches() -> Vec<String> {
         .collect()
 }
 
-/// Everything as JSON.
+/// Describes machine and versions as JSON.
 pub fn describe() -> Value {
     let cores = std::thread::available_parallelism().map_or(0, std::num::NonZero::get);
     let load = fs::read_to_string("/proc/loadavg").unwrap_or_default();

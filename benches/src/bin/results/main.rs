@@ -37,7 +37,7 @@ use serde_json::{Value, json};
 
 use crate::measure::Bare;
 
-/// How often things are measured.
+/// Numbers of repetitions of the measurements.
 #[derive(Debug, Clone, Copy)]
 pub struct Effort {
     hot_rounds: usize,
@@ -125,7 +125,7 @@ fn say(text: &str) {
     eprintln!("{text}");
 }
 
-/// The images of the policy that ships, with the weights stored in every way that gives the same plans.
+/// Compiles the shipped policy, with the weights stored in every way that gives the same plans.
 fn images(bundle: &Bundle) -> Result<Vec<(&'static str, Aligned)>, BenchError> {
     let mut images = vec![];
     for weights in WeightFormat::ALL {
@@ -139,7 +139,7 @@ fn images(bundle: &Bundle) -> Result<Vec<(&'static str, Aligned)>, BenchError> {
     Ok(images)
 }
 
-/// Images that the paced run for the tails measures: weights of 32 and of 16 bits.
+/// Number of images that the paced run for the tails measures: weights of 32 and of 16 bits.
 const FOR_TAILS: usize = 3;
 
 #[expect(clippy::too_many_lines, reason = "the order of the run, step by step")]
@@ -260,14 +260,14 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
     Ok(())
 }
 
-/// Bytes of the low level's weights in 32 bits.
+/// Size of the low level's weights with 32 bits, in bytes.
 fn low_level_bytes(bundle: &[u8]) -> Result<usize, BenchError> {
     let act = Source::new(bundle)?.cut("low_level/act")?;
     // All but some hundred bytes of this model are its weights; cache lines are the unit in any case.
     Ok(act.len() / 64 * 64)
 }
 
-/// Compiling, opening, and sizes.
+/// Measures compiling and opening, and lists sizes.
 fn preparation(
     bytes: &[u8],
     bundle: &Bundle,
@@ -314,7 +314,7 @@ fn preparation(
     )
 }
 
-/// Exports the model without a cache at the last control step of an episode; says where it lies, or why there is none.
+/// Exports the model without a cache at the last control step of an episode; returns its path, or why there is none.
 fn export_recompute(
     arguments: &Arguments,
     candidates: &[Candidate<'_>],
@@ -351,7 +351,7 @@ fn export_recompute(
     })
 }
 
-/// The model without a cache, on the runtimes that take it.
+/// Measures the model without a cache, on the runtimes that take it.
 fn recomputes(arguments: &Arguments, model: &Result<PathBuf, String>) -> Vec<Box<dyn Contender>> {
     let model = match model {
         Ok(model) => model,
@@ -372,7 +372,7 @@ fn recomputes(arguments: &Arguments, model: &Result<PathBuf, String>) -> Vec<Box
     open
 }
 
-/// Lets the exporter make the random bundles, unless they are there.
+/// Makes the random bundles with the exporter, unless they exist.
 fn export_growth(arguments: &Arguments, folder: &Path) -> Result<(), BenchError> {
     if folder.join("index.json").is_file() {
         return Ok(());

@@ -1,10 +1,10 @@
-//! Tables and numbers in Markdown. Nothing here can fail.
+//! Formats tables and numbers in Markdown. Nothing here can fail.
 
 use std::fmt::Write as _;
 
 use serde_json::Value;
 
-/// A table in Markdown; the first column is text, the others are numbers.
+/// Formats a table in Markdown; the first column is text, the others are numbers.
 pub fn table(header: &[&str], rows: impl Iterator<Item = Vec<String>>) -> String {
     let mut text = format!(
         "| {} |\n|---|{}\n",
@@ -17,17 +17,17 @@ pub fn table(header: &[&str], rows: impl Iterator<Item = Vec<String>>) -> String
     text
 }
 
-/// A text, or a question mark where there is none.
+/// Formats a text, or a question mark where there is none.
 pub fn text(value: &Value) -> String {
     value.as_str().unwrap_or("?").to_owned()
 }
 
-/// A number, or a dash where there is none.
+/// Formats a number, or a dash where there is none.
 pub fn number(value: &Value) -> String {
     value.as_f64().map_or_else(|| "–".into(), plain)
 }
 
-/// Three significant digits or so.
+/// Formats a number with three significant digits or so.
 pub fn plain(x: f64) -> String {
     match x.abs() {
         size if size >= 100.0 => format!("{x:.0}"),
@@ -37,7 +37,7 @@ pub fn plain(x: f64) -> String {
     }
 }
 
-/// Texts one after the other.
+/// Joins texts to a list.
 pub fn list(value: &Value) -> String {
     value
         .as_array()

@@ -1,4 +1,4 @@
-//! The two runs that the ratios come from: hot, and at 50 Hz.
+//! Measures the two runs that the ratios are from: hot, and at 50 Hz.
 
 use std::time::Duration;
 
@@ -22,7 +22,7 @@ pub const CONTEXT: usize = 300;
 /// Control steps per second of the paced runs.
 pub const RATE: u64 = 50;
 
-/// Calls of a block.
+/// Number of calls in a block.
 const CALLS: usize = 20;
 
 /// Measured rounds of several contenders, by name.
@@ -33,13 +33,13 @@ pub struct Run {
 }
 
 impl Run {
-    /// The rounds of a contender.
+    /// Returns the rounds of a contender.
     pub fn of(&self, name: &str) -> Option<&Rounds> {
         let at = self.names.iter().position(|known| known == name)?;
         self.rounds.get(at)
     }
 
-    /// Latencies of all contenders and kinds, in microseconds.
+    /// Lists the latencies of all contenders and kinds, in microseconds.
     pub fn rows(&self) -> Vec<Value> {
         let us = |ns: u64| ns as f64 / 1e3;
         let mut rows = vec![];
@@ -58,7 +58,7 @@ impl Run {
     }
 }
 
-/// Reads as many bytes as the low level's weights have, and does nothing else.
+/// A contender that reads as many bytes as the low level's weights have, and does nothing else.
 pub struct Bare {
     name: String,
     sweep: Sweep,
@@ -98,7 +98,8 @@ impl Contender for Bare {
     }
 }
 
-/// One after the other: the low level, control steps around [`CONTEXT`], instructions, and the whole history where it is offered.
+/// Measures hot, one after the other: the low level, control steps around [`CONTEXT`], instructions, and the whole history where it is
+/// offered.
 pub fn hot(
     field: &Field<'_>,
     contenders: &mut [&mut dyn Contender],
@@ -148,7 +149,7 @@ pub fn hot(
     })
 }
 
-/// Once every 20 ms, asleep in between.
+/// Measures once every 20 ms, asleep in between.
 pub fn paced(
     field: &Field<'_>,
     contenders: &mut [&mut dyn Contender],
@@ -175,7 +176,7 @@ pub fn paced(
     })
 }
 
-/// Ordinary steps at several contexts, hot: `(tokens, microseconds)` for each contender.
+/// Measures ordinary steps at several contexts, hot: `(tokens, microseconds)` for each contender.
 pub fn contexts(
     field: &Field<'_>,
     contenders: &mut [&mut dyn Contender],
@@ -211,7 +212,7 @@ fn names(contenders: &[&mut dyn Contender]) -> Vec<String> {
         .collect()
 }
 
-/// The ratio of two rows of rounds, and how far its first and second half of the run are apart.
+/// Computes the ratio of two rows of rounds, and how far its first and second half of the run are apart.
 pub fn ratio(above: &[f64], below: &[f64]) -> Option<(Ratio, f64)> {
     let whole = Ratio::of(above, below)?;
     let middle = above.len().min(below.len()) / 2;

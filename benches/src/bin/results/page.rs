@@ -1,4 +1,4 @@
-//! RESULTS.md: what was measured, in tables with a word on what each means.
+//! Renders RESULTS.md: the measurements, in tables with a word on what each means.
 
 use std::fmt::Write as _;
 
@@ -12,7 +12,7 @@ use crate::measure::CONTEXT;
 use crate::regression::Changes;
 use crate::rows::Row;
 
-/// The page.
+/// Renders the page.
 pub fn page(measured: &Measured, rows: &[Row], changes: &Changes) -> String {
     let mut page = String::new();
     let parts = [
@@ -338,7 +338,7 @@ fn fitted(fit: Option<(f64, f64)>) -> String {
     fit.map_or_else(|| "–".into(), |(e, r2)| format!("{e:.2} ({r2:.2})"))
 }
 
-/// The name of a column and what is in it.
+/// Header of a column, and its value at a point.
 type Column = (&'static str, fn(&Point) -> f64);
 
 fn network(measured: &Measured) -> String {

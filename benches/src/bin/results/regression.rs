@@ -7,21 +7,21 @@ use serde_json::Value;
 
 use crate::rows::Row;
 
-/// Beyond this a change is worth a warning.
+/// Relative change beyond which a ratio is worth a warning.
 const WORTH: f64 = 0.15;
 
-/// What became of the ratios.
+/// Changes of the ratios since the committed results.
 #[derive(Debug, Default)]
 pub struct Changes {
     /// Commit or file that was compared with.
     pub with: Option<String>,
-    /// `(row, before, now)` of every ratio that is in both.
+    /// Ratios that are in both, as `(row, before, now)`.
     pub all: Vec<(String, f64, f64)>,
-    /// Lines about those that became worse by more than 15 %.
+    /// Lines about the ratios that became worse by more than 15 %.
     pub warnings: Vec<String>,
 }
 
-/// The numbers of the last commit, or, outside a repository, of the folder.
+/// Reads the results of the last commit, or, outside a repository, of the folder.
 pub fn committed(folder: &Path) -> Option<(String, Value)> {
     let file = folder.join("results.json");
     let shown = Command::new("git")
@@ -42,7 +42,7 @@ pub fn committed(folder: &Path) -> Option<(String, Value)> {
     ))
 }
 
-/// Compares row by row.
+/// Compares the ratios row by row.
 pub fn compare(rows: &[Row], before: Option<&(String, Value)>) -> Changes {
     let Some((with, before)) = before else {
         return Changes::default();

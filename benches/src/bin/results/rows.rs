@@ -1,4 +1,4 @@
-//! The ratios that the runtime is held to, each with its target and what was measured.
+//! Ratios that the runtime is held to, each with its target and its measurement.
 
 use lads_pace::contender::Kind;
 use lads_pace::stats::{Ratio, Rounds, quantile};
@@ -8,20 +8,20 @@ use serde_json::Value;
 use crate::files::Measured;
 use crate::measure::{Run, ratio};
 
-/// One line of the table.
+/// A ratio of the table.
 #[derive(Debug, Clone, Serialize)]
 pub struct Row {
-    /// Short, for the comparison with earlier results.
+    /// Short name, for the comparison with earlier results.
     pub id: String,
-    /// For people.
+    /// Label of the row, for people.
     pub label: String,
-    /// What was measured, if it was.
+    /// Measured ratio, if there is one.
     pub ratio: Option<Ratio>,
-    /// How far the first and the second half of the run are apart.
+    /// Distance between the first and the second half of the run.
     pub halves: Option<f64>,
-    /// At most this, if there is a target.
+    /// Largest ratio that meets the target, if there is a target.
     pub target: Option<f64>,
-    /// Unit of the number; a ratio has none.
+    /// Unit of the number; empty for a ratio.
     pub unit: &'static str,
 }
 
@@ -32,7 +32,7 @@ impl Row {
     }
 }
 
-/// Something of a contender in a run: `(run, contender, kind, quantile)`.
+/// One side of a ratio, as `(run, contender, kind, quantile)`.
 type Side<'r> = (&'r Run, &'static str, Kind, f64);
 
 fn per_round((run, name, kind, q): Side<'_>) -> Vec<f64> {
@@ -41,7 +41,7 @@ fn per_round((run, name, kind, q): Side<'_>) -> Vec<f64> {
         .unwrap_or_default()
 }
 
-/// p50: the median over rounds of the rounds' ratios.
+/// Computes the row of a p50: the median over rounds of the rounds' ratios.
 fn paired(id: &str, label: &str, above: Side<'_>, below: Side<'_>, target: Option<f64>) -> Row {
     let found = ratio(&per_round(above), &per_round(below));
     Row {
@@ -56,7 +56,8 @@ fn paired(id: &str, label: &str, above: Side<'_>, below: Side<'_>, target: Optio
     }
 }
 
-/// A tail: over all calls of the run, because a round is too short for one. Its quartiles are those of four parts of the run.
+/// Computes the row of a tail: over all calls of the run, because a round is too short for one. Its quartiles are those of four parts of
+/// the run.
 fn pooled(id: &str, label: &str, above: Side<'_>, below: Side<'_>, target: Option<f64>) -> Row {
     let of = |(run, name, kind, q): Side<'_>, part: Option<usize>| {
         let rounds: &Rounds = run.of(name)?;
@@ -107,10 +108,10 @@ fn number(id: &str, label: &str, value: &Value, target: Option<f64>, unit: &'sta
 
 const ORT: &str = "ONNX Runtime";
 
-/// Weights of half the bytes: the contender, and how they are stored.
+/// Contenders whose weights have half the bytes, each with the format of its weights.
 const HALVED: [[&str; 2]; 2] = [["lads int16", "int16"], ["lads f16", "f16"]];
 
-/// All rows, in the order of the page.
+/// Computes all rows, in the order of the page.
 #[expect(clippy::too_many_lines, reason = "a list: every row of the page, once")]
 pub fn rows(measured: &Measured) -> Vec<Row> {
     let Measured {

@@ -1,11 +1,11 @@
-//! The rules of the verdict, one by one.
+//! Tests of the verdict's rules, one by one.
 
 use super::super::answers::Answer;
 use super::super::pairs::{N_RATE_MARGIN, NRatePair, RATE_MARGIN, RatePair};
 use super::super::statistics::{Counts, Pairs};
 use super::*;
 
-/// A verification of `n` episodes in which one sub-task was done in `both`, in the run only, and in the reference only.
+/// Makes a verification of `n` episodes in which one sub-task was done in `both`, in the run only, and in the reference only.
 fn certificate(n: usize, both: usize, run_only: usize, reference_only: usize) -> Certificate {
     let policy = Answers {
         episodes: 2,
@@ -126,7 +126,7 @@ fn few_equal_episodes_decide_nothing_and_the_asked_number_does() {
     assert!(more < 500, "{more}");
 }
 
-/// 10 of 8,080 episodes fall out otherwise, all one way: McNemar's p is 0.002, and the loss of 0.12 % is nothing beside 5 %.
+/// Case of 10 of 8,080 episodes that differ, all one way: McNemar's p is 0.002, and the loss of 0.12 % is nothing beside 5 %.
 #[test]
 fn what_is_significant_and_negligible_is_called_so() {
     let found = certificate(8080, 4000, 0, 10);

@@ -1,4 +1,4 @@
-//! Pairs of counts: numbers of completed sub-tasks, in run and reference.
+//! Tests and intervals for pairs of counts: numbers of completed sub-tasks, in run and reference.
 //!
 //! A difference of means is tested by betting (Waudby-Smith and Ramdas 2024, *JRSS B* 86:1): whoever bets a share of the capital on each pair, at
 //! odds that are fair where the difference is as large as the hypothesis says, multiplies it by 20 with a chance of at most 5 %. That holds for
@@ -10,20 +10,20 @@ use std::collections::BTreeMap;
 use super::{Difference, EQUIVALENCE, EQUIVALENCE_LEVEL, REPORTED, crossing, smallest_growth};
 use crate::metrics::Interval;
 
-/// Shares of the largest bet that cannot lose everything twice, and of the capital that is bet so. The largest is the best where few pairs
-/// differ, the smaller ones where many do.
+/// Bets as shares of the largest bet that cannot lose everything twice, each with its share of the capital. The largest is the best where
+/// few pairs differ, the smaller ones where many do.
 const BETS: [(f64, f64); 4] = [(1.0, 0.5), (0.5, 0.25), (0.25, 0.125), (0.125, 0.125)];
 
-/// Numbers of completed sub-tasks, run and reference, episode by episode.
+/// Pairs of counts: completed sub-tasks in run and reference, episode by episode.
 #[derive(Debug, Clone, Default)]
 pub struct Counts {
     pairs: Vec<[f64; 2]>,
-    /// The most that any of these episodes commanded.
+    /// Largest number of sub-tasks that any of the episodes commanded.
     most: usize,
 }
 
 impl Counts {
-    /// One more pair of episodes, in which `commanded` could be completed.
+    /// Adds a pair of episodes, in which `commanded` sub-tasks could be completed.
     pub fn add(&mut self, run: usize, reference: usize, commanded: usize) {
         self.pairs.push([run as f64, reference as f64]);
         self.most = self.most.max(commanded).max(run).max(reference);
@@ -33,12 +33,12 @@ impl Counts {
         self.pairs.iter().map(of).sum::<f64>() / self.pairs.len().max(1) as f64
     }
 
-    /// Means of run and reference.
+    /// Mean counts of run and reference.
     pub fn means(&self) -> [f64; 2] {
         [self.mean(|x| x[0]), self.mean(|x| x[1])]
     }
 
-    /// Difference of the means, the pairing used.
+    /// Compares the means as pairs.
     pub fn paired(&self, margin: f64) -> Difference {
         let bets = self.bets();
         let [run, reference] = self.means();
@@ -67,14 +67,14 @@ impl Counts {
         }
     }
 
-    /// The p-values that judge, without the intervals.
+    /// Computes the p-values that judge, without the intervals: of equivalence, and of a difference beyond the margin.
     #[cfg(test)]
     pub(super) fn judged(&self, margin: f64) -> (f64, f64) {
         let bets = self.bets();
         (bets.p_equivalence(margin, 1.0), bets.p_beyond(margin))
     }
 
-    /// Difference of the means as if run and reference were two samples: a normal approximation.
+    /// Compares the means as if run and reference were two independent samples, by a normal approximation.
     pub fn unpaired(&self, margin: f64) -> Difference {
         let n = self.pairs.len() as f64;
         let [run, reference] = self.means();
@@ -110,14 +110,14 @@ impl Counts {
     }
 }
 
-/// What is bet on: how often each difference was seen, and the largest there can be.
+/// Counts of each paired difference, with the largest difference that is possible.
 struct Bets {
     seen: Vec<(f64, f64)>,
     most: f64,
 }
 
 impl Bets {
-    /// Run and reference exchanged.
+    /// Exchanges run and reference.
     fn mirrored(&self) -> Self {
         Self {
             seen: self
@@ -129,19 +129,19 @@ impl Bets {
         }
     }
 
-    /// The larger p-value of the two one-sided tests of a difference as large as the margin.
+    /// Computes the larger p-value of the two one-sided tests of a difference as large as the margin.
     fn p_equivalence(&self, margin: f64, growth: f64) -> f64 {
         let lost = self.p_greater(-margin, growth);
         lost.max(self.mirrored().p_greater(-margin, growth))
     }
 
-    /// The smaller p-value of the two one-sided tests of a difference within the margin.
+    /// Computes the smaller p-value of the two one-sided tests of a difference within the margin.
     fn p_beyond(&self, margin: f64) -> f64 {
         self.p_greater(margin, 1.0)
             .min(self.mirrored().p_greater(margin, 1.0))
     }
 
-    /// The p-value of what was seen, were there `growth` times as much of it, where the mean is at most `bound`.
+    /// Computes the p-value of the observed counts, multiplied by `growth`, under a mean of at most `bound`.
     fn p_greater(&self, bound: f64, growth: f64) -> f64 {
         // The worst pair then leaves nothing of the capital.
         let largest = 1.0 / (self.most + bound).max(f64::MIN_POSITIVE);
@@ -188,7 +188,7 @@ mod tests {
         );
     }
 
-    /// A loss of all four sub-tasks in 1 of 40 episodes is a loss of 0.1 and shows in none of 25 episodes with 53 %.
+    /// Case: a loss of all four sub-tasks in 1 of 40 episodes is a loss of 0.1 and shows in none of 25 episodes with 53 %.
     #[test]
     fn a_few_identical_episodes_prove_nothing() {
         for n in [17, 25, 50, 100] {

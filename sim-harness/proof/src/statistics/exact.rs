@@ -11,15 +11,15 @@ use statrs::function::factorial::ln_binomial;
 use super::{crossing, quantile};
 use crate::metrics::Interval;
 
-/// Chance that the parameter lies outside of the set in which it is looked for.
+/// Chance that the confidence set of the unknown parameter misses it.
 const MISSED: f64 = 1e-5;
-/// Places in that set.
+/// Number of places in the confidence set at which the p-value is computed.
 const PLACES: usize = 48;
-/// A cell's count less likely than this has no part in a p-value.
+/// Probability below which a cell's count is left out of a p-value.
 const NEVER: f64 = 1e-11;
 
-/// Tango's score statistic of `run_only` against `reference_only` among `n` pairs, were the difference `delta`: standard normal for many pairs,
-/// the larger, the larger the difference that was seen.
+/// Computes Tango's score statistic of `run_only` against `reference_only` among `n` pairs, under the difference `delta`: standard normal
+/// for many pairs, the larger, the larger the observed difference.
 pub fn score(run_only: usize, reference_only: usize, n: usize, delta: f64) -> f64 {
     let [b, c, n] = [run_only, reference_only, n].map(|count| count as f64);
     // The likeliest share of `reference_only` where the difference is `delta`: the larger root of a quadratic.
@@ -39,7 +39,7 @@ pub fn score(run_only: usize, reference_only: usize, n: usize, delta: f64) -> f6
     }
 }
 
-/// Tango's score interval of the difference: where the statistic is at most `z`.
+/// Computes Tango's score interval of the difference: where the statistic is at most `z`.
 pub fn interval(run_only: usize, reference_only: usize, n: usize, z: f64) -> Interval {
     if n == 0 {
         return Interval(-1.0, 1.0);
@@ -59,7 +59,7 @@ pub fn interval(run_only: usize, reference_only: usize, n: usize, z: f64) -> Int
     Interval(low, high)
 }
 
-/// The p-value of what was seen, or more, where the difference run minus reference is at most `delta`.
+/// Computes the p-value of the observed difference, or a larger one, under a difference run minus reference of at most `delta`.
 pub fn p_greater(run_only: usize, reference_only: usize, n: usize, delta: f64) -> f64 {
     if n == 0 {
         return 1.0;
@@ -73,7 +73,7 @@ pub fn p_greater(run_only: usize, reference_only: usize, n: usize, delta: f64) -
         f64::midpoint(differing, -delta).max(0.0)
     };
     let (from, to) = (counts(share(0), n).0, counts(share(PLACES - 1), n).1);
-    // The least `run_only` for each `reference_only` whose statistic is as large; no number is where there is none.
+    // The least `run_only` for each `reference_only` whose statistic is as large; beyond all counts where there is none.
     let least: Vec<usize> = (from..=to)
         .map(|reference_only| {
             let (mut low, mut high) = (0, n - reference_only + 1);
@@ -98,7 +98,7 @@ pub fn p_greater(run_only: usize, reference_only: usize, n: usize, delta: f64) -
     (chances.fold(0.0, f64::max) + MISSED).min(1.0)
 }
 
-/// The counts that a share of `n` comes to; others are too unlikely to matter.
+/// Range of counts that a share of `n` can plausibly give; others are too unlikely to matter.
 fn counts(share: f64, n: usize) -> (usize, usize) {
     let (mean, deviation) = (
         n as f64 * share,
@@ -108,7 +108,7 @@ fn counts(share: f64, n: usize) -> (usize, usize) {
     (from, ((mean + 7.5 * deviation + 12.0) as usize).min(n))
 }
 
-/// The probability that `run_only` is at least `least`, where its share is `delta` more than that of `reference_only`.
+/// Computes the probability that `run_only` is at least `least`, where its share is `delta` more than that of `reference_only`.
 fn tail(least: impl Fn(usize) -> Option<usize>, n: usize, share: f64, delta: f64) -> f64 {
     let other = ((share + delta) / (1.0 - share).max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
     let (from, to) = counts(share, n);
@@ -130,7 +130,7 @@ fn tail(least: impl Fn(usize) -> Option<usize>, n: usize, share: f64, delta: f64
         .sum()
 }
 
-/// The probability of a count.
+/// Computes the binomial probability of a count.
 pub(super) fn likelihood(count: usize, n: usize, share: f64) -> f64 {
     if share <= 0.0 {
         return f64::from(u8::from(count == 0));
@@ -142,7 +142,7 @@ pub(super) fn likelihood(count: usize, n: usize, share: f64) -> f64 {
     (ln_binomial(n as u64, count as u64) + done * share.ln() + left * (-share).ln_1p()).exp()
 }
 
-/// The exact interval of a proportion that misses it with `MISSED` (Clopper and Pearson 1934).
+/// Computes the exact interval of a proportion, which misses it with probability `MISSED` (Clopper and Pearson 1934).
 fn clopper_pearson(count: usize, n: usize) -> Interval {
     let at = |first: usize, second: usize, chance: f64| {
         Beta::new(first as f64, second as f64).map_or(chance, |beta| beta.inverse_cdf(chance))
@@ -160,7 +160,7 @@ fn clopper_pearson(count: usize, n: usize) -> Interval {
     Interval(low, high)
 }
 
-/// Tango's interval at a confidence.
+/// Computes Tango's interval at a confidence.
 pub fn interval_at(run_only: usize, reference_only: usize, n: usize, confidence: f64) -> Interval {
     interval(run_only, reference_only, n, quantile(confidence))
 }
@@ -169,7 +169,7 @@ pub fn interval_at(run_only: usize, reference_only: usize, n: usize, confidence:
 mod tests {
     use super::*;
 
-    /// Fagerland, Lydersen and Laake 2014 (*Statistics in Medicine* 33:2850): Tango's interval of Bentur's airway data.
+    /// Published value, by Fagerland, Lydersen and Laake 2014 (*Statistics in Medicine* 33:2850): Tango's interval of Bentur's airway data.
     #[test]
     fn the_interval_is_the_published_one() {
         let Interval(low, high) = interval_at(1, 7, 21, 0.95);
@@ -201,7 +201,7 @@ mod tests {
         }
     }
 
-    /// With no differing pair, only a share of `margin` lost in none of n pairs could hide: its chance is the p-value.
+    /// Case of no differing pair: only a share of `margin` lost in none of n pairs could hide, and its chance is the p-value.
     #[test]
     fn no_differing_pair_proves_what_it_can() {
         for n in [32, 45, 58, 59] {
@@ -217,7 +217,8 @@ mod tests {
         assert_eq!(p_greater(0, 0, 0, -0.05), 1.0);
     }
 
-    /// All tables of 12 pairs: whatever the parameter, the test at 5 % rejects in at most 5 % of them, at differences at and below the bound.
+    /// Sums over all tables of 12 pairs: whatever the parameter, the test at 5 % rejects in at most 5 % of them, at differences at and
+    /// below the bound.
     #[test]
     fn it_holds_its_level_exactly() {
         let n = 12;

@@ -1,4 +1,4 @@
-//! The statistics of a verification: are two success rates the same?
+//! Statistics of a verification: tests whether two success rates are the same.
 //!
 //! - Paired proportions, from the same episodes: Tango's score interval (Tango 1998, *Statistics in Medicine* 17:891), and exact tests of
 //!   its statistic that hold their level at any number of pairs ([`exact`]).
@@ -28,35 +28,37 @@ use crate::metrics::Interval;
 pub const EQUIVALENCE_LEVEL: f64 = 0.05;
 /// Confidence of the reported intervals.
 const REPORTED: f64 = 0.95;
-/// Confidence of the interval that two one-sided tests at 5 % amount to.
+/// Confidence of the interval that is equivalent to two one-sided tests at 5 %.
 const EQUIVALENCE: f64 = 0.90;
-/// Where a search for a sufficient number of episodes ends: so many times those there are.
+/// Largest growth at which a search for a sufficient number of episodes ends, as a factor on their number.
 const MOST_GROWTH: f64 = 64.0;
 
-/// A difference, run minus reference, and whether it is negligible.
+/// Difference of run minus reference, and whether it is negligible.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Difference {
-    /// The estimate.
+    /// Estimate of the difference.
     pub estimate: f64,
-    /// Its 95 % interval.
+    /// 95 % interval of the difference.
     pub interval: Interval,
-    /// Its 90 % interval.
+    /// 90 % interval of the difference.
     pub interval_90: Interval,
-    /// What is negligible.
+    /// Largest negligible difference.
     pub margin: f64,
-    /// The larger p-value of the two one-sided tests of a difference as large as the margin; `None` for two samples, which are not judged.
+    /// Larger p-value of the two one-sided tests of a difference as large as the margin; `None` for two samples, which are not judged.
     pub p_equivalence: Option<f64>,
-    /// The smaller p-value of the two one-sided tests of a difference within the margin; `None` for two samples.
+    /// Smaller p-value of the two one-sided tests of a difference within the margin; `None` for two samples.
     pub p_beyond: Option<f64>,
-    /// Whether it is negligible at 5 %: by the tests where there are any, else because the 90 % interval lies inside the margin.
+    /// Whether the difference is negligible at 5 %: by the tests where there are any, else because the 90 % interval lies inside the
+    /// margin.
     pub equivalent: bool,
-    /// How many times as many episodes would make it equivalent, were they to fall out alike; `None` where it is, or no number would.
+    /// Factor by which the number of episodes must grow to show equivalence at this estimate; `None` if it is shown already, or no number
+    /// suffices.
     #[serde(skip)]
     pub growth_needed: Option<f64>,
 }
 
 impl Difference {
-    /// Of two samples.
+    /// Makes the difference of two independent samples.
     fn apart(estimate: f64, margin: f64, interval: impl Fn(f64) -> Interval) -> Self {
         let interval_90 = interval(quantile(EQUIVALENCE));
         Self {
@@ -71,13 +73,13 @@ impl Difference {
         }
     }
 
-    /// Whether a test at `level` finds that it is larger than the margin.
+    /// Whether a test at `level` finds that the difference is larger than the margin.
     pub fn beyond_margin(&self, level: f64) -> bool {
         self.p_beyond.is_some_and(|p| p < level)
     }
 }
 
-/// Two-sided standard normal quantile of a confidence.
+/// Computes the two-sided standard normal quantile of a confidence.
 fn quantile(confidence: f64) -> f64 {
     Normal::standard().inverse_cdf(f64::midpoint(1.0, confidence))
 }
@@ -86,7 +88,7 @@ fn share(count: usize, n: usize) -> f64 {
     if n == 0 { 0.0 } else { count as f64 / n as f64 }
 }
 
-/// The smallest factor up to [`MOST_GROWTH`] for which `enough` holds, to 2 %, if it goes on holding once it does.
+/// Finds the smallest factor up to [`MOST_GROWTH`] for which `enough` holds, to 2 %, provided that it goes on holding once it does.
 fn smallest_growth(enough: impl Fn(f64) -> bool) -> Option<f64> {
     let mut high = 1.0;
     while !enough(high) {
@@ -107,7 +109,7 @@ fn smallest_growth(enough: impl Fn(f64) -> bool) -> Option<f64> {
     Some(high.max(1.0))
 }
 
-/// Where a function that falls through `level` between `low` and `high` does so.
+/// Finds where a function that falls through `level` between `low` and `high` does so.
 fn crossing(falling: impl Fn(f64) -> f64, level: f64, low: f64, high: f64) -> f64 {
     let (mut low, mut high) = (low, high);
     for _ in 0..60 {

@@ -1,4 +1,4 @@
-//! Pairs of outcomes: done or not, in run and reference.
+//! Tests and intervals for pairs of outcomes: done or not, in run and reference.
 
 use serde::Serialize;
 use statrs::distribution::{Binomial, DiscreteCDF as _};
@@ -6,21 +6,21 @@ use statrs::distribution::{Binomial, DiscreteCDF as _};
 use super::{Difference, EQUIVALENCE, EQUIVALENCE_LEVEL, REPORTED, exact, share, smallest_growth};
 use crate::metrics::{Interval, wilson_at};
 
-/// How pairs of episodes fell out.
+/// Pairs of episodes, counted by outcome.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Pairs {
-    /// Done in both.
+    /// Number of pairs done in both.
     pub both: usize,
-    /// Done in the run only.
+    /// Number of pairs done in the run only.
     pub run_only: usize,
-    /// Done in the reference only.
+    /// Number of pairs done in the reference only.
     pub reference_only: usize,
-    /// Done in neither.
+    /// Number of pairs done in neither.
     pub neither: usize,
 }
 
 impl Pairs {
-    /// One more pair.
+    /// Adds a pair of outcomes.
     pub fn add(&mut self, run: bool, reference: bool) {
         match (run, reference) {
             (true, true) => self.both += 1,
@@ -35,22 +35,22 @@ impl Pairs {
         self.both + self.run_only + self.reference_only + self.neither
     }
 
-    /// Whether there are none.
+    /// Whether there are no pairs.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Successes of run and reference.
+    /// Numbers of successes of run and reference.
     fn successes(&self) -> [usize; 2] {
         [self.both + self.run_only, self.both + self.reference_only]
     }
 
-    /// Rates of run and reference.
+    /// Success rates of run and reference.
     pub fn shares(&self) -> [f64; 2] {
         self.successes().map(|count| share(count, self.len()))
     }
 
-    /// Two-sided p-value of McNemar's exact test; 1 where no pair differs.
+    /// Computes the two-sided p-value of McNemar's exact test; 1 where no pair differs.
     pub fn mcnemar(&self) -> f64 {
         let differing = (self.run_only + self.reference_only) as u64;
         let fewer = self.run_only.min(self.reference_only) as u64;
@@ -60,7 +60,7 @@ impl Pairs {
         (2.0 * fair.cdf(fewer)).min(1.0)
     }
 
-    /// Difference of the rates, the pairing used.
+    /// Compares the rates as pairs.
     pub fn paired(&self, margin: f64) -> Difference {
         let [run, reference] = self.shares();
         let (b, c, n) = (self.run_only, self.reference_only, self.len());
@@ -81,13 +81,13 @@ impl Pairs {
         }
     }
 
-    /// The smaller p-value of the two one-sided tests of a difference within the margin.
+    /// Computes the smaller p-value of the two one-sided tests of a difference within the margin.
     pub(super) fn p_beyond(&self, margin: f64) -> f64 {
         let (b, c, n) = (self.run_only, self.reference_only, self.len());
         exact::p_greater(b, c, n, margin).min(exact::p_greater(c, b, n, margin))
     }
 
-    /// The larger p-value of the two one-sided tests, were there `growth` times as many pairs of each kind.
+    /// Computes the larger p-value of the two one-sided tests, with `growth` times as many pairs of each kind.
     pub(super) fn p_equivalence(&self, margin: f64, growth: f64) -> f64 {
         let grown = |count: usize| (count as f64 * growth).round() as usize;
         let (b, c, n) = (
@@ -99,7 +99,7 @@ impl Pairs {
         lost.max(exact::p_greater(c, b, n, -margin))
     }
 
-    /// Difference of the rates as if run and reference were two samples.
+    /// Compares the rates as if run and reference were two independent samples.
     pub fn unpaired(&self, margin: f64) -> Difference {
         let [run, reference] = self.successes();
         let n = self.len();
@@ -110,7 +110,7 @@ impl Pairs {
     }
 }
 
-/// The interval of a difference of two proportions out of their score intervals.
+/// Computes the interval of a difference of two proportions from their score intervals.
 fn hybrid(estimate: f64, first: (usize, usize), second: (usize, usize), z: f64) -> Interval {
     let (below1, above1) = score_arms(first, z);
     let (below2, above2) = score_arms(second, z);
@@ -120,7 +120,7 @@ fn hybrid(estimate: f64, first: (usize, usize), second: (usize, usize), z: f64) 
     )
 }
 
-/// How far a Wilson interval reaches below and above its proportion; as far as there is room over no episodes.
+/// Computes how far a Wilson interval reaches below and above its proportion; without episodes, as far as there is room.
 fn score_arms((successes, n): (usize, usize), z: f64) -> (f64, f64) {
     if n == 0 {
         return (1.0, 1.0);

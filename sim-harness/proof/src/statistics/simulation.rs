@@ -1,5 +1,5 @@
-//! The verdict's size and power: how often a test says what is not so, and what is. Rates by summing over all tables, the N-rate by
-//! simulation.
+//! Size and power of the verdict: how often a test wrongly reports a difference or equivalence, and how often it rightly does. Rates by
+//! summing over all tables, the N-rate by simulation.
 //!
 //! A reduced one runs with the tests; `cargo test -p lads-proof --release -- --ignored --nocapture size_and_power` prints the table of
 //! the crate's README.
@@ -29,14 +29,14 @@ impl Stream {
     }
 }
 
-/// How one pair of episodes falls out.
+/// Model of how one pair of episodes turns out.
 #[derive(Clone, Copy)]
 enum World {
-    /// The run loses `loss` of all, among those that the reference does with `p`, and is the same otherwise.
+    /// Loses `loss` of all episodes, among those that the reference does with `p`, and is the same otherwise.
     OneWay { p: f64, loss: f64 },
-    /// The same, and `swapped` of the pairs fall out otherwise either way besides.
+    /// Loses like `OneWay`, and `swapped` of the pairs differ either way besides.
     TwoWay { p: f64, loss: f64, swapped: f64 },
-    /// Both are samples of their own.
+    /// Draws run and reference as independent samples.
     Apart { p: f64, loss: f64 },
 }
 
@@ -58,7 +58,7 @@ impl World {
         }
     }
 
-    /// Probabilities of run only and of reference only.
+    /// Probabilities of the outcomes "run only" and "reference only".
     fn cells(self) -> [f64; 2] {
         match self {
             Self::OneWay { loss, .. } => [0.0, loss],
@@ -101,8 +101,8 @@ struct Shares {
 /// Level at which one of ten tests finds a difference.
 const BEYOND_LEVEL: f64 = 1e-3;
 
-/// Where the tests reject, found once for each number of pairs: from the least number of pairs that were done in the run only, for each number
-/// done in the reference only. More for the run speaks more for it, so there is one.
+/// Regions in which the tests reject, found once for each number of pairs: from the least number of pairs that were done in the run only,
+/// for each number done in the reference only. More for the run speaks more for it, so there is one.
 #[derive(Default)]
 struct Regions(HashMap<(usize, usize, Option<u64>), usize>);
 
@@ -160,7 +160,7 @@ impl Regions {
     }
 }
 
-/// How often `trials` verifications of `n` pairs say EQUIVALENT, and DIFFERENT at the level of one of ten tests.
+/// Estimates how often verifications of `n` pairs say EQUIVALENT, and DIFFERENT at the level of one of ten tests, from `trials` of them.
 fn rates(regions: &mut Regions, world: World, n: usize, trials: usize, seed: u128) -> Shares {
     let mut stream = Stream::new(seed);
     let mut shares = Shares::default();
@@ -177,7 +177,7 @@ fn rates(regions: &mut Regions, world: World, n: usize, trials: usize, seed: u12
     shares
 }
 
-/// The same without chance: the sum over all tables that pairs of a world can come to.
+/// Computes the same shares as [`rates`] exactly: the sum over all tables that pairs of a world can give.
 fn exactly(regions: &mut Regions, world: World, n: usize) -> Shares {
     let [run_only, reference_only] = world.cells();
     let mut shares = Shares::default();
@@ -247,7 +247,7 @@ fn the_regions_are_those_of_the_verdict() {
     }
 }
 
-/// Losses of the N-rate: all four sub-tasks in few episodes, or one in many; with what else differs either way.
+/// Losses of the N-rate: all four sub-tasks in few episodes, or one in many; with the share of other pairs that differ either way.
 const N_WORLDS: [(&str, usize, f64); 3] = [
     ("all of the loss in few episodes", 4, 0.0),
     ("one sub-task in many", 1, 0.0),
@@ -282,7 +282,7 @@ fn n_rates(
     shares
 }
 
-/// A share of `trials` may be so much above its bound by chance: three standard errors.
+/// Chance excess of a share of `trials` over its bound: three standard errors.
 fn slack(bound: f64, trials: usize) -> f64 {
     3.0 * (bound * (1.0 - bound) / trials as f64).sqrt()
 }

@@ -1,11 +1,11 @@
-//! The command line: the main job's options, and the other jobs as subcommands. Options that jobs share stand in groups.
+//! The command line: options of the main job, and the other jobs as subcommands. Options that several jobs share are grouped in structs.
 
 use std::path::{Path, PathBuf};
 
 use clap::{ArgMatches, Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 use lads_sim::faults::Faults;
 
-/// What is to be done: the main job, or another.
+/// The job to do: the main job, or a subcommand.
 #[derive(Debug)]
 pub enum Arguments {
     Run(Run),
@@ -41,7 +41,7 @@ impl FromArgMatches for Arguments {
 
 impl Parser for Arguments {}
 
-/// Options that have become subcommands, and how these are called.
+/// Former options that are subcommands now, each with the name of its subcommand.
 pub const MOVED: [(&str, &str); 7] = [
     ("--verify", "lads-run verify --model MODEL"),
     ("--replay", "lads-run replay LOG --model MODEL"),
@@ -69,7 +69,7 @@ pub struct Run {
     pub report: Option<PathBuf>,
 }
 
-/// The other jobs.
+/// Subcommands besides the main job.
 #[derive(Debug, Subcommand)]
 pub enum Job {
     /// Run the episodes of a reference and say whether the policy is the reference's: exit code 0 EQUIVALENT, 1 DIFFERENT, 3 INCONCLUSIVE
@@ -90,7 +90,7 @@ pub enum Job {
     Record(Record),
 }
 
-/// Which policy, and how its kernels run.
+/// Options that choose the policy and how its kernels run.
 #[derive(Debug, Args)]
 pub struct PolicyArguments {
     /// The policy bundle (ONNX)
@@ -103,12 +103,12 @@ pub struct PolicyArguments {
     /// Instructions that the kernels run on; left out, the widest of this CPU. The results have the same bits on all
     #[arg(long)]
     pub isa: Option<IsaName>,
-    /// Whether the bundle is compiled with 32 bits, whatever it was tuned to.
+    /// Compiles the bundle with 32 bits, whatever formats it was tuned to.
     #[arg(skip)]
     pub exact: bool,
 }
 
-/// Instruction sets by name.
+/// Instruction sets by their command-line names.
 #[derive(Debug, Clone, Copy, clap::ValueEnum)]
 pub enum IsaName {
     Portable,
@@ -116,7 +116,7 @@ pub enum IsaName {
     Avx512,
 }
 
-/// Which episodes run.
+/// Options that choose which episodes run.
 #[derive(Debug, Args)]
 pub struct EpisodeArguments {
     /// Run only this instruction, by its text or its id; any other sentence goes through the language encoder
@@ -139,7 +139,7 @@ pub struct EpisodeArguments {
     pub sample: bool,
 }
 
-/// Words that the bundle does not bring.
+/// Options for instructions that are not in the bundle's table.
 #[derive(Debug, Default, Args)]
 #[command(next_help_heading = "Language (cargo feature `language`)")]
 pub struct LanguageArguments {
@@ -158,7 +158,7 @@ pub struct LanguageArguments {
     pub encoder: Option<PathBuf>,
 }
 
-/// A real robot's imperfections.
+/// Options that simulate a real robot's imperfections.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Faults between policy and environment")]
 pub struct FaultArguments {
@@ -177,7 +177,7 @@ pub struct FaultArguments {
 }
 
 impl FaultArguments {
-    /// The faults that they ask for.
+    /// Returns the faults that these options ask for.
     pub fn faults(&self) -> Faults {
         Faults {
             delay_steps: self.delay_steps,
@@ -188,7 +188,7 @@ impl FaultArguments {
     }
 }
 
-/// What goes into files, and comes out of them.
+/// Options for files to write and to read.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Results, recordings and plans")]
 pub struct FileArguments {
@@ -206,7 +206,7 @@ pub struct FileArguments {
     pub monitor: bool,
 }
 
-/// Episodes, and everything that may be asked of them.
+/// Options of a run of episodes, with everything that may be asked of it.
 #[derive(Debug, Args)]
 pub struct Rollouts {
     #[command(flatten)]
@@ -243,7 +243,7 @@ pub struct Verify {
     pub threads: Option<usize>,
 }
 
-/// The reference's file: the one that was named, else the one beside the model.
+/// Path of the reference: the one that was named, else the file beside the model.
 pub fn reference(named: Option<&Path>, model: &Path) -> PathBuf {
     let beside = || model.with_extension("reference.json");
     named.map_or_else(beside, Path::to_owned)
@@ -308,7 +308,7 @@ pub struct Record {
     pub rollouts: Rollouts,
 }
 
-/// What a job wants of its episodes, whichever job it is.
+/// What a job needs of its episodes, in a form common to all jobs.
 pub struct Wanted<'a> {
     pub policy: &'a PolicyArguments,
     pub language: &'a LanguageArguments,
@@ -320,11 +320,11 @@ pub struct Wanted<'a> {
     pub uniform: bool,
     pub faults: Faults,
     pub plans: Option<&'a Path>,
-    /// How many episodes of each instruction keep their control steps.
+    /// Number of episodes per instruction whose control steps are kept.
     pub traced: u32,
     pub threads: usize,
-    /// The job or option that a sentence outside the bundle's table cannot go with, if there is one.
+    /// The job or option that excludes a sentence outside the bundle's table, if there is one.
     pub of_table: Option<&'static str>,
-    /// Whether a sentence outside the table must say what it is judged by.
+    /// Whether a sentence outside the table must come with the sub-tasks that judge it.
     pub judged: bool,
 }

@@ -1,4 +1,4 @@
-//! What every job that runs episodes needs, checked and ready: policy, words, environment and evaluation.
+//! What every job that runs episodes needs, checked and ready: policy, word embeddings, environment and evaluation.
 //!
 //! What can fail: everything that a person named, before the first episode.
 
@@ -20,7 +20,7 @@ use crate::language::{self, Chosen, Heard};
 use crate::program::Program;
 use crate::{progress, recordings, unfinished};
 
-/// Everything that was checked, ready to run.
+/// A checked evaluation, ready to run.
 pub struct Bench<'b> {
     pub evaluation: Evaluation<'b>,
     pub bundle: &'b Bundle,
@@ -31,7 +31,7 @@ pub struct Bench<'b> {
     pub stop: &'b AtomicBool,
 }
 
-/// Opens and checks what is wanted, and hands it to `job`.
+/// Opens and checks everything that `wanted` names, and passes it to `job`.
 pub fn with<R>(
     wanted: &Wanted<'_>,
     stop: &AtomicBool,
@@ -98,7 +98,7 @@ pub fn with<R>(
             stop_where_refused: false,
             traced: wanted.traced,
             words: Some(&heard.words),
-            onlooker: None,
+            observer: None,
         },
     };
     job(&Bench {
@@ -129,7 +129,7 @@ impl Bench<'_> {
         Ok((results, evaluated))
     }
 
-    /// All that was measured, summed up.
+    /// Sums up all measurements of a run as results.
     pub fn sum_up(
         &self,
         evaluation: &Evaluation<'_>,
@@ -200,7 +200,8 @@ fn check_plans(
     Ok(())
 }
 
-/// The contract's rule; where sampling was asked for, at the contract's temperature, or at 1 where its rule is argmax.
+/// Decision rule of the run: the contract's, or, where sampling was asked for, sampling at the contract's temperature (1 where its rule is
+/// argmax).
 fn decision(policy: &Policy<'_>, sample: bool) -> Decision {
     match policy.contract().decision() {
         Decision::Argmax if sample => Decision::Sample {

@@ -1,14 +1,14 @@
-//! How a run ends, and where its words go.
+//! Ways in which a run ends, and where its output goes.
 
 use std::fmt::Display;
 use std::io::{ErrorKind, Write as _};
 use std::path::Path;
 
-/// How a run ends early.
+/// Why a run ends early.
 pub enum End {
-    /// With a line that names the thing and the remedy.
+    /// Refused, with one line that names the thing and the remedy.
     Refused(String),
-    /// By an interrupt.
+    /// Interrupted by a signal.
     Interrupted,
 }
 
@@ -16,7 +16,7 @@ pub fn refused(line: impl Display) -> End {
     End::Refused(line.to_string())
 }
 
-/// A file that an option asks for and that cannot be written.
+/// Refuses a file that an option asks for and that cannot be written.
 pub fn unwritable(option: &str, path: &Path, error: &dyn Display) -> End {
     refused(format!(
         "{option} {}: cannot be written ({error}); name a file in an existing, writable folder",
@@ -24,7 +24,7 @@ pub fn unwritable(option: &str, path: &Path, error: &dyn Display) -> End {
     ))
 }
 
-/// Prints to stdout; a reader that has left is no failure.
+/// Prints to stdout; a closed pipe is not an error.
 pub fn print(text: &dyn Display) -> Result<(), End> {
     let mut stdout = std::io::stdout().lock();
     match write!(stdout, "{text}").and_then(|()| stdout.flush()) {

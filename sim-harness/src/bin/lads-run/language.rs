@@ -1,4 +1,5 @@
-//! What the policy is told: instructions of the bundle's table, or, through the language encoder (cargo feature `language`), any sentence.
+//! Chooses the instructions of a run: those of the bundle's table, or, through the language encoder (cargo feature `language`), any
+//! sentence.
 
 use lads_compiler::Bundle;
 use lads_core::Policy;
@@ -9,13 +10,13 @@ use lads_sim::spoken::{self, Sentence, Unaccepted, WordBook};
 use crate::arguments::Wanted;
 use crate::end::{End, refused};
 
-/// What was asked for.
+/// The instructions that were asked for.
 pub enum Chosen {
-    /// All instructions of the table.
+    /// All instructions of the bundle's table.
     All,
-    /// These of its instructions.
+    /// Some instructions of the bundle's table, by index.
     Known(Vec<u32>),
-    /// A sentence outside the table.
+    /// A sentence outside the bundle's table.
     Sentence(String),
 }
 
@@ -41,7 +42,7 @@ impl Chosen {
         if found.is_empty() {
             if let Some(of_table) = wanted.of_table {
                 return Err(refused(format!(
-                    "{of_table}: for instructions of the bundle's table, and '{text}' is none{}",
+                    "{of_table}: for instructions of the bundle's table, and '{text}' is not one{}",
                     nearest_texts(bundle, text)
                 )));
             }
@@ -62,7 +63,7 @@ impl Chosen {
         ))
     }
 
-    /// Whether an instruction of the table is among them.
+    /// Whether this choice includes `instruction` of the bundle's table.
     pub fn has(&self, instruction: u32) -> bool {
         match self {
             Self::All => true,
@@ -71,7 +72,7 @@ impl Chosen {
         }
     }
 
-    /// The sentence outside the table, with what it is judged by.
+    /// Returns the sentence outside the table, with the sub-tasks that it is judged by.
     pub fn sentence(
         &self,
         wanted: &Wanted<'_>,
@@ -94,22 +95,22 @@ fn nearest_texts(bundle: &Bundle, wanted: &str) -> String {
     format!(" (the nearest that it knows: {})", nearest.join(", "))
 }
 
-/// What was heard through the language encoder.
+/// Word embeddings made by the language encoder for this run.
 pub struct Heard<'p> {
-    /// The embeddings.
+    /// Embeddings by instruction.
     pub words: WordBook,
-    /// Who heard them, for results; `None` where all come from the table.
+    /// The encoder that made the embeddings, for results; `None` where all come from the table.
     pub by: Option<HeardBy>,
     /// The known instruction that a sentence outside the table is most like.
     pub nearest: Option<Asked<'p>>,
-    /// What a person must know of it before it is followed.
+    /// Text to print before the sentence is followed.
     pub first: String,
-    /// What a person wants to know of it afterwards.
+    /// Text to print after the run.
     pub note: String,
 }
 
 impl Heard<'_> {
-    /// The note, with what a sentence that names no sub-tasks has completed.
+    /// Returns the text to print after the run, with what a sentence that names no sub-tasks has completed.
     pub fn last(&self, results: &Results) -> String {
         let unjudged = self.words.sentence.as_ref();
         let unjudged = unjudged.is_some_and(|sentence| sentence.asked().sub_tasks.is_empty());
@@ -121,7 +122,7 @@ impl Heard<'_> {
     }
 }
 
-/// Lets the language encoder hear what the table does not have, or, with `--encode-language`, everything.
+/// Encodes what the table does not have, or, with `--encode-language`, every instruction.
 pub fn hear<'p>(
     wanted: &Wanted<'_>,
     bundle: &'p Bundle,
@@ -262,7 +263,7 @@ fn heard_by(
     }
 }
 
-/// The encoder itself.
+/// The language encoder.
 #[cfg(feature = "language")]
 mod encoder {
     use lads_compiler::Bundle;
@@ -286,7 +287,7 @@ mod encoder {
     }
 }
 
-/// This program was built without it.
+/// Stand-in for builds without the language encoder.
 #[cfg(not(feature = "language"))]
 mod encoder {
     use lads_compiler::Bundle;

@@ -87,7 +87,7 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
     }
 }
 
-/// A flag that an interrupt raises; a second interrupt ends the program at once.
+/// Returns a flag that an interrupt raises; a second interrupt ends the program at once.
 fn stop_on_interrupt() -> Result<Arc<AtomicBool>, End> {
     let stop = Arc::new(AtomicBool::new(false));
     let raised = Arc::clone(&stop);
@@ -104,7 +104,7 @@ fn stop_on_interrupt() -> Result<Arc<AtomicBool>, End> {
     Ok(stop)
 }
 
-/// The files that were named.
+/// Lists the files that were named.
 fn given<'p>(
     files: impl IntoIterator<Item = (&'p str, Option<&'p PathBuf>)>,
 ) -> Vec<output::Named<'p>> {
@@ -114,7 +114,7 @@ fn given<'p>(
         .collect()
 }
 
-/// The number of threads: what was asked for, else one per core, or one where a window shows their episodes.
+/// Number of threads to run on: as asked for, else one per core, or one where a window shows the episodes.
 fn threads(asked: Option<usize>, viewer: bool) -> Result<usize, End> {
     match asked {
         Some(0) => Err(refused(
@@ -129,7 +129,7 @@ fn threads(asked: Option<usize>, viewer: bool) -> Result<usize, End> {
     }
 }
 
-/// Refuses to run no episode.
+/// Refuses a run of zero episodes.
 fn some_episodes(episodes: Option<u32>) -> Result<(), End> {
     if episodes == Some(0) {
         return Err(refused("--episodes 0: nothing to run; give at least 1"));
@@ -137,12 +137,12 @@ fn some_episodes(episodes: Option<u32>) -> Result<(), End> {
     Ok(())
 }
 
-/// A progress bar over episodes; indicatif hides it where stderr is no terminal.
+/// Makes a progress bar over episodes; indicatif hides it where stderr is not a terminal.
 fn progress(episodes: usize) -> ProgressBar {
     progress_over(episodes, "episodes")
 }
 
-/// A progress bar over other things.
+/// Makes a progress bar over `count` things.
 fn progress_over(count: usize, things: &str) -> ProgressBar {
     command::progress(count, things)
 }

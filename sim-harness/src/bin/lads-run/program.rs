@@ -1,4 +1,4 @@
-//! The program image that runs, compiled from the bundle just now or before, and the instructions that its kernels run on.
+//! The program image that runs, compiled from the bundle now or earlier, and the instruction set that its kernels run on.
 //!
 //! What can fail: a bundle that does not compile; an image that cannot be read, is broken or is another bundle's; instructions that this CPU
 //! does not have.
@@ -12,7 +12,7 @@ use lads_host::{Memory, Opened};
 use crate::arguments::{IsaName, PolicyArguments};
 use crate::end::{End, refused};
 
-/// A bundle, the image of it that runs, and on which instructions.
+/// A bundle, its program image, and the instruction set that the image runs on.
 pub struct Program {
     image: Opened,
     bundle: Bundle,
@@ -60,17 +60,17 @@ impl Program {
         Ok(program(image, bundle))
     }
 
-    /// The checked view on the image.
+    /// Returns the checked view of the image.
     pub fn policy(&self) -> Policy<'_> {
         self.image.policy()
     }
 
-    /// The instructions that it runs on.
+    /// Instruction set that the image runs on.
     pub fn isa(&self) -> Isa {
         self.isa
     }
 
-    /// Replays the bundle's golden episode; a policy that answers differently on this machine is not run.
+    /// Replays the bundle's golden episode; refuses a policy that gives other answers on this machine.
     pub fn self_test(&self) -> Result<(), End> {
         let policy = self.policy();
         let about = |wrong: &dyn std::fmt::Display| about(&self.model, wrong);
@@ -85,13 +85,13 @@ impl Program {
         tested.map(drop)
     }
 
-    /// The bundle that the image is of.
+    /// Returns the bundle that the image was compiled from.
     pub fn bundle(&self) -> &Bundle {
         &self.bundle
     }
 }
 
-/// The instructions that were asked for, if this CPU has them.
+/// Finds the instruction set that was asked for, if this CPU has it.
 fn isa(name: Option<IsaName>) -> Result<Isa, End> {
     let Some(name) = name else {
         return Ok(Isa::detect());

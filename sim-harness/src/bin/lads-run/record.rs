@@ -1,4 +1,4 @@
-//! `record`.
+//! The `record` subcommand: films an episode.
 //!
 //! The place, ffmpeg and EGL are looked at before the first episode; filming follows after the last, and is renamed to its place at the end.
 
@@ -27,7 +27,7 @@ mod with {
     use crate::end::{End, refused};
     use crate::progress_over;
 
-    /// Ready to film.
+    /// A place, an environment and a camera, ready to film.
     pub struct Recording {
         form: Form,
         path: PathBuf,
@@ -36,7 +36,7 @@ mod with {
         camera: Camera,
     }
 
-    /// Complete, but for its name.
+    /// A complete film under a temporary name.
     pub struct Film {
         finished: Finished,
         path: PathBuf,
@@ -53,7 +53,7 @@ mod with {
         }
     }
 
-    /// Whether pictures could be written, before any work.
+    /// Refuses early if pictures could not be written.
     pub fn check(asked: Option<&Record>) -> Result<(), End> {
         let Some(Record { out, .. }) = asked else {
             return Ok(());
@@ -61,7 +61,7 @@ mod with {
         Form::of(out).map(drop).map_err(|error| about(out, error))
     }
 
-    /// Opens an environment and a camera in it; `None` in other jobs.
+    /// Opens an environment and a camera in it; `None` for other jobs.
     pub fn prepare(
         asked: Option<&Record>,
         evaluation: &Evaluation<'_>,
@@ -93,7 +93,7 @@ mod with {
         }))
     }
 
-    /// A recorded episode, as something to be filmed; `None` if it is no episode of this evaluation.
+    /// Prepares a recorded episode for filming; `None` if it is not an episode of this evaluation.
     pub fn scene<'s>(evaluation: &'s Evaluation<'_>, trace: &'s Trace) -> Option<Scene<'s>> {
         let mut assignments = evaluation.assignments.iter();
         let assignment = assignments.find(|it| it.instruction == trace.instruction)?;
@@ -137,7 +137,7 @@ mod with {
     }
 
     impl Film {
-        /// Moves it to its place.
+        /// Moves the film to its final path.
         pub fn write(self) -> Result<(), End> {
             let written = self.finished.persist(&self.path);
             written.map_err(|error| failed(&self.path, error))
@@ -145,7 +145,7 @@ mod with {
     }
 }
 
-/// This program was built without pictures.
+/// Stand-in for builds without pictures.
 #[cfg(not(feature = "record"))]
 mod without {
     use std::sync::atomic::AtomicBool;
@@ -157,13 +157,13 @@ mod without {
     use crate::arguments::Record;
     use crate::end::{End, refused};
 
-    /// There is none.
+    /// Uninhabited: this build cannot record.
     pub enum Recording {}
 
-    /// There is none.
+    /// Uninhabited: this build cannot record.
     pub enum Film {}
 
-    /// Refuses.
+    /// Refuses `record`, which this build does not have.
     pub fn check(asked: Option<&Record>) -> Result<(), End> {
         match asked {
             None => Ok(()),
@@ -173,7 +173,7 @@ mod without {
         }
     }
 
-    /// None: [`check`] has refused.
+    /// Always `None`: [`check`] has refused `record`.
     #[expect(
         clippy::unnecessary_wraps,
         reason = "with pictures there may be no EGL"

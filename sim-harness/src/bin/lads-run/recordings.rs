@@ -1,4 +1,4 @@
-//! `replay`, `encode`, `--log`, `--plans` and `--monitor`.
+//! Jobs and options around recordings: `replay`, `encode`, `--log`, `--plans` and `--monitor`.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -19,17 +19,17 @@ use crate::end::{End, print, refused, unwritable};
 use crate::program::Program;
 use crate::{given, progress};
 
-/// Exit code of a replay that came out otherwise.
+/// Exit code of a replay whose actions differ from the log.
 const DIFFERENT: u8 = 1;
 
-/// At most so many differences are printed.
+/// Largest number of differences that are printed.
 const SHOWN: usize = 10;
 
 fn read(job: &str, path: &Path) -> Result<Log, End> {
     recorder::read(path).map_err(|error| refused(format!("{job} {}: {error}", path.display())))
 }
 
-/// Computes a log again.
+/// Runs `replay`: computes the actions of a log again and compares them.
 pub fn replay(asked: &Replay) -> Result<ExitCode, End> {
     let program = Program::open(&asked.policy)?;
     program.self_test()?;
@@ -101,7 +101,7 @@ fn said(difference: &Difference) -> String {
     line
 }
 
-/// Prints, or writes, the plans that the encoder sees in a log.
+/// Runs `encode`: prints, or writes, the plans that the trajectory encoder sees in a log.
 pub fn encode(asked: &Encode) -> Result<ExitCode, End> {
     let (path, json) = (&asked.log, asked.json.as_deref());
     let inputs = [
@@ -150,7 +150,7 @@ pub fn encode(asked: &Encode) -> Result<ExitCode, End> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// One line per episode: sequences are read by people.
+/// Formats a plan file with one line per episode, as people read it.
 fn pretty(file: &PlanFile) -> String {
     let lines = file.episodes.iter().map(|sequence| {
         let line = serde_json::to_string(sequence).unwrap_or_default();
@@ -163,7 +163,7 @@ fn pretty(file: &PlanFile) -> String {
     )
 }
 
-/// Reads and checks a file of plans.
+/// Reads a plan file and checks it against the policy.
 pub fn plans(policy: &Policy<'_>, bundle: &Bundle, path: &Path) -> Result<PlanBook, End> {
     let index = |wanted: &str| {
         let found = bundle.instruction_indices(wanted);
@@ -178,7 +178,7 @@ fn names(channel: &Channel<'_>) -> Vec<String> {
     channel.elements().map(|e| e.name.to_owned()).collect()
 }
 
-/// Writes what happened.
+/// Writes the recorded control steps to the log.
 pub fn log(
     evaluation: &Evaluation<'_>,
     environment: &dyn Environment,
@@ -228,7 +228,7 @@ pub fn log(
     written().map_err(|error| unwritable("--log", path, &error))
 }
 
-/// The monitor's table.
+/// Formats the monitor's table.
 pub fn agreement(agreement: &Agreement) -> String {
     let mut text = String::new();
     let Agreement {

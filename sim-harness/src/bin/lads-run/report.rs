@@ -1,4 +1,5 @@
-//! `--report`. Film strips need the cargo feature `record`, and EGL when it runs; without either the page says so.
+//! The `--report` option: an HTML page of the results. Film strips need the cargo feature `record`, and EGL when it runs; without either
+//! the page says so.
 
 #[cfg(feature = "report")]
 pub use with::{check, page, write};
@@ -19,13 +20,13 @@ mod with {
 
     use crate::end::{End, refused, unwritable};
 
-    /// Whether a report could be written, before any work.
+    /// Refuses early if a report could not be written.
     pub fn check(path: Option<&Path>) -> Result<(), End> {
         let outputs: Vec<_> = path.iter().map(|&path| ("--report", path)).collect();
         output::check(&[], &outputs).map_err(refused)
     }
 
-    /// The page, film strips included.
+    /// Renders the page, film strips included.
     pub fn page(
         results: &Results,
         traces: &[Trace],
@@ -45,7 +46,7 @@ mod with {
         html.map_err(|error| unwritable("--report", path, &error))
     }
 
-    /// Writes the page.
+    /// Writes the page to `path`.
     pub fn write(page: &str, path: &Path) -> Result<(), End> {
         lads_sim::output::write(path, page.as_bytes())
             .map_err(|error| unwritable("--report", path, &error))
@@ -89,7 +90,7 @@ mod with {
         Ok(Ok(strips))
     }
 
-    /// Why there are none.
+    /// Says why there are no film strips: this build has no pictures.
     #[cfg(not(feature = "record"))]
     #[expect(
         clippy::unnecessary_wraps,
@@ -107,7 +108,7 @@ mod with {
     }
 }
 
-/// This program was built without reports.
+/// Stand-in for builds without reports.
 #[cfg(not(feature = "report"))]
 mod without {
     use std::path::Path;
@@ -120,7 +121,7 @@ mod without {
 
     use crate::end::{End, refused};
 
-    /// Refuses.
+    /// Refuses `--report`, which this build does not have.
     pub fn check(path: Option<&Path>) -> Result<(), End> {
         match path {
             None => Ok(()),
@@ -130,7 +131,7 @@ mod without {
         }
     }
 
-    /// Never reached: [`check`] refuses.
+    /// Never called: [`check`] refuses `--report`.
     pub fn page(
         _: &Results,
         _: &[Trace],
@@ -141,7 +142,7 @@ mod without {
         check(Some(path)).map(|()| String::new())
     }
 
-    /// Never reached: [`check`] refuses.
+    /// Never called: [`check`] refuses `--report`.
     pub fn write(_: &str, path: &Path) -> Result<(), End> {
         check(Some(path))
     }

@@ -1,4 +1,4 @@
-//! The benchmark, in a window or not, and all files about it that were asked for.
+//! Runs the benchmark, in a window or without, and writes all files that were asked for.
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -15,17 +15,17 @@ use crate::bench::{self, Bench};
 use crate::end::{End, print, refused, unwritable};
 use crate::{given, record, recordings, report, some_episodes, threads, viewer};
 
-/// What a job asks for besides.
+/// Options of single jobs beyond those of [`Rollouts`].
 #[derive(Default)]
 pub struct Extra<'e> {
-    /// Random actions instead of the policy's.
+    /// Whether actions are random instead of the policy's.
     pub uniform: bool,
     pub report: Option<&'e Path>,
     pub viewer: bool,
     pub record: Option<&'e Record>,
 }
 
-/// Runs the episodes.
+/// Runs the episodes and writes their files.
 pub fn run(asked: &Rollouts, extra: &Extra<'_>, stop: &AtomicBool) -> Result<ExitCode, End> {
     let (files, episodes) = (&asked.files, &asked.episodes);
     asked.faults.faults().check().map_err(refused)?;
@@ -61,7 +61,7 @@ pub fn run(asked: &Rollouts, extra: &Extra<'_>, stop: &AtomicBool) -> Result<Exi
     })
 }
 
-/// How many episodes of each instruction keep their control steps.
+/// Number of episodes per instruction whose control steps are kept.
 fn traced(asked: &Rollouts, extra: &Extra<'_>) -> u32 {
     if asked.files.log.is_some() || asked.files.monitor || extra.report.is_some() {
         return u32::MAX;
@@ -70,7 +70,7 @@ fn traced(asked: &Rollouts, extra: &Extra<'_>) -> u32 {
     filmed.map_or(0, |record| record.episode.saturating_add(1))
 }
 
-/// Whether all files could be written and none is what is read or another one, before any work.
+/// Checks, before any work, that all output files can be written and that none is an input or named twice.
 fn check_outputs(asked: &Rollouts, extra: &Extra<'_>) -> Result<(), End> {
     report::check(extra.report)?;
     let (policy, files) = (&asked.policy, &asked.files);
@@ -91,7 +91,7 @@ fn check_outputs(asked: &Rollouts, extra: &Extra<'_>) -> Result<(), End> {
     viewer::check(extra.viewer)
 }
 
-/// The same in a window; the episodes that were finished when it was closed.
+/// Runs the episodes in a window; returns the results of those that were finished when it was closed.
 fn show(bench: &Bench<'_>, viewer: viewer::Viewer) -> Result<(Results, Evaluated), End> {
     let start = Instant::now();
     let evaluated = viewer.evaluate(&bench.evaluation, bench.open, bench.stop)?;

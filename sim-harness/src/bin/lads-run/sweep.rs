@@ -1,7 +1,7 @@
-//! `sweep`: the benchmark at several levels of each fault, one fault at a time, on the same episodes.
+//! The `sweep` subcommand: the benchmark at several levels of each fault, one fault at a time, on the same episodes.
 //!
 //! A fault may lead to observations outside the contract, which the controller refuses. Such an episode ends there, as the machine would
-//! stop, and counts as it stands; how many did is told with each level.
+//! stop, and counts with what it has completed; each level says how many did.
 
 use std::fmt::Write as _;
 
@@ -26,24 +26,24 @@ const FORMAT: &str = "lads-sweep";
 /// Version of the JSON's form.
 const FORMAT_VERSION: u32 = 1;
 
-/// What one level came to.
+/// Result of the benchmark at one level of one fault.
 #[derive(Debug, Serialize)]
 pub struct Level {
-    /// The option's name without its dashes.
+    /// Name of the fault's option, without its dashes.
     fault: &'static str,
-    /// Its value.
+    /// Value of the fault's option.
     value: f64,
     /// Scores by split.
     splits: Splits,
     /// Episodes of all splits.
     episodes: usize,
-    /// Those that ended because the controller refused an observation.
+    /// Number of episodes that ended because the controller refused an observation.
     refused_episodes: usize,
-    /// The earliest control step, from 0, at which one did.
+    /// Earliest control step, from 0, at which an observation was refused.
     first_refused_step: Option<usize>,
 }
 
-/// A sweep.
+/// Results of all levels of all faults, as written to JSON.
 #[derive(Debug, Serialize)]
 pub struct Sweep {
     format: &'static str,
@@ -57,7 +57,7 @@ pub struct Sweep {
 
 type Set = fn(&mut Faults, f64);
 
-/// Each fault with how it is set and its levels, the first of which is none of it.
+/// Each fault with its setter and its levels, of which the first is zero.
 const FAULTS: [(&str, Set, [f64; 5]); 4] = [
     (
         "delay-steps",
@@ -81,7 +81,7 @@ const FAULTS: [(&str, Set, [f64; 5]); 4] = [
     ),
 ];
 
-/// The benchmark once for each level of each fault.
+/// Runs the benchmark once for each level of each fault.
 pub fn run(asked: &Asked, stop: &AtomicBool) -> Result<ExitCode, End> {
     let episodes = &asked.episodes;
     some_episodes(Some(episodes.episodes))?;
@@ -129,8 +129,8 @@ pub fn run(asked: &Asked, stop: &AtomicBool) -> Result<ExitCode, End> {
     })
 }
 
-/// Runs all levels: `run` runs the benchmark with given faults and says what it came to.
-/// Results come with the control steps at which episodes were refused, in rising order.
+/// Runs all levels: `run` runs the benchmark with given faults and returns its results. Results come with the control steps at which
+/// episodes were refused, in rising order.
 fn sweep(run: impl Fn(Faults, &str) -> Result<(Results, Vec<usize>), End>) -> Result<Sweep, End> {
     // Without faults all four are the same run.
     let runs = 1 + FAULTS
@@ -175,7 +175,7 @@ fn sweep(run: impl Fn(Faults, &str) -> Result<(Results, Vec<usize>), End>) -> Re
 }
 
 impl Sweep {
-    /// N-rate with its standard error, by fault and level.
+    /// Formats N-rate with its standard error, by fault and level.
     pub fn table(&self) -> String {
         let mut text = String::from(
             "N-rate with its standard error, one fault at a time; an episode whose observation the controller refuses ends there\n",

@@ -1,4 +1,4 @@
-//! `tune`: the smallest formats that keep every plan of a reference's questions, written into the bundle.
+//! The `tune` subcommand: finds the smallest formats that keep every plan of a reference's questions, and writes them into the bundle.
 
 use std::fmt;
 use std::process::ExitCode;
@@ -100,7 +100,7 @@ pub fn run(asked: &Tune, stop: &AtomicBool) -> Result<ExitCode, End> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// What was chosen, on a terminal.
+/// Prints the chosen formats on a terminal.
 struct Summary<'t>(&'t Tuned);
 
 impl fmt::Display for Summary<'_> {

@@ -1,4 +1,4 @@
-//! `verify`: the reference, the certificate, and the verdict as exit code.
+//! The `verify` subcommand: runs the reference's episodes, writes the certificate, and gives the verdict as exit code.
 
 use std::ffi::OsStr;
 use std::fmt;
@@ -88,7 +88,7 @@ pub fn run(asked: &Verify, stop: &AtomicBool) -> Result<ExitCode, End> {
     })
 }
 
-/// The certificate on a terminal.
+/// Prints the certificate on a terminal.
 struct Summary<'c>(&'c Certificate);
 
 impl fmt::Display for Summary<'_> {
@@ -188,7 +188,7 @@ impl fmt::Display for Summary<'_> {
         match self.0.more_episodes_per_instruction {
             Some(more) => writeln!(
                 f,
-                "- about {more} more episodes of each instruction would decide, if it stays as it is"
+                "- about {more} more episodes of each instruction would decide, at these rates"
             ),
             None => Ok(()),
         }

@@ -1,4 +1,4 @@
-//! `view`.
+//! The `view` subcommand: episodes in a window.
 //!
 //! The display and EGL are looked at before the first episode. A window that is closed ends the run with what was finished.
 
@@ -19,7 +19,7 @@ mod with {
     use crate::end::{End, refused};
     use crate::{progress, unfinished};
 
-    /// Ready to show episodes.
+    /// A window and its texts, ready to show episodes.
     pub struct Viewer {
         window: Window,
         texts: Texts,
@@ -32,7 +32,7 @@ mod with {
         }
     }
 
-    /// Whether there may be a display, before any work.
+    /// Refuses early if there can be no display.
     pub fn check(asked: bool) -> Result<(), End> {
         if asked {
             viewer::check().map_err(about)?;
@@ -40,7 +40,7 @@ mod with {
         Ok(())
     }
 
-    /// Connects to the display and opens a camera; `None` in other jobs.
+    /// Connects to the display and opens a camera; `None` for other jobs.
     pub fn prepare(
         asked: bool,
         evaluation: &Evaluation<'_>,
@@ -65,7 +65,7 @@ mod with {
     }
 
     impl Viewer {
-        /// Runs the episodes in view, one after the other; those that were finished when the window was closed.
+        /// Runs the episodes in view, one after the other; returns those that were finished when the window was closed.
         pub fn evaluate(
             self,
             evaluation: &Evaluation<'_>,
@@ -73,9 +73,9 @@ mod with {
             stop: &AtomicBool,
         ) -> Result<Evaluated, End> {
             let bar = progress(evaluation.len());
-            let shown = self.window.run(&self.texts, stop, |onlooker| {
+            let shown = self.window.run(&self.texts, stop, |observer| {
                 let setup = Setup {
-                    onlooker: Some(onlooker),
+                    observer: Some(observer),
                     ..evaluation.setup
                 };
                 let seen = Evaluation {
@@ -92,7 +92,7 @@ mod with {
     }
 }
 
-/// This program was built without a window.
+/// Stand-in for builds without a window.
 #[cfg(not(feature = "viewer"))]
 mod without {
     use std::sync::atomic::AtomicBool;
@@ -102,10 +102,10 @@ mod without {
 
     use crate::end::{End, refused};
 
-    /// There is none.
+    /// Uninhabited: this build has no window.
     pub enum Viewer {}
 
-    /// Refuses.
+    /// Refuses `view`, which this build does not have.
     pub fn check(asked: bool) -> Result<(), End> {
         if !asked {
             return Ok(());
@@ -115,7 +115,7 @@ mod without {
         ))
     }
 
-    /// None: [`check`] has refused.
+    /// Always `None`: [`check`] has refused `view`.
     #[expect(
         clippy::unnecessary_wraps,
         reason = "with a window there may be no display"

@@ -1,4 +1,4 @@
-//! The Franka arm as the experts move it: poses to joint displacements to actions.
+//! Kinematics of the Franka arm for the experts: from poses to joint displacements to actions.
 //!
 //! Kinematics come from MuJoCo (site pose and Jacobian). A displacement is a damped least-squares step with a pull towards the home posture
 //! in the null space; joints at their limits are taken out of the step (active set). Nothing here can fail: unreachable poses give the
@@ -19,7 +19,7 @@ pub type Joints = SVector<f64, JOINTS>;
 type Jacobian = SMatrix<f64, 6, JOINTS>;
 type Physics = MjData<Arc<MjModel>>;
 
-/// Limits that the experts keep: the model's, less a margin; joint 6 also respects the environment's lower bound of 0.
+/// Joint limits that the experts keep: the model's, less a margin; joint 6 also respects the environment's lower bound of 0.
 const LIMIT_LOW: [f64; JOINTS] = [-2.85, -1.74, -2.85, -3.03, -2.85, 0.02, -2.85];
 const LIMIT_HIGH: [f64; JOINTS] = [2.85, 1.74, 2.85, -0.45, 2.85, 2.08, 2.85];
 /// Stiffness of the position servos, N m/rad (actuator.xml).
@@ -39,25 +39,25 @@ const ACTIVE_SET_ROUNDS: usize = 5;
 /// Iterations after which inverse kinematics has converged for every pose that the experts use.
 const INVERSE_KINEMATICS_STEPS: usize = 150;
 
-/// Where the hand is or shall be, in world coordinates.
+/// Pose of the hand, present or wanted, in world coordinates.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose {
     /// Position of the `end_effector` site, m. The fingertips lie 5 cm beyond it.
     pub position: Vector3<f64>,
-    /// Orientation of the site.
+    /// Orientation of the `end_effector` site.
     pub rotation: Rotation3<f64>,
 }
 
-/// How fast the hand may move.
+/// Largest speeds of the hand.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pace {
-    /// m/s
+    /// Linear speed, m/s.
     pub linear: f64,
-    /// rad/s
+    /// Angular speed, rad/s.
     pub angular: f64,
 }
 
-/// The arm's kinematics.
+/// Kinematics of the arm.
 pub struct Arm {
     site: usize,
     home: Joints,
@@ -65,7 +65,7 @@ pub struct Arm {
 }
 
 impl Arm {
-    /// The arm of the model that `physics` belongs to.
+    /// Takes the arm from the model that `physics` belongs to.
     pub fn new(physics: &Physics) -> Self {
         let site = site_id(physics, "end_effector");
         let home = Joints::from_iterator(INITIAL_POSITIONS.iter().copied());
@@ -76,7 +76,7 @@ impl Arm {
         }
     }
 
-    /// Where the hand is.
+    /// Pose of the hand.
     pub fn pose(&self, physics: &Physics) -> Pose {
         let rotation = Matrix3::from_row_slice(&physics.site_xmat()[self.site]);
         Pose {
@@ -85,7 +85,7 @@ impl Arm {
         }
     }
 
-    /// Joint displacement of one control step towards a pose.
+    /// Computes the joint displacement of one control step towards a pose.
     pub fn displacement(&self, physics: &Physics, goal: &Pose, pace: Pace) -> Joints {
         let pose = self.pose(physics);
         let linear = POSITION_GAIN * (goal.position - pose.position);
@@ -113,7 +113,7 @@ impl Arm {
         )
     }
 
-    /// Joint angles that bring the hand to a pose, always sought from the home posture, so that a pose has one posture.
+    /// Finds the joint angles that bring the hand to a pose, always from the home posture, so that a pose has one posture.
     pub fn inverse_kinematics(&mut self, physics: &Physics, goal: &Pose) -> Joints {
         let start =
             Joints::from_fn(|joint, _| self.home[joint].clamp(LIMIT_LOW[joint], LIMIT_HIGH[joint]));
@@ -140,7 +140,7 @@ impl Arm {
         joint_angles(&self.scratch)
     }
 
-    /// Jacobian of the site: three translation rows, three weighted rotation rows.
+    /// Jacobian of the `end_effector` site: three translation rows, three weighted rotation rows.
     fn jacobian(&self, physics: &Physics) -> Jacobian {
         let (translation, rotation) = physics.jac_site(true, true, self.site);
         let columns = translation.len() / 3;
@@ -154,7 +154,7 @@ impl Arm {
     }
 }
 
-/// The damped least-squares step for a weighted twist, with the joints kept inside their `room`.
+/// Computes the damped least-squares step for a weighted twist, with the joints kept inside their `room`.
 fn limited_step(
     jacobian: &Jacobian,
     twist: &Vector6<f64>,
@@ -192,7 +192,7 @@ fn limited_step(
     step
 }
 
-/// The action that displaces the arm's joints within one control step, scaled down as a whole where it asks for too much.
+/// Computes the action that displaces the arm's joints within one control step, scaled down as a whole where it asks for too much.
 ///
 /// `share` is the part of the full speed that may be used; `open` opens or closes the fingers with full force.
 pub fn action(

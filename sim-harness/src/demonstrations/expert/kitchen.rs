@@ -19,13 +19,13 @@ const OPEN: bool = true;
 const CLOSED: bool = false;
 /// Attempts of one sub-task before the demonstration is given up.
 const ATTEMPTS: usize = 3;
-/// Grips before the sub-task is begun anew.
+/// Grips that are tried before the sub-task begins anew.
 const GRIPS: usize = 3;
-/// The approach's funnel: within this distance of the axis the hand may advance, m.
+/// Radius of the approach's funnel: within this distance of the axis the hand may advance, m.
 const FUNNEL_WIDTH: f64 = 0.012;
-/// How far it waits back per metre outside.
+/// Slope of the approach's funnel: distance that the hand waits back per metre off the axis.
 const FUNNEL_SLOPE: f64 = 4.0;
-/// How far back it waits at most, m.
+/// Length of the approach's funnel: farthest that the hand waits back, m.
 const FUNNEL_LEN: f64 = 0.1;
 
 // Elements of the state.
@@ -43,18 +43,18 @@ type Sense<'a, P, T> = &'a dyn Fn(&P) -> T;
 
 /// What to grip and how to pull it.
 struct Grip<'a, P> {
-    /// Where the hand closes.
+    /// Pose at which the hand closes.
     contact: Sense<'a, P, Pose>,
-    /// Where the hand pulls to, ahead of the object.
+    /// Pose that the hand pulls to, ahead of the object.
     goal: Sense<'a, P, Pose>,
-    /// How far the object has come.
+    /// Displacement of the object so far.
     turned: Sense<'a, P, f64>,
     done: Sense<'a, P, bool>,
     /// Distance between the fingers below which nothing is held, m.
     width: f64,
 }
 
-/// Notices that a movement has no effect.
+/// Detects a movement that has no effect.
 struct Progress {
     patience: usize,
     best: Cell<f64>,
@@ -62,7 +62,7 @@ struct Progress {
 }
 
 impl Progress {
-    /// Gives up after `patience` control steps without progress.
+    /// Makes a detector that gives up after `patience` control steps without progress.
     fn new(patience: usize) -> Self {
         Self {
             patience,
@@ -71,7 +71,7 @@ impl Progress {
         }
     }
 
-    /// To be asked once per control step with how far the movement has come.
+    /// Whether the movement has stalled; called once per control step with how far it has come.
     fn stalled(&self, value: f64) -> bool {
         if value > self.best.get() + 0.003 {
             self.best.set(value);
@@ -83,7 +83,7 @@ impl Progress {
     }
 }
 
-/// The hand points towards +y with the fingers opening along x; then turned about the world's axes.
+/// Orientation of the hand towards +y with the fingers opening along x, then turned about the world's axes.
 fn grasp() -> Rotation3<f64> {
     Rotation3::from_matrix_unchecked(Matrix3::new(0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0))
 }
@@ -109,7 +109,7 @@ fn pose(position: Vector3<f64>, rotation: Rotation3<f64>) -> Pose {
 }
 
 impl Performer<'_> {
-    /// Performs a sub-task, with another approach where one fails. Whether it succeeded is the environment's to say.
+    /// Performs a sub-task, with another approach where one fails. The environment decides whether it succeeded.
     ///
     /// # Errors
     /// The episode's time ran out.
@@ -142,7 +142,7 @@ impl Performer<'_> {
         id.map_or_else(Vector3::zeros, |id| physics.xanchor()[id].into())
     }
 
-    /// Backs off by `way` with the hand as it is, far enough for the next transit.
+    /// Moves the hand back by `way` without turning it, far enough for the next transit.
     fn retreat(&mut self, open: bool, way: Vector3<f64>) -> Result<(), OutOfTime> {
         let hand = self.hand();
         self.reach(
@@ -152,7 +152,7 @@ impl Performer<'_> {
         Ok(())
     }
 
-    /// Comes to a contact pose along the hand's own axis: the farther the hand is off the axis, the farther back it waits.
+    /// Moves to a contact pose along the hand's own axis: the farther the hand is off the axis, the farther back it waits.
     fn approach(
         &mut self,
         open: bool,
@@ -203,7 +203,7 @@ impl Performer<'_> {
         Ok(())
     }
 
-    /// Opens the fingers where the hand is.
+    /// Opens the fingers without moving the hand.
     fn release(&mut self, steps: usize) -> Result<(), OutOfTime> {
         let hand = self.hand();
         self.reach(Move::new(OPEN, 0.0, steps), hand)?;

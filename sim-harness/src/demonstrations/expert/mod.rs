@@ -17,12 +17,12 @@ use arm::{Arm, JOINTS, Joints, Pace, Pose, action, joint_angles};
 
 /// Correlation of the recovery noise from one control step to the next.
 pub const NOISE_CORRELATION: f64 = 0.7;
-/// Second word of the experts' own random stream: keeps it apart from the environment's stream of the same episode.
+/// Second word of the entropy of the experts' own random stream, which keeps it apart from the environment's stream of the same episode.
 const EXPERT_STREAM: u64 = 0x6578_7065_7274;
-/// Gain and speed of joint-space moves.
+/// Gain of joint-space moves.
 const TRANSIT_GAIN: f64 = 0.9;
 
-/// What makes one demonstration differ from the next.
+/// Random variation of one demonstration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Style {
     /// Factor on all speeds.
@@ -34,14 +34,14 @@ pub struct Style {
 }
 
 impl Style {
-    /// No variation at all.
+    /// Style without any variation.
     pub const PLAIN: Self = Self {
         speed: 1.0,
         jitter: 0.0,
         recovery_noise: 0.0,
     };
 
-    /// A random style: speed 0.85 to 1.2, jitter 9 mm, noise of a standard deviation between 0 and `recovery_noise`.
+    /// Draws a random style: speed 0.85 to 1.2, jitter 9 mm, noise of a standard deviation between 0 and `recovery_noise`.
     pub fn draw(stream: &mut Stream, recovery_noise: f64) -> Self {
         Self {
             speed: stream.uniform(0.85, 1.2),
@@ -54,35 +54,35 @@ impl Style {
 /// One control step of a demonstration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Transition {
-    /// What a policy sees before the step.
+    /// Observation before the step, as a policy sees it.
     pub observation: [f32; OBSERVATION_LEN],
-    /// The same without noise.
+    /// Observation before the step, without noise.
     pub state: [f32; OBSERVATION_LEN],
-    /// What the expert wants to do.
+    /// The expert's intended action: the label.
     pub action: [f32; ACTION_LEN],
-    /// What was done.
+    /// Executed action, recovery noise included.
     pub executed: [f32; ACTION_LEN],
 }
 
-/// The episode's time is up.
+/// The episode's time has run out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct OutOfTime;
 
-/// How a movement ends and how fast it is.
+/// End condition and speed of a movement.
 #[derive(Clone, Copy, Debug)]
 struct Move {
     open: bool,
     pace: Pace,
     /// Distance at which the pose counts as reached, m.
     near: f64,
-    /// Angle at which it counts as reached, rad.
+    /// Angle at which the pose counts as reached, rad.
     aligned: f64,
     /// Control steps after which the movement ends anyway.
     steps: usize,
 }
 
 impl Move {
-    /// A movement with open or closed fingers that ends within `near` metres of its goal or after `steps` control steps.
+    /// Makes a movement with open or closed fingers that ends within `near` metres of its goal or after `steps` control steps.
     const fn new(open: bool, near: f64, steps: usize) -> Self {
         Self {
             open,
@@ -107,7 +107,7 @@ impl Move {
     }
 }
 
-/// Performs sub-tasks in an environment and records what it does.
+/// Performs sub-tasks in an environment and records the control steps.
 pub struct Performer<'k> {
     kitchen: &'k mut Kitchen,
     arm: Arm,
@@ -132,7 +132,7 @@ impl<'k> Performer<'k> {
         Self::with_style(kitchen, seed, stream, style, max_steps)
     }
 
-    /// The same with a given style, whose noise and jitter are drawn from `stream`.
+    /// Starts an episode with a given style, whose noise and jitter are drawn from `stream`.
     pub fn with_style(
         kitchen: &'k mut Kitchen,
         seed: EpisodeSeed,
@@ -153,22 +153,22 @@ impl<'k> Performer<'k> {
         }
     }
 
-    /// The style in force.
+    /// Style of this demonstration.
     pub fn style(&self) -> Style {
         self.style
     }
 
-    /// The steps so far.
+    /// Control steps so far.
     pub fn transitions(&self) -> &[Transition] {
         &self.transitions
     }
 
-    /// The environment.
+    /// Environment in its present state.
     pub fn environment(&self) -> &Kitchen {
         self.kitchen
     }
 
-    /// Hands the record over.
+    /// Returns the recorded control steps.
     pub fn into_transitions(self) -> Vec<Transition> {
         self.transitions
     }
@@ -267,7 +267,7 @@ impl<'k> Performer<'k> {
         Ok(done(self))
     }
 
-    /// Moves to a fixed pose.
+    /// Moves to a fixed pose; true when it was reached.
     fn reach(&mut self, how: Move, goal: Pose) -> Result<bool, OutOfTime> {
         self.follow(how, |_| goal, |_| false)
     }

@@ -25,15 +25,15 @@ use spec::{
     SUB_TASKS,
 };
 
-/// The environment's name in contracts and datasets.
+/// Name of the environment in contracts and datasets.
 pub const ID: &str = "franka-kitchen";
-/// The version of its behaviour.
+/// Version of the environment's behaviour.
 pub const VERSION: &str = "1";
 
-/// The site that stands for the gripper in pictures.
+/// Site that marks the gripper in pictures.
 const GRIPPER: &str = "end_effector";
 
-/// FrankaKitchen-v1's own camera.
+/// Viewpoint of FrankaKitchen-v1's own camera.
 const VIEW: View = View::Free {
     look_at: [-0.2, 0.5, 2.0],
     distance: 2.2,
@@ -43,21 +43,21 @@ const VIEW: View = View::Free {
 
 const SCENE: &str = "assets/kitchen_franka/kitchen_assets/kitchen_env_model.xml";
 
-/// The scene cannot be loaded.
+/// Why the scene cannot be loaded.
 #[derive(Debug, Error)]
 pub enum SceneError {
-    /// The assets were not set up.
+    /// The assets are missing.
     #[error(transparent)]
     Missing(#[from] MissingAssets),
     /// Another MuJoCo is loaded.
     #[error(transparent)]
     Version(#[from] OtherMujoco),
-    /// MuJoCo refuses the scene.
+    /// MuJoCo refused the scene.
     #[error("MuJoCo cannot load {path}: {reason}; {remedy}", remedy = remedy(reason))]
     Refused {
-        /// The scene's file.
+        /// Path of the scene's file.
         path: String,
-        /// What MuJoCo says.
+        /// MuJoCo's reason.
         reason: String,
     },
 }
@@ -92,7 +92,7 @@ impl Scene {
     }
 }
 
-/// The environment: a scene's own state, one per worker.
+/// Franka Kitchen with a simulator state of its own, one per worker.
 pub struct Kitchen {
     data: MjData<Arc<MjModel>>,
     /// Index of the site between the fingers.
@@ -105,7 +105,7 @@ pub struct Kitchen {
 }
 
 impl Kitchen {
-    /// An environment at the start of episode (0, 0, 0).
+    /// Makes an environment at the start of episode (0, 0, 0).
     pub fn new(scene: &Scene, noise: Noise) -> Self {
         let mut kitchen = Self {
             data: MjData::new(Arc::clone(&scene.model)),
@@ -129,7 +129,7 @@ impl Kitchen {
         kitchen
     }
 
-    /// MuJoCo's state, which the scripted experts may see and policies may not.
+    /// Simulator state, which the scripted experts may see and policies may not.
     pub fn physics(&self) -> &MjData<Arc<MjModel>> {
         &self.data
     }

@@ -1,4 +1,4 @@
-//! The numbers of Franka Kitchen, as in D4RL and Gymnasium-Robotics' FrankaKitchen-v1.
+//! Constants of Franka Kitchen, as in D4RL and Gymnasium-Robotics' FrankaKitchen-v1.
 //!
 //! Elements of an observation (30): arm joints 1-7 \[rad\], fingers \[m\], four knobs each followed by its burner, light switch and light,
 //! slide cabinet \[m\], left and right hinge cabinet, microwave \[rad\], kettle position \[m\] and quaternion (w, x, y, z).
@@ -7,15 +7,15 @@
 pub const OBSERVATION_LEN: usize = 30;
 /// Elements of an action: seven arm joints, two fingers.
 pub const ACTION_LEN: usize = 9;
-/// Physics steps of 2 ms in a control step.
+/// Number of physics steps of 2 ms in a control step.
 pub const FRAME_SKIP: usize = 40;
 /// Control period in seconds.
 pub const CONTROL_PERIOD_S: f64 = 0.08;
-/// Control steps of an episode.
+/// Number of control steps of an episode.
 pub const MAX_STEPS: usize = 280;
 /// Joint velocity that an action of 1 asks for, rad/s (fingers: m/s).
 pub const ACTION_SCALE: f64 = 2.0;
-/// A sub-task is done when its elements are nearer to the goal than this (L2).
+/// Distance (L2) to the goal below which a sub-task counts as completed.
 pub const COMPLETION_DISTANCE: f64 = 0.3;
 
 /// Names of the observation's elements: joints as in the model, the kettle's seven coordinates spelled out.
@@ -99,9 +99,9 @@ pub const INITIAL_POSITIONS: [f64; OBSERVATION_LEN] = [
     -2.68278933e-04,
 ];
 
-/// Bounds of the position set-points that reach the servos.
+/// Lower bounds of the position set-points that reach the servos.
 pub const SET_POINT_LOW: [f64; ACTION_LEN] = [-2.9, -1.8, -2.9, -3.1, -2.9, 0.0, -2.9, 0.0, 0.0];
-/// See [`SET_POINT_LOW`].
+/// Upper bounds of the position set-points that reach the servos.
 pub const SET_POINT_HIGH: [f64; ACTION_LEN] = [2.9, 1.8, 2.9, 0.0, 2.9, 3.8, 2.9, 0.04, 0.04];
 
 /// `pos_noise_amp` of `franka_config.xml`, the amplitude of each element's noise before the ratio of [`Noise`] is applied.
@@ -110,13 +110,13 @@ const NOISE_AMPLITUDES: [f64; OBSERVATION_LEN] = [
     0.0005, 0.0005, 0.005, 0.005, 0.005, 0.1, 0.1, 0.1, 0.005, 0.005, 0.005, 0.1, 0.1, 0.1, 0.005,
 ];
 
-/// A sub-task: the elements that must come near to the goal.
+/// A sub-task: the observation elements that must come near to the goal.
 pub struct SubTask {
     /// Name as in the instructions' `sub_tasks`.
     pub name: &'static str,
-    /// Its first element in the observation; the goal's elements follow each other.
+    /// Index of the sub-task's first element in the observation; the others follow it.
     pub first: usize,
-    /// Where they must be.
+    /// Positions that the elements must reach.
     pub goal: &'static [f64],
 }
 
@@ -171,7 +171,7 @@ pub const SUB_TASK_NAMES: [&str; 7] = [
 ];
 
 impl SubTask {
-    /// Distance of the true positions to the goal.
+    /// Distance (L2) of the true positions to the goal.
     pub fn distance(&self, state: &[f64]) -> f64 {
         state
             .iter()
@@ -182,18 +182,18 @@ impl SubTask {
             .sqrt()
     }
 
-    /// Whether it is done in this state.
+    /// Whether the sub-task is completed in this state.
     pub fn is_done(&self, state: &[f64]) -> bool {
         self.distance(state) < COMPLETION_DISTANCE
     }
 }
 
-/// How much uniform noise the observations carry.
+/// Level of uniform noise on the observations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub enum Noise {
-    /// None: observations are the state.
+    /// No noise: observations equal the state.
     None,
-    /// D4RL's level, of the paper's data: a tenth of the configured amplitudes, 0.01 rad for the arm.
+    /// D4RL's level, used for the paper's data: a tenth of the configured amplitudes, 0.01 rad for the arm.
     #[default]
     V0,
     /// FrankaKitchen-v1's level: a hundredth for the robot; objects a two-thousandth, with the amplitudes shifted by one as there.
@@ -211,7 +211,7 @@ impl Noise {
         })
     }
 
-    /// The name that the command line and the files use.
+    /// Name of the level on the command line and in files.
     pub fn name(self) -> &'static str {
         match self {
             Self::None => "none",

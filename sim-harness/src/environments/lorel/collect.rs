@@ -1,4 +1,4 @@
-//! Random trajectories with post-hoc labels: the work of `lads-collect --env lorel`.
+//! Collects random trajectories with post-hoc labels, for `lads-collect --env lorel`.
 //!
 //! Every trajectory has random streams of its own, seeded by (seed, episode), so the file does not depend on the number of threads.
 //! Trajectories that moved nothing are left out and counted. Actions are uniform in their limits and recorded as they were drawn, the
@@ -28,10 +28,10 @@ use crate::random::Stream;
 
 /// Fourth number of the entropy of the stream that actions and the order of clauses are drawn from.
 const ACTION_STREAM: u64 = 2;
-/// Trajectories that a thread takes at a time.
+/// Number of trajectories that a thread takes at a time.
 const CHUNK: usize = 100;
 
-/// What to collect.
+/// Settings of a collection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Settings {
     /// Trajectories to run, those that move nothing included.
@@ -42,30 +42,30 @@ pub struct Settings {
     pub threads: NonZeroUsize,
 }
 
-/// Collection cannot start.
+/// No episodes were asked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
 #[error("zero episodes: ask for at least 1 with --episodes")]
 pub struct NoEpisodes;
 
-/// One trajectory.
+/// A labelled random trajectory.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trajectory {
-    /// Number of its random streams.
+    /// Number of the trajectory's random streams.
     pub episode: u64,
-    /// What it did.
+    /// Label: what the trajectory did, in words.
     pub label: Label,
-    /// Before each step.
+    /// Observation before each step.
     pub observations: [[f32; OBSERVATION_LEN]; MAX_STEPS],
-    /// As drawn.
+    /// Action of each step, as drawn.
     pub actions: [[f32; ACTION_LEN]; MAX_STEPS],
 }
 
-/// What was collected.
+/// Collected trajectories and their counts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Collected {
-    /// Trajectories that did something, in the order of their numbers.
+    /// Trajectories that moved something, in the order of their numbers.
     pub trajectories: Vec<Trajectory>,
-    /// How many were run.
+    /// Number of trajectories that were run.
     pub episodes: usize,
     /// Seed of everything random.
     pub seed: u64,
@@ -117,7 +117,7 @@ pub fn collect(
     })
 }
 
-/// One trajectory; `None` if it moved nothing between its first and its last observation.
+/// Runs one trajectory; `None` if it moved nothing between its first and its last observation.
 fn trajectory(lorel: &mut Lorel, seed: u64, number: u64) -> Option<Trajectory> {
     let episode = FIRST_EPISODE + number;
     let start = EpisodeSeed {
@@ -150,12 +150,12 @@ fn trajectory(lorel: &mut Lorel, seed: u64, number: u64) -> Option<Trajectory> {
 }
 
 impl Collected {
-    /// Trajectories that moved nothing.
+    /// Number of trajectories that moved nothing.
     pub fn nothing(&self) -> usize {
         self.episodes - self.trajectories.len()
     }
 
-    /// Writes the dataset, see [`crate::dataset`].
+    /// Writes the dataset in the form of [`crate::dataset`].
     pub fn write(&self, path: &Path) -> Result<(), DatasetError> {
         let mut instructions: Vec<Instruction> = Vec::new();
         let mut numbers: HashMap<&str, usize> = HashMap::new();

@@ -1,4 +1,4 @@
-//! Post-hoc labels: what a trajectory did, in words, by the rules of the `LOReL` benchmark.
+//! Post-hoc labels: sentences that say what a trajectory did, by the rules of the `LOReL` benchmark.
 //!
 //! Each mug that moved gives one clause with its directions, the drawer and the faucet one each; directions within a clause and the
 //! clauses are shuffled and joined with "and". A trajectory that moved nothing has no label. Nothing here can fail.
@@ -6,16 +6,16 @@
 use super::spec::{BLACK_MUG, DRAWER, FAUCET, OBSERVATION_LEN, SUB_TASKS, SubTask, WHITE_MUG};
 use crate::random::Stream;
 
-/// A label.
+/// Post-hoc label of a trajectory.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Label {
-    /// The sentence.
+    /// The label's sentence.
     pub text: String,
-    /// Names of the sub-tasks that it speaks of, in its order.
+    /// Names of the sub-tasks that the sentence speaks of, in its order.
     pub sub_tasks: Vec<&'static str>,
 }
 
-/// The label of a trajectory from `start` to `end`; `None` where nothing moved far enough ("do nothing").
+/// Labels a trajectory from `start` to `end`; `None` where nothing moved far enough ("do nothing").
 pub fn label(
     start: &[f64; OBSERVATION_LEN],
     end: &[f64; OBSERVATION_LEN],
@@ -49,7 +49,7 @@ pub fn label(
     })
 }
 
-/// The first sub-task's name, and of the others of the same mug their direction, which is the last word.
+/// Joins the sub-tasks of one mug: the first one's name, then only the direction of each other one, which is its last word.
 fn sentence(clause: &[&SubTask]) -> String {
     let word = |(place, task): (usize, &&SubTask)| match task.name.rsplit_once(' ') {
         Some((_, direction)) if place > 0 => direction,
@@ -59,7 +59,7 @@ fn sentence(clause: &[&SubTask]) -> String {
     words.join(" and ")
 }
 
-/// Fisher and Yates' shuffle.
+/// Shuffles `items` in place by Fisher and Yates' method.
 fn shuffle<T>(items: &mut [T], stream: &mut Stream) {
     for last in (1..items.len()).rev() {
         let other = (stream.unit() * (last + 1) as f64) as usize;

@@ -32,18 +32,18 @@ use spec::{
     SUB_TASK_NAMES, SUB_TASKS, SubTask, WHITE_MUG,
 };
 
-/// The environment's name in contracts and datasets.
+/// Name of the environment in contracts and datasets.
 pub const ID: &str = "lorel-table";
-/// The version of its behaviour.
+/// Version of the environment's behaviour.
 pub const VERSION: &str = "1";
-/// The only noise level: none.
+/// Name of the only noise level, which has no noise.
 pub const NOISE: &str = "none";
-/// Settled postures above the mugs.
+/// Number of settled postures above the mugs.
 pub const POSTURES: usize = 256;
 
-/// The body that stands for the gripper in pictures.
+/// Body that marks the gripper in pictures.
 const HAND: &str = "hand";
-/// The camera of LOReL's images.
+/// Viewpoint of LOReL's images.
 const VIEW: View = View::Camera("cam0");
 const SCENE: &str = include_str!("scene.xml");
 /// Folder of the scene's assets in the vendor folder, and one file of it.
@@ -51,20 +51,20 @@ const ASSETS: &str = "assets/metaworld";
 const ONE_ASSET: &str = "assets/metaworld/meshes/drawer/drawer.stl";
 /// Entropy of the streams from which the hand's targets above the mugs are drawn, with the number of the posture.
 const POSTURE_STREAM: u64 = 0x706f_7374_7572_6573;
-/// Everything that a time step depends on.
+/// Parts of the simulator's state that a time step depends on: all of them.
 const FULL_STATE: u32 = MjtState::mjSTATE_INTEGRATION as u32;
 const GRIPPER_OPEN: [f64; 2] = [-1.0, 1.0];
 
-/// The scene cannot be loaded.
+/// Why the scene cannot be loaded.
 #[derive(Debug, Error)]
 pub enum SceneError {
-    /// The assets were not set up.
+    /// The assets are missing.
     #[error(transparent)]
     Missing(#[from] MissingAssets),
     /// Another MuJoCo is loaded.
     #[error(transparent)]
     Version(#[from] OtherMujoco),
-    /// MuJoCo refuses the scene.
+    /// MuJoCo refused the scene.
     #[error("MuJoCo cannot load the LOReL table: {0}; {remedy}", remedy = remedy(.0))]
     Refused(String),
 }
@@ -101,7 +101,7 @@ impl Scene {
         })
     }
 
-    /// The simulator's state with the hand at rest: posture 0 at home, the others above the mugs.
+    /// Simulator state with the hand at rest: posture 0 at home, the others above the mugs.
     fn settled(&self, posture: usize) -> &[f64] {
         self.postures[posture].get_or_init(|| {
             let mut hand = HAND_HOME;
@@ -134,7 +134,7 @@ fn advance(data: &mut MjData<Arc<MjModel>>, physics_steps: usize) {
     }
 }
 
-/// The environment: a scene's own state, one per worker.
+/// The `LOReL` table with a simulator state of its own, one per worker.
 pub struct Lorel {
     scene: Scene,
     data: MjData<Arc<MjModel>>,
@@ -146,7 +146,7 @@ pub struct Lorel {
 }
 
 impl Lorel {
-    /// An environment at the start of episode (0, 0, 0).
+    /// Makes an environment at the start of episode (0, 0, 0).
     pub fn new(scene: &Scene) -> Self {
         let mut lorel = Self {
             scene: scene.clone(),
@@ -169,7 +169,7 @@ impl Lorel {
         lorel
     }
 
-    /// The start of a recorded trajectory: the hand at rest, everything else anywhere.
+    /// Places everything for the start of a recorded trajectory: the hand at rest, everything else at random.
     fn scatter(&mut self, stream: &mut Stream) {
         let posture = if stream.unit() < 0.5 {
             0
@@ -190,7 +190,8 @@ impl Lorel {
         advance(&mut self.data, 100);
     }
 
-    /// The start of an evaluation: the objects that the instruction speaks of, in the order of the sub-tasks, then the hand.
+    /// Places everything for the start of an evaluation: the objects that the instruction speaks of, in the order of the sub-tasks, then
+    /// the hand.
     fn prepare(&mut self, commanded: &[usize], stream: &mut Stream) {
         let positions = self.data.qpos_mut();
         let mut hand = HAND_FOR_OTHERS;

@@ -1,4 +1,4 @@
-//! The numbers of the `LOReL` table.
+//! Constants of the `LOReL` table.
 //!
 //! An observation (15) is the simulator's positions as they are: arm joints 0-6 \[rad\], right and left finger \[m\], white and black mug
 //! x and y \[m\], faucet \[rad\], drawer \[m\] (0 closed, negative open). On the table, left is +x, right is -x, down is +y, up is -y.
@@ -9,18 +9,18 @@ use std::f64::consts::{FRAC_1_SQRT_2, PI};
 pub const OBSERVATION_LEN: usize = 15;
 /// Elements of an action: three of the hand's displacement, one without effect, the gripper.
 pub const ACTION_LEN: usize = 5;
-/// Physics steps of 2.5 ms in a control step.
+/// Number of physics steps of 2.5 ms in a control step.
 pub const FRAME_SKIP: usize = 5;
 /// Control period in seconds.
 pub const CONTROL_PERIOD_S: f64 = 0.0125;
-/// Control steps of an episode, and of a recorded trajectory.
+/// Number of control steps of an episode, and of a recorded trajectory.
 pub const MAX_STEPS: usize = 20;
-/// Control steps of an episode of the composite splits, which ask for several things.
+/// Number of control steps of an episode of the composite splits, which ask for several things.
 pub const MAX_STEPS_COMPOSITE: usize = 40;
-/// Their names begin like this.
+/// Prefix of the composite splits' names.
 pub const COMPOSITE: &str = "composite";
 
-/// Names of the observation's elements, as of the joints in the scene.
+/// Names of the observation's elements, equal to those of the joints in the scene.
 pub const OBSERVATION_NAMES: [&str; OBSERVATION_LEN] = [
     "right_j0",
     "right_j1",
@@ -38,33 +38,33 @@ pub const OBSERVATION_NAMES: [&str; OBSERVATION_LEN] = [
     "faucet",
     "drawer",
 ];
-/// Places of the objects in an observation.
+/// Index of the white mug's x in an observation; its y follows.
 pub const WHITE_MUG: usize = 9;
-/// See [`WHITE_MUG`].
+/// Index of the black mug's x in an observation; its y follows.
 pub const BLACK_MUG: usize = 11;
-/// See [`WHITE_MUG`].
+/// Index of the faucet in an observation.
 pub const FAUCET: usize = 13;
-/// See [`WHITE_MUG`].
+/// Index of the drawer in an observation.
 pub const DRAWER: usize = 14;
 
 /// Names of the action's elements.
 pub const ACTION_NAMES: [&str; ACTION_LEN] = ["hand_x", "hand_y", "hand_z", "unused", "gripper"];
-/// The element of an action that has no effect.
+/// Index of the action element that has no effect.
 pub const UNUSED_ACTION: usize = 3;
 /// Largest absolute value of the action's elements.
 pub const ACTION_LIMITS: [f64; ACTION_LEN] = [1.0, 1.0, 1.0, PI, 1.0];
 
-/// Metres that the mocap body moves for an action of 1.
+/// Displacement of the mocap body for an action of 1, in metres.
 pub const ACTION_SCALE: f64 = 0.2;
-/// Corners of the box that the mocap body stays in.
+/// Lower corner of the box that the mocap body stays in.
 pub const MOCAP_LOW: [f64; 3] = [-0.3, 0.4, 0.0];
-/// See [`MOCAP_LOW`].
+/// Upper corner of the box that the mocap body stays in.
 pub const MOCAP_HIGH: [f64; 3] = [0.3, 0.8, 0.15];
 /// Orientation of the mocap body.
 pub const MOCAP_QUATERNION: [f64; 4] = [FRAC_1_SQRT_2, 0.0, FRAC_1_SQRT_2, 0.0];
 
-/// Arm and fingers at rest with the hand at (0, 0.5, 0.07), from where every episode's settling starts. The arm's zero posture is
-/// stretched out; pulled from there the hand catches the drawer on its way.
+/// Arm and fingers at rest with the hand at (0, 0.5, 0.07), where every episode's settling starts. The arm's zero posture is stretched out;
+/// pulled from there the hand catches the drawer on its way.
 pub const HOME: [f64; 9] = [
     1.93333534,
     -0.499194428,
@@ -76,51 +76,51 @@ pub const HOME: [f64; 9] = [
     0.04,
     -0.03,
 ];
-/// Where the mugs stand while the hand settles: out of its way.
+/// Position of the mugs while the hand settles, out of its way.
 pub const PARKED_MUGS: [f64; 4] = [-0.6, 0.4, -0.6, 0.9];
-/// Where half of the episodes' hands settle; the other half above the mugs, within [`HAND_SPREAD`].
+/// Target at which the hand settles in half of the episodes; in the other half it settles above the mugs, within [`HAND_SPREAD`].
 pub const HAND_HOME: [f64; 3] = [0.0, 0.5, 0.07];
-/// See [`HAND_HOME`].
+/// Middle of the targets above the mugs at which the hand settles.
 pub const HAND_ABOVE_MUGS: [f64; 3] = [-0.2, 0.65, 0.07];
-/// See [`HAND_HOME`].
+/// Half-width of the targets above the mugs at which the hand settles.
 pub const HAND_SPREAD: f64 = 0.05;
-/// Where the hand is brought for instructions about a mug, and for others.
+/// Target of the hand for instructions about a mug.
 pub const HAND_FOR_MUG: [f64; 3] = [-0.1, 0.55, 0.1];
-/// See [`HAND_FOR_MUG`].
+/// Target of the hand for instructions that are not about a mug.
 pub const HAND_FOR_OTHERS: [f64; 3] = [0.0, 0.45, 0.1];
 
-/// Middle of the mugs' starts.
+/// Middle of the mugs' start positions.
 pub const MUG_START: [f64; 2] = [-0.2, 0.65];
-/// Half-width of the mugs' starts, and where an instruction speaks of the mug.
+/// Half-width of a mug's start positions.
 pub const MUG_SPREAD: f64 = 0.1;
-/// See [`MUG_SPREAD`].
+/// Half-width of a mug's start positions where the instruction speaks of it.
 pub const MUG_SPREAD_COMMANDED: f64 = 0.05;
-/// Half-width of the faucet's starts, and where an instruction speaks of it.
+/// Half-width of the faucet's start angles.
 pub const FAUCET_SPREAD: f64 = PI / 4.0;
-/// See [`FAUCET_SPREAD`].
+/// Half-width of the faucet's start angles where the instruction speaks of it.
 pub const FAUCET_SPREAD_COMMANDED: f64 = PI / 5.0;
-/// Range of the drawer's starts.
+/// Range of the drawer's start positions.
 pub const DRAWER_START: [f64; 2] = [-0.09, 0.0];
-/// The same where it is to be opened.
+/// Range of the drawer's start positions where it is to be opened.
 pub const DRAWER_START_TO_OPEN: [f64; 2] = [-0.05, 0.0];
-/// The same where it is to be closed.
+/// Range of the drawer's start positions where it is to be closed.
 pub const DRAWER_START_TO_CLOSE: [f64; 2] = [-0.15, -0.05];
 
-/// How far a mug or the drawer must have moved, in metres.
+/// Distance that a mug or the drawer must have moved, in metres.
 pub const MOVED_M: f64 = 0.02;
-/// How far the faucet must have turned, in radians.
+/// Angle that the faucet must have turned, in radians.
 pub const TURNED_RAD: f64 = PI / 10.0;
 
 /// A sub-task: an element of the observation that must change by more than a threshold, in one direction.
 #[derive(Clone, Copy, Debug)]
 pub struct SubTask {
-    /// What one says.
+    /// Name of the sub-task, as instructions say it.
     pub name: &'static str,
-    /// The element.
+    /// Index of the element in an observation.
     pub element: usize,
-    /// 1 or -1.
+    /// Direction of the change: 1 or -1.
     pub sign: f64,
-    /// Strictly more than this.
+    /// Threshold that the element's change must strictly exceed.
     pub threshold: f64,
 }
 
@@ -134,7 +134,7 @@ impl SubTask {
         }
     }
 
-    /// Whether it is done in `now`, for an episode that began in `start`.
+    /// Whether the sub-task is carried out in `now`, for an episode that began in `start`.
     pub fn holds(&self, start: &[f64; OBSERVATION_LEN], now: &[f64]) -> bool {
         let change = now.get(self.element).unwrap_or(&f64::NAN) - start[self.element];
         self.sign * change > self.threshold
