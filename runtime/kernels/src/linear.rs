@@ -86,7 +86,7 @@ pub enum Activation {
     Relu,
     /// Leaky rectifier: `x` where `x >= 0`, else `alpha * x`.
     LeakyRelu(f32),
-    /// Clipped rectifier, `min(max(x, 0), bound)`: with a bound of 6, the ReLU6 of mobile networks.
+    /// Clipped rectifier, `min(max(x, 0), bound)`: with a bound of 6, the `ReLU6` of mobile networks.
     Clipped(f32),
     /// Hyperbolic tangent.
     Tanh,
