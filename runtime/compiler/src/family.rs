@@ -82,7 +82,7 @@ families! {
     Vae(vae::Vae) = "vae",
     /// LCSD: a plan in every step, and an action by denoising.
     Lcsd(lcsd::Lcsd) = "lcsd",
-    /// SkillDiffuser: a chunk of states by denoising, and the actions between them.
+    /// `SkillDiffuser`: a chunk of states by denoising, and the actions between them.
     SkillDiffuser(skilldiffuser::SkillDiffuser) = "skilldiffuser",
     /// LADS with a history: plans held for a horizon, and a low level that also attends to a window
     /// of earlier steps.
