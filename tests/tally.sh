@@ -8,6 +8,8 @@ set -uo pipefail
 [ $# -gt 0 ] || { echo "usage: tests/tally.sh COMMAND..." >&2; exit 2; }
 [ -z "${LADS_TALLY:-}" ] || exec "$@"
 export LADS_TALLY=1
+# What is read by awk is written as for a file; colours stay on a terminal.
+[ ! -t 1 ] || export CARGO_TERM_COLOR=${CARGO_TERM_COLOR:-always}
 found=$(mktemp)
 trap 'rm -f "$found"' EXIT
 "$@" 2>&1 | awk -v found="$found" '

@@ -165,10 +165,9 @@ fn anchor(heading: &str, taken: &BTreeSet<String>) -> String {
     });
     let plain: String = kept.collect();
     let numbered = (1..).map(|n| format!("{plain}-{n}"));
-    let all = std::iter::once(plain.clone()).chain(numbered);
-    all.into_iter()
-        .find(|name| !taken.contains(name))
-        .unwrap_or(plain)
+    let mut all = std::iter::once(plain.clone()).chain(numbered);
+    let free = all.find(|name| !taken.contains(name));
+    free.unwrap_or_default()
 }
 
 /// Folders that hold nothing of the project's own.

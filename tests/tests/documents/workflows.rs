@@ -19,7 +19,7 @@ fn workflows_call_rules_that_exist() {
             };
             count += 1;
             let mut make = Command::new("make");
-            make.args(["-n"]).args(command.split_whitespace());
+            make.arg("-n").args(command.split_whitespace());
             make.env_remove("MAKEFLAGS").env_remove("MAKELEVEL");
             let output = make.current_dir(project_path(".")).output();
             let output = output.expect("there is make");
