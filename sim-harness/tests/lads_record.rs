@@ -143,7 +143,7 @@ fn an_interrupted_film_leaves_nothing() {
     );
     command.arg(&out).arg("--json").arg(&json);
     // The film's temporary file is there from the first picture on.
-    let begun = || !files(folder.path()).is_empty();
+    let begun = |_| !files(folder.path()).is_empty();
     let Some((code, errors)) = interrupt::when(&mut command, &begun) else {
         println!("skipped: it ended before it could be interrupted");
         return;

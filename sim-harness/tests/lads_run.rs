@@ -1,12 +1,14 @@
 //! Tests the program `lads-run`: its report, its JSON, and everything that it refuses.
 
+#[cfg(target_os = "linux")]
+#[path = "common/interrupt.rs"]
+mod interrupt;
 #[path = "common/schema.rs"]
 mod schema;
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
-use std::time::Duration;
+use std::process::{Command, Output};
 
 use serde_json::Value;
 
@@ -344,7 +346,7 @@ fn a_failure_overwrites_nothing() {
     );
 }
 
-#[cfg(unix)]
+#[cfg(target_os = "linux")]
 #[test]
 fn an_interrupt_overwrites_nothing() {
     let folder = tempfile::tempdir().unwrap();
@@ -354,24 +356,9 @@ fn an_interrupt_overwrites_nothing() {
         &kitchen_bundle(),
         &["--episodes", "1000", "--json", json.to_str().unwrap()],
     );
-    let mut child = command
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    // Long enough for the handler to be there, which is the first thing that the program does; far too short for 25,000 episodes.
-    std::thread::sleep(Duration::from_secs(2));
-    assert!(child.try_wait().unwrap().is_none(), "it is still at work");
-    assert!(
-        Command::new("kill")
-            .args(["-INT", &child.id().to_string()])
-            .status()
-            .unwrap()
-            .success()
-    );
-    let output = child.wait_with_output().unwrap();
-    let errors = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(130), "{errors}");
+    let ended = interrupt::when(&mut command, &interrupt::runs_episodes);
+    let (code, errors) = ended.expect("25,000 episodes take minutes");
+    assert_eq!(code, Some(130), "{errors}");
     assert!(
         errors.contains("interrupted") && !errors.contains("panicked"),
         "{errors}"

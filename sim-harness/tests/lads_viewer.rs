@@ -120,7 +120,7 @@ fn an_interrupt_closes_the_window() {
     command.env("DISPLAY", &display.name);
     // In the first of many episodes at real time, however slow the machine is.
     let start = Instant::now();
-    let shown = || start.elapsed() > Duration::from_secs(4);
+    let shown = |_| start.elapsed() > Duration::from_secs(4);
     let (code, errors) = interrupt::when(&mut command, &shown).unwrap();
     if lacks_egl(&errors) {
         return;
