@@ -142,10 +142,10 @@ fn cache_format(name: &str) -> Result<CacheFormat, String> {
 
 /// A format; `None` is `auto`.
 #[derive(Debug, Clone, Copy)]
-struct Choice<T>(Option<T>);
+pub(crate) struct Choice<T>(pub(crate) Option<T>);
 
 /// A parser that also knows `auto`.
-fn auto_or<T>(
+pub(crate) fn auto_or<T>(
     format: fn(&str) -> Result<T, String>,
 ) -> impl Fn(&str) -> Result<Choice<T>, String> + Clone {
     move |name| match name {

@@ -15,9 +15,15 @@ const COMPARED: usize = 60;
 /// An action that is further from the recorded one than this is not rounding.
 const BROKEN: f32 = 0.1;
 
-/// How a policy is compiled to be measured: with fewer bits for the weights, the cache has half of them too, and the tolerance, which
-/// is otherwise the machine's, only has to tell a sound policy from a broken one.
-pub fn options(weights: WeightFormat) -> Options {
+/// The name of [`options`] of no format.
+pub const AUTO: &str = "auto";
+
+/// How a policy is compiled to be measured: as it was tuned, or with one format for all weights. With fewer bits the cache then has half of them too,
+/// and the tolerance, which is otherwise the machine's, only has to tell a sound policy from a broken one.
+pub fn options(weights: Option<WeightFormat>) -> Options {
+    let Some(weights) = weights else {
+        return Options::default();
+    };
     if weights == WeightFormat::F32 {
         return Options::exact();
     }
@@ -31,7 +37,7 @@ pub fn options(weights: WeightFormat) -> Options {
 /// An image to measure.
 #[derive(Debug, Clone, Copy)]
 pub struct Candidate<'i> {
-    /// How its weights are stored, such as `f32`.
+    /// How its weights are stored, such as `f32`, or [`AUTO`].
     pub weights: &'i str,
     /// The compiled program image, aligned to four bytes.
     pub image: &'i [u8],

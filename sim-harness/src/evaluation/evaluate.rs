@@ -8,7 +8,7 @@ use std::panic::resume_unwind;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 
-use lads_compiler::Contract;
+use lads_compiler::{CompileError, Contract};
 use lads_core::{Decision, Isa, Noise, Policy};
 use lads_host::{Memory, MemoryError};
 use thiserror::Error;
@@ -97,6 +97,9 @@ pub enum EvaluationError {
         /// What happened.
         source: RolloutError,
     },
+    /// The policy with 32 bits, beside which one with fewer is judged, does not compile.
+    #[error("with 32 bits: {0}")]
+    Exact(CompileError),
     /// It was told to stop.
     #[error("interrupted")]
     Interrupted,

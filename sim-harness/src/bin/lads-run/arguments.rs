@@ -108,12 +108,14 @@ pub struct PolicyArguments {
     pub exact: bool,
 }
 
-/// Instruction sets by name.
+/// Instruction sets by the names that [`lads_core::Isa::name`] gives, those of other processors too.
 #[derive(Debug, Clone, Copy, clap::ValueEnum)]
 pub enum IsaName {
     Portable,
     Avx2,
     Avx512,
+    Neon,
+    Dotprod,
 }
 
 /// Which episodes run.
