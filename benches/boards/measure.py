@@ -1,6 +1,6 @@
 """Estimates a control step on boards that are not at hand: instructions by QEMU, cycles of the inner loops by llvm-mca.
 
-    lads compile models/kitchen.onnx --emit-c f32.c
+    lads compile models/kitchen.onnx --weights f32 --emit-c f32.c
     python3 benches/boards/measure.py steps f32=f32.c int8=int8.c    instructions of a step, per target and kernel
     python3 benches/boards/measure.py loops                          cycles per 64 weights, per core and loop
     python3 benches/boards/measure.py table                          the tables of both, from results.json

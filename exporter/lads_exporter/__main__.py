@@ -77,8 +77,11 @@ def _check_card(arguments, more):
 
 
 def _card(arguments, saved, sha256):
-    from . import acceptance, card
+    import onnx
 
+    from . import acceptance, card, contract
+
+    metadata = contract.properties(onnx.load(arguments.output))
     beside = []
     for pair in arguments.beside:
         label, equals, path = pair.rpartition("=")
@@ -89,7 +92,7 @@ def _card(arguments, saved, sha256):
     path = Path(arguments.output).with_suffix(".md")
     notes = Path(arguments.output).with_suffix(".notes.md")
     notes = notes.read_text(encoding="utf-8") if notes.is_file() else ""
-    output.write_atomically(path, card.write(arguments.run, saved, sha256, results, beside, notes, acceptance.beside(arguments.output)).encode())
+    output.write_atomically(path, card.write(arguments.run, saved, sha256, metadata, results, beside, notes, acceptance.beside(arguments.output)).encode())
     print(f"{path}: model card")
 
 

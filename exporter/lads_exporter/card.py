@@ -2,6 +2,7 @@
 
 import csv
 import json
+from collections import Counter
 from pathlib import Path
 
 from . import acceptance
@@ -102,9 +103,34 @@ def _plans(summary):
     return []
 
 
-def write(folder, saved, sha256, results=None, beside=(), notes="", calibrated=None):
-    """Writes the card as Markdown. `folder` is the run's, `saved` its checkpoint, `notes` what a person has to say, `calibrated` which
-    sentences it follows."""
+def storage(metadata):
+    """Returns the card's line on how a bundle's numbers are stored, and on what evidence; `metadata` is the bundle's, by key."""
+    text = metadata.get("lads.storage")
+    if text is None:
+        return "- numbers: 32-bit floats; `lads-run tune` looks for smaller ones that decide the same"
+    record = json.loads(text)
+    stored, seen = record["storage"], record["evidence"]
+    entries = {}
+    for part, kind in stored["parts"].items():
+        entry = "/".join(part.split("/")[:2])  # an entry's name, or what a node's begins with
+        entries.setdefault(entry, []).append((part, kind))
+    said = []
+    for entry, rows in entries.items():
+        kinds = [kind for part, kind in rows if part == entry] or [stored["weights"]]
+        nodes = Counter(kind for part, kind in rows if part != entry)
+        said.append(", ".join([f"{entry} {kinds[0]}", *(f"but {kind} in {count} of its layers" for kind, count in nodes.items())]))
+    parts = f" ({'; '.join(said)})" if said else ""
+    clear = f"{seen['clear_share']:.1%} of them clear by {seen['margin_factor']:g} times the {seen['largest_logit_error']:.1e} that a logit moves"
+    margin = f" ({clear}; smallest margin {seen['smallest_margin']:.1e})" if seen.get("smallest_margin") is not None else ""
+    return (
+        f"- numbers: {stored['weights']} weights{parts}, {stored['cache']} cache, by `lads-run tune`: the same indices in "
+        f"{seen['decisions']} decisions{margin}, actions moved by {seen['largest_action_error']:.1e} in {seen['steps']} steps"
+    )
+
+
+def write(folder, saved, sha256, metadata, results=None, beside=(), notes="", calibrated=None):
+    """Writes the card as Markdown. `folder` is the run's, `saved` its checkpoint, `metadata` the bundle's, `notes` what a person has to say, `calibrated`
+    which sentences it follows."""
     summary = json.loads((Path(folder) / SUMMARY).read_text(encoding="utf-8"))
     tables, environment, _ = saved["identity"]["tables"]
     steps = ", ".join(f"{name} {count} ({summary['seconds'][name]:.0f} s)" for name, count in summary["steps"].items())
@@ -116,6 +142,7 @@ def write(folder, saved, sha256, results=None, beside=(), notes="", calibrated=N
         "Intended for simulation and study; it has seen no real robot.",
         "",
         f"- sha256 of the bundle: `{sha256}`",
+        storage(metadata),
         f"- data: {summary['episodes']} episodes, {summary['transitions']} transitions, sha256 `{summary['dataset_sha256']}`",
         *(f"- data, {name}: {value if isinstance(value, str) else json.dumps(value)}" for name, value in saved["notes"].items()),
         f"- language encoder: {tables['language']['encoder']}, layer {tables['language']['layer']}, sha256 `{saved['identity']['language_sha256']}`",

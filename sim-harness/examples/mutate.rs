@@ -47,9 +47,11 @@ impl Bench {
                 return;
             }
         };
-        let answers = &judged.answers;
+        // With fewer bits than 32 the logits count by what they decide; their values, and what moves them, with 32.
+        let answers = &judged.asked.policy;
+        let exact = judged.asked.exact.as_ref().unwrap_or(answers);
         let (logit, action) = (
-            answers.largest_logit_difference,
+            exact.largest_logit_difference,
             answers.largest_action_difference,
         );
         let moving = logit > LOGIT || action > ACTION || answers.differing_segments > 0;

@@ -97,6 +97,28 @@ fn every_plan_is_kept_and_the_bundle_says_so() {
     assert!(image.as_bytes().len() * 10 < exact.as_bytes().len() * 6);
 }
 
+/// What ships is what `tune` found with the reference beside it, and what compiles it by default is that.
+#[test]
+fn shipped_bundles_are_tuned_by_their_own_references() {
+    for (name, most) in [
+        ("kitchen", 2_600_000),
+        ("kitchen-small", 350_000),
+        ("lorel", 1_500_000),
+    ] {
+        let bundle = Bundle::open(&project_file(&format!("models/{name}.onnx"))).unwrap();
+        let reference = fs::read(project_file(&format!("models/{name}.reference.json"))).unwrap();
+        let tuned = bundle.tuned().unwrap().unwrap();
+        let seen = &tuned.evidence;
+        assert_eq!(seen.reference_sha256, lads_compiler::sha256(&reference));
+        assert!(seen.decisions > 600 && seen.segments > 500 && seen.clear_share >= 0.99);
+        assert_eq!(seen.largest_action_error, 0.0, "{name}");
+        assert_eq!(tuned.storage.of("low_level/act", ""), WeightFormat::F32);
+        let image = lads_compiler::compile(&bundle).unwrap();
+        let bytes = image.as_bytes().len();
+        assert!(bytes <= most, "{name}: {bytes}");
+    }
+}
+
 #[test]
 fn what_cannot_be_tuned_is_refused_and_nothing_is_written() {
     let folder = tempfile::tempdir().unwrap();

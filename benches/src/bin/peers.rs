@@ -12,7 +12,7 @@ use lads_benches::peers::Peers;
 use lads_compiler::WeightFormat;
 use lads_pace::BenchError;
 use lads_pace::paced::{Protocol, Report, measure};
-use lads_pace::suite::{Candidate, options};
+use lads_pace::suite::{AUTO, Candidate, options};
 
 /// Measures a policy at its real rate beside ONNX Runtime, tract and rten, and with a Python beside PyTorch and OpenVINO.
 #[derive(Debug, Parser)]
@@ -29,8 +29,8 @@ struct Arguments {
     /// Threads that thrash the caches and compute beside it
     #[arg(long, default_value_t = 0)]
     load: usize,
-    /// Formats of the weights to measure, side by side, those of 16 bits or fewer with a cache of 16
-    #[arg(long, value_delimiter = ',', default_value = "f32")]
+    /// Formats of the weights to measure, side by side: auto, as the bundle was tuned, or one for all weights, of 16 bits or fewer with a cache of 16
+    #[arg(long, value_delimiter = ',', default_value = AUTO)]
     weights: Vec<String>,
     /// The shared library of ONNX Runtime
     #[arg(long, default_value = "vendor/onnxruntime/libonnxruntime.so")]
@@ -62,17 +62,18 @@ fn run(arguments: &Arguments) -> Result<Report, BenchError> {
         .map_err(|error| BenchError::new(path.display(), error, "name a bundle (.onnx)"))?;
     let mut models = vec![];
     for name in &arguments.weights {
-        let mut known = WeightFormat::ALL.into_iter();
-        let weights = known.find(|format| format.name() == name);
-        let weights = weights.ok_or_else(|| {
+        let known = WeightFormat::ALL
+            .into_iter()
+            .find(|format| format.name() == name);
+        if known.is_none() && name != AUTO {
             let known = WeightFormat::ALL.map(WeightFormat::name).join(", ");
-            BenchError::new(
+            return Err(BenchError::new(
                 name,
                 "no format of weights",
-                format_args!("known are {known}"),
-            )
-        })?;
-        let opened = lads_host::open_with(path, &options(weights));
+                format_args!("known are {AUTO}, {known}"),
+            ));
+        }
+        let opened = lads_host::open_with(path, &options(known));
         let opened = opened.map_err(|error| BenchError::of(&error))?;
         if !opened.is_bundle() {
             return Err(BenchError::new(

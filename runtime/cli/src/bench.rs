@@ -9,8 +9,9 @@ use std::path::PathBuf;
 use clap::Args;
 use lads_compiler::WeightFormat;
 use lads_pace::paced::{Protocol, Report, measure};
-use lads_pace::suite::{Candidate, Nobody, options};
+use lads_pace::suite::{AUTO, Candidate, Nobody, options};
 
+use crate::compile::{Choice, auto_or, weight_format};
 use crate::model::Model;
 use crate::refusal::Refusal;
 
@@ -29,16 +30,17 @@ pub struct Request {
     /// Threads that thrash the caches and compute during the measurement
     #[arg(long, default_value_t = 0)]
     load: usize,
-    /// Weight formats to measure, side by side; formats of 16 bits or fewer get a cache of 16 bits;
-    /// an image keeps the formats that it was compiled with
+    /// Weight formats to measure, side by side: auto, as the bundle was tuned, or one for all weights;
+    /// formats of 16 bits or fewer get a cache of 16 bits; an image keeps the formats that it was
+    /// compiled with
     #[arg(
         long,
         value_name = "FORMAT",
         value_delimiter = ',',
-        default_value = "f32",
-        value_parser = crate::compile::weight_format
+        default_value = AUTO,
+        value_parser = auto_or(weight_format)
     )]
-    weights: Vec<WeightFormat>,
+    weights: Vec<Choice<WeightFormat>>,
     /// Print one JSON object
     #[arg(long)]
     pub json: bool,
@@ -56,12 +58,12 @@ pub fn bench(request: &Request) -> Result<Report, Refusal> {
         Refusal::new(flag, senseless.wrong, senseless.remedy)
     })?;
     let mut models = vec![];
-    for &weights in &request.weights {
+    for &Choice(weights) in &request.weights {
         let model = Model::compile(&request.model, &options(weights))?;
-        models.push((weights.name(), model));
+        models.push((weights.map_or(AUTO, WeightFormat::name), model));
     }
     if models.is_empty() {
-        let remedy = "name a format, such as f32";
+        let remedy = "name a format, such as f32, or auto";
         return Err(Refusal::new("--weights", "it names none", remedy));
     }
     let candidates: Vec<_> = models

@@ -146,10 +146,10 @@ fn cache_format(name: &str) -> Result<CacheFormat, String> {
 
 /// A format, or `auto` as `None`.
 #[derive(Debug, Clone, Copy)]
-struct Choice<T>(Option<T>);
+pub(crate) struct Choice<T>(pub(crate) Option<T>);
 
 /// Makes a parser that also accepts `auto`.
-fn auto_or<T>(
+pub(crate) fn auto_or<T>(
     format: fn(&str) -> Result<T, String>,
 ) -> impl Fn(&str) -> Result<Choice<T>, String> + Clone {
     move |name| match name {

@@ -28,7 +28,7 @@ fn bench_measures_every_kind_of_step() {
     let report: Value =
         serde_json::from_str(&answer(&[&short[..], &["--json"]].concat(), "")).unwrap();
     let contender = &report["contenders"][0];
-    assert_eq!(contender["name"], "lads f32");
+    assert_eq!(contender["name"], "lads auto");
     let latency = &contender["latency_us"];
     for kind in ["act", "ordinary", "decision", "instruct"] {
         let [p50, max] = ["p50", "max"].map(|q| latency[kind][q].as_f64().unwrap());

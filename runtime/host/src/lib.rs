@@ -36,4 +36,4 @@ pub use open::{Loaded, OpenError, Opened, Problem, from_bytes, open};
 #[cfg(feature = "compile")]
 pub use open::{from_bytes_with, open_with};
 pub use refused::refused;
-pub use stored::stored;
+pub use stored::{is_exact, stored};

@@ -7,9 +7,26 @@ use lads_image::op::{CacheFormat, Op, WeightFormat};
 /// Names the formats that a policy's programs read, for example `f16 and f32 weights, f16 cache`; a
 /// policy without dense layers or without a cache names none of them.
 pub fn stored(policy: &Policy<'_>) -> String {
+    let (weights, caches) = formats(policy);
+    let all = [
+        named(weights.into_iter().map(WeightFormat::name), "weights"),
+        named(caches.into_iter().map(CacheFormat::name), "cache"),
+    ];
+    all.into_iter().flatten().collect::<Vec<_>>().join(", ")
+}
+
+/// Whether a policy's weights and caches all have 32 bits, so that nothing of it was rounded.
+pub fn is_exact(policy: &Policy<'_>) -> bool {
+    let (weights, caches) = formats(policy);
+    weights.iter().all(|&format| format == WeightFormat::F32)
+        && caches.iter().all(|&format| format == CacheFormat::F32)
+}
+
+/// Of weights and of caches.
+fn formats(policy: &Policy<'_>) -> (Vec<WeightFormat>, Vec<CacheFormat>) {
     // Opening the policy has read the same tables.
     let Ok(tables) = Tables::new(policy.image()) else {
-        return String::new();
+        return (vec![], vec![]);
     };
     let ops: Vec<Op> = (0..tables.entries_len())
         .filter_map(|i| tables.entry(i))
@@ -26,14 +43,11 @@ pub fn stored(policy: &Policy<'_>) -> String {
         let stores = |op: &Op| matches!(op, Op::Attention(op) if op.format == format);
         ops.iter().any(stores)
     });
-    let all = [
-        named(weights.map(WeightFormat::name).collect(), "weights"),
-        named(caches.map(CacheFormat::name).collect(), "cache"),
-    ];
-    all.into_iter().flatten().collect::<Vec<_>>().join(", ")
+    (weights.collect(), caches.collect())
 }
 
-fn named(mut formats: Vec<&str>, what: &str) -> Option<String> {
+fn named<'n>(formats: impl Iterator<Item = &'n str>, what: &str) -> Option<String> {
+    let mut formats: Vec<_> = formats.collect();
     formats.sort_unstable();
     (!formats.is_empty()).then(|| format!("{} {what}", formats.join(" and ")))
 }

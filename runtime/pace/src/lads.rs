@@ -1,7 +1,6 @@
 //! The lads runtime as a contender.
 
 use lads_core::{ChannelId, Controller, Data, Decision, GoldenStep, Instruction, Role, StepReport};
-use lads_image::{Op, Tables};
 
 use crate::clock::Pace;
 use crate::contender::{Block, Computed, Contender, Episode, Kind, Sample, Work, measure};
@@ -28,8 +27,7 @@ impl<'c, 'a, 'm> Lads<'c, 'a, 'm> {
     ) -> Self {
         let (isa, version) = (controller.isa().name(), env!("CARGO_PKG_VERSION"));
         let policy = controller.policy();
-        let cache = cache_format(policy.image()).map(|format| format!(", {format} cache"));
-        let cache = cache.unwrap_or_default();
+        let stored = lads_host::stored(policy);
         let recorded = policy
             .golden()
             .into_iter()
@@ -38,7 +36,7 @@ impl<'c, 'a, 'm> Lads<'c, 'a, 'm> {
         let action = vec![0.0; policy.contract().action_len()];
         Self {
             name: format!("lads {weights}"),
-            detail: format!("{version}, {weights} weights{cache}, {isa}"),
+            detail: format!("{version}, {stored}, {isa}"),
             controller,
             episode,
             recorded,
@@ -99,17 +97,6 @@ impl<'c, 'a, 'm> Lads<'c, 'a, 'm> {
         }
         Ok(())
     }
-}
-
-/// Returns the format of an image's KV cache, if it has one.
-fn cache_format(image: &[u8]) -> Option<&'static str> {
-    let tables = Tables::new(image).ok()?;
-    let entries = (0..tables.entries_len()).filter_map(|i| tables.entry(i));
-    let mut ops = entries.flat_map(|entry| tables.ops(&entry));
-    ops.find_map(|words| match Op::decode(words) {
-        Some(Op::Attention(op)) => Some(op.format.name()),
-        _ => None,
-    })
 }
 
 impl Contender for Lads<'_, '_, '_> {

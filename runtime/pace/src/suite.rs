@@ -15,10 +15,17 @@ const COMPARED: usize = 60;
 /// Largest difference of an action from the recorded one that may be rounding.
 const BROKEN: f32 = 0.1;
 
-/// Returns the options that compile a policy for a measurement: with fewer bits for the weights,
-/// the cache has half of them too, and the tolerance, which is otherwise the machine's, only has to
-/// distinguish a sound policy from a broken one.
-pub fn options(weights: WeightFormat) -> Options {
+/// Name of the formats that a bundle was tuned to, which [`options`] gives for no format.
+pub const AUTO: &str = "auto";
+
+/// Returns the options that compile a policy for a measurement: as it was tuned, or with one format
+/// for all weights. With fewer bits for the weights, the cache has half of them too, and the
+/// tolerance, which is otherwise the machine's, only has to distinguish a sound policy from a broken
+/// one.
+pub fn options(weights: Option<WeightFormat>) -> Options {
+    let Some(weights) = weights else {
+        return Options::default();
+    };
     if weights == WeightFormat::F32 {
         return Options::exact();
     }
@@ -32,7 +39,7 @@ pub fn options(weights: WeightFormat) -> Options {
 /// A program image to measure.
 #[derive(Debug, Clone, Copy)]
 pub struct Candidate<'i> {
-    /// Format of the weights, such as `f32`.
+    /// Format of the weights, such as `f32`, or [`AUTO`].
     pub weights: &'i str,
     /// The compiled program image, aligned to four bytes.
     pub image: &'i [u8],

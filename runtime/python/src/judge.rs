@@ -6,10 +6,11 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 
 use askama::Template as _;
-use lads_core::{Channel, ChannelId, Contract, DType, Data};
-use lads_proof::answers::{Answer, Answers, Replay, Reply};
+use lads_core::{Channel, ChannelId, Contract, DType, Data, Decision};
+use lads_proof::answers::{Answer, Replay, Reply};
 use lads_proof::certificate::{Certificate, ReferenceUsed, Setting};
 use lads_proof::contract::Compared;
 use lads_proof::episode::{Completion, Episode};
@@ -18,12 +19,13 @@ use lads_proof::page::Page;
 use lads_proof::pairs::{Episodes, Paired, Traced};
 use lads_proof::physics::Physics;
 use lads_proof::reference::{Reference, Trace};
+use lads_proof::rounding::Asked;
 use pyo3::prelude::*;
 use serde::Deserialize;
 use serde_json::Value;
 
 use crate::arrays;
-use crate::cell::Working;
+use crate::cell::{Checked, Working};
 use crate::controller::Controller;
 use crate::errors::{ProofError, instruction as refused_instruction};
 
@@ -83,8 +85,14 @@ pub fn judge(
     let contract = view.contract();
     let numbers = known(&reference, controller)?;
     let replays = py.detach(|| ask(&mut asked, contract, &reference, &numbers))?;
+    let exact = exact(controller)?;
+    let exact = exact.map(|checked| {
+        let mut asked = controller.settings().working(&checked)?;
+        py.detach(|| ask(&mut asked, contract, &reference, &numbers))
+    });
+    let exact = exact.transpose()?;
     let tolerance = view.golden().map(|golden| f64::from(golden.tolerance()));
-    let (answers, numbering) = Answers::judge(&reference, &replays, tolerance);
+    let (answers, numbering) = Asked::judge(&reference, &replays, exact.as_deref(), tolerance);
     let rollouts = pairs(&reference, &numbering, &run, &about, contract);
     let setting = Setting {
         environment: about.environment,
@@ -123,6 +131,26 @@ pub fn judge(
         .render()
         .map_err(|error| broken(&error))?;
     Ok((certificate.verdict.word(), json, page))
+}
+
+/// Compiles the policy with 32 bits, if its image has fewer, selects the largest logit and was
+/// compiled from a bundle that is at hand.
+fn exact(controller: &Controller) -> PyResult<Option<Arc<Checked>>> {
+    let (checked, settings) = (controller.checked(), controller.settings());
+    let view = checked.view();
+    let selects = view.index_count() > 0
+        && settings.sample.is_none()
+        && view.contract().decision() == Decision::Argmax;
+    let bundle = checked.opened().bundle();
+    let Some(bundle) = bundle.filter(|_| selects && !lads_host::is_exact(view)) else {
+        return Ok(None);
+    };
+    let broken =
+        |error: &dyn std::fmt::Display| ProofError::new_err(format!("with 32 bits: {error}"));
+    let image = lads_compiler::compile_with(bundle, &lads_compiler::Options::exact());
+    let image = image.map_err(|error| broken(&error))?;
+    let opened = lads_host::from_bytes(image.as_bytes()).map_err(|error| broken(&error))?;
+    Ok(Some(Checked::of(opened)))
 }
 
 /// Returns the numbers of the reference's instructions; `None` for a policy that takes none.

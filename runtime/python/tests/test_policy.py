@@ -56,7 +56,11 @@ def test_an_image_is_the_same_policy(kitchen, tmp_path):
 
 def test_it_is_compiled_as_asked(kitchen, tmp_path):
     half = lads.open(kitchen.path, weights="f16", cache="f16", tolerance=0.05)
-    assert len(half.image) < 0.7 * len(kitchen.image)
+    exact = lads.open(kitchen.path, weights="f32")
+    assert exact.inspect()["stored"] == "f32 weights, f32 cache"
+    # Left alone it is as it was tuned.
+    assert len(half.image) < 0.7 * len(exact.image) and len(kitchen.image) < 0.9 * len(exact.image)
+    assert kitchen.inspect()["stored"] == "f32 and int16 weights, f16 cache"
     assert half.inspect()["stored"] == "f16 weights, f16 cache" and half.self_test().tolerance == pytest.approx(0.05)
     mixed = lads.open(kitchen.path, weights="int16", low_level="f32")
     assert "int16" in mixed.inspect()["stored"]

@@ -111,8 +111,8 @@ pub struct Answers {
     pub compared_decisions: usize,
     /// Largest difference of a logit in the compared decisions, up to a constant added to all of a decision's.
     pub largest_logit_difference: f64,
-    /// Allowed difference of a logit.
-    pub logit_tolerance: f64,
+    /// Allowed difference of a logit; `None` where what the logits decide is judged instead ([`Rounding`](crate::rounding::Rounding)).
+    pub logit_tolerance: Option<f64>,
     /// Number of decisions that differ within rounding.
     pub close_calls: usize,
     /// Number of segments whose encoding by the trajectory encoder was compared.
@@ -125,6 +125,9 @@ pub struct Answers {
     pub differing_episodes: usize,
     /// First difference beyond the tolerances.
     pub first_difference: Option<Answer>,
+    /// Largest reference margin at which a decision whose logits are known may differ: two logits may be off.
+    #[serde(skip)]
+    pub(crate) close_call: f64,
 }
 
 impl Answers {
@@ -134,51 +137,85 @@ impl Answers {
         replays: &[Replay],
         stated_tolerance: Option<f64>,
     ) -> (Self, Numbering) {
+        let mut answers = Self::bounded(reference, stated_tolerance);
+        let tolerance = logit_tolerance(reference);
+        answers.logit_tolerance = Some(tolerance);
+        let traced = traced(reference, replays);
+        let numbering = Numbering::of(
+            traced.iter().flat_map(Traced::decisions),
+            tolerance,
+            answers.close_call,
+        );
+        (answers.all(&traced, &numbering), numbering)
+    }
+
+    /// The same of an image with fewer bits than 32, whose answers with 32 have shown how plans are numbered: its logits are measured, and what
+    /// they decide is judged.
+    pub fn judge_rounded(
+        reference: &Reference,
+        replays: &[Replay],
+        stated_tolerance: Option<f64>,
+        numbering: &Numbering,
+    ) -> Self {
+        let answers = Self::bounded(reference, stated_tolerance);
+        answers.all(&traced(reference, replays), numbering)
+    }
+
+    /// Nothing yet, and what may be off.
+    fn bounded(reference: &Reference, stated_tolerance: Option<f64>) -> Self {
         let noise = reference.float_noise.unwrap_or_default();
         let stated = stated_tolerance
             .unwrap_or(ACTION_TOLERANCE)
             .min(ACTION_TOLERANCE);
-        let mut answers = Self {
+        Self {
             action_tolerance: stated.max(NOISE_FACTOR * noise.action),
-            logit_tolerance: LOGIT_TOLERANCE.max(NOISE_FACTOR * noise.logit),
+            close_call: 2.0 * logit_tolerance(reference),
             ..Self::default()
-        };
-        let traced: Vec<_> = replays
-            .iter()
-            .filter_map(|replay| Traced::of(reference, replay))
-            .collect();
-        let numbering = Numbering::of(
-            traced.iter().flat_map(Traced::decisions),
-            answers.logit_tolerance,
-            2.0 * answers.logit_tolerance,
-        );
-        answers.renumbered = numbering.is_another();
-        for episode in &traced {
-            answers.episodes += 1;
-            answers.decisions += episode.decided_at.len();
-            answers.longest_episode = answers.longest_episode.max(episode.replay.replies.len());
-            let Some((step, what)) = episode.judge(&numbering, &mut answers) else {
+        }
+    }
+
+    fn all(mut self, traced: &[Traced<'_>], numbering: &Numbering) -> Self {
+        self.renumbered = numbering.is_another();
+        for episode in traced {
+            self.episodes += 1;
+            self.decisions += episode.decided_at.len();
+            self.longest_episode = self.longest_episode.max(episode.replay.replies.len());
+            let Some((step, what)) = episode.judge(numbering, &mut self) else {
                 continue;
             };
-            answers.differing_episodes += 1;
-            answers.first_difference.get_or_insert(Answer {
+            self.differing_episodes += 1;
+            self.first_difference.get_or_insert(Answer {
                 instruction: episode.instruction.to_owned(),
                 episode: episode.replay.episode,
                 step,
                 what,
             });
         }
-        (answers, numbering)
+        self
     }
 
-    /// Largest reference margin at which a decision may differ: two logits may be off.
+    /// Largest reference margin at which a decision may differ.
     fn close_call(&self, decision: &Decision<'_>) -> f64 {
         if decision.reference_logits.is_empty() {
             CLOSE_CALL
         } else {
-            2.0 * self.logit_tolerance
+            self.close_call
         }
     }
+}
+
+/// Allowed difference of a logit.
+fn logit_tolerance(reference: &Reference) -> f64 {
+    let noise = reference.float_noise.unwrap_or_default();
+    LOGIT_TOLERANCE.max(NOISE_FACTOR * noise.logit)
+}
+
+/// Lists the replays of which the reference has a trace.
+fn traced<'t>(reference: &'t Reference, replays: &'t [Replay]) -> Vec<Traced<'t>> {
+    let replays = replays.iter();
+    replays
+        .filter_map(|replay| Traced::of(reference, replay))
+        .collect()
 }
 
 /// One decision of both policies.
@@ -355,12 +392,9 @@ impl Answers {
                 f64::from(ours) - f64::from(theirs)
             }));
         self.largest_logit_difference = self.largest_logit_difference.max(difference);
-        (difference > self.logit_tolerance).then(|| {
-            format!(
-                "a logit is off by {difference:.1e}, allowed {:.1e}",
-                self.logit_tolerance
-            )
-        })
+        let tolerance = self.logit_tolerance?;
+        (difference > tolerance)
+            .then(|| format!("a logit is off by {difference:.1e}, allowed {tolerance:.1e}"))
     }
 
     fn plan(&mut self, decision: &Decision<'_>, same: bool) -> Option<String> {

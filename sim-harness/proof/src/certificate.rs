@@ -5,10 +5,12 @@
 //!
 //! 1. **DIFFERENT** if the contract says otherwise than the reference's did, or the image otherwise than the bundle; if the policy answers the
 //!    reference's questions otherwise (a logit or an action beyond its tolerance, another plan although the reference's margin is not a close call,
-//!    decisions at other steps, another encoding of a trajectory); if the reference's actions lead through other states; or if a test finds a paired
+//!    decisions at other steps, another encoding of a trajectory); if an image with fewer bits than 32 is of a bundle that does so with 32, or is not
+//!    the same policy as with 32 ([`rounding`](super::rounding): of its logits counts what they decide); if the reference's actions lead through other states; or if a test finds a paired
 //!    difference larger than its margin (1 % over all of them together).
 //! 2. **EQUIVALENT** if none of this holds, contract, actions, states and, where the reference decides, logits were compared at all, and every paired difference is
-//!    equivalent: two one-sided tests at 5 %, within 0.05 for rates and 0.1 for the N-rate.
+//!    equivalent: two one-sided tests at 5 %, within 0.05 for rates and 0.1 for the N-rate. Of an image with fewer bits, at least 99 % of the decisions
+//!    are clear; fewer are DIFFERENT only if a binomial test shows it (1 %).
 //! 3. **INCONCLUSIVE** otherwise; then it says how many more episodes of each instruction would decide, at these rates.
 //!
 //! A difference that is significant (McNemar's test, 5 % over all rates together) and yet negligible is noted as such: with enough episodes
@@ -25,11 +27,12 @@ use super::answers::Answers;
 use super::contract::{Compared, FieldDifference};
 use super::pairs::Paired;
 use super::physics::Physics;
+use super::rounding::{Asked, Rounding};
 
 /// Value of the JSON's `format`.
 pub const FORMAT: &str = "lads-certificate";
 /// Version of the JSON form; changes when a field changes its meaning or goes.
-pub const FORMAT_VERSION: u32 = 2;
+pub const FORMAT_VERSION: u32 = 3;
 
 /// Chance of a false alarm of McNemar's tests, all together.
 const SIGNIFICANCE: f64 = 0.05;
@@ -148,6 +151,10 @@ pub struct Certificate {
     pub contract: Compared,
     /// Open-loop comparison of the policy alone.
     pub policy: Answers,
+    /// Open-loop comparison of the same policy with all numbers stored with 32 bits, if the image that ran has fewer and selects the largest logit.
+    pub exact: Option<Answers>,
+    /// Comparison of the image with the same bundle at 32 bits.
+    pub rounding: Option<Rounding>,
     /// Open-loop comparison of the environment alone.
     pub environment: Physics,
     /// Closed-loop comparison of policy and environment together.
@@ -160,23 +167,35 @@ impl Certificate {
         setting: Setting,
         reference: ReferenceUsed,
         contract: Compared,
-        policy: Answers,
+        asked: Asked,
         environment: Physics,
         rollouts: Paired,
         mut not_covered: Vec<String>,
     ) -> Self {
-        let different = differences(&contract, &policy, &environment, &rollouts);
+        let different = differences(&contract, &asked, &environment, &rollouts);
+        let unclear = asked.undecided();
+        let Asked {
+            policy,
+            exact,
+            rounding,
+        } = asked;
         let mut undecided = undecided(&rollouts);
         let uncompared = uncompared(&contract, &policy, &environment);
-        not_covered.extend(unseen(&reference, &policy));
-        let more_would_help = uncompared.is_empty();
+        not_covered.extend(unseen(&reference, &policy, rounding.as_ref()));
+        let more_would_help = uncompared.is_empty() && unclear.is_none();
         undecided.extend(uncompared);
+        undecided.extend(unclear);
         let (verdict, reasons) = if !different.is_empty() {
             (Verdict::Different, different)
         } else if undecided.is_empty() {
             (
                 Verdict::Equivalent,
-                vec![agreement(&policy, &environment, &rollouts)],
+                vec![agreement(
+                    &policy,
+                    rounding.as_ref(),
+                    &environment,
+                    &rollouts,
+                )],
             )
         } else {
             (Verdict::Inconclusive, undecided)
@@ -197,6 +216,8 @@ impl Certificate {
             not_covered,
             contract,
             policy,
+            exact,
+            rounding,
             environment,
             rollouts,
         }
@@ -205,7 +226,7 @@ impl Certificate {
 
 fn differences(
     contract: &Compared,
-    policy: &Answers,
+    asked: &Asked,
     environment: &Physics,
     rollouts: &Paired,
 ) -> Vec<String> {
@@ -226,12 +247,7 @@ fn differences(
     {
         reasons.push(format!("{what} in {}", list(differing)));
     }
-    if let Some(answer) = &policy.first_difference {
-        reasons.push(format!(
-            "the policy answers otherwise in {} of {} replayed episodes, first in {answer}",
-            policy.differing_episodes, policy.episodes
-        ));
-    }
+    reasons.extend(asked.differences());
     if let Some(answer) = &environment.first_difference {
         reasons.push(format!(
             "the environment moves otherwise under the reference's actions, first in {answer}"
@@ -334,7 +350,7 @@ fn uncompared(contract: &Compared, policy: &Answers, environment: &Physics) -> V
 }
 
 /// Lists what no verification looks at, and what this one could not.
-fn unseen(reference: &ReferenceUsed, policy: &Answers) -> Vec<String> {
+fn unseen(reference: &ReferenceUsed, policy: &Answers, rounding: Option<&Rounding>) -> Vec<String> {
     let mut unseen = vec![
         "observations other than those of the reference's episodes".to_owned(),
         "what a machine adds around the policy: guard, fallback, sensors, actuators, timing"
@@ -342,6 +358,12 @@ fn unseen(reference: &ReferenceUsed, policy: &Answers) -> Vec<String> {
         "the golden episode and its tolerance: the self-test replays it before a policy runs"
             .to_owned(),
     ];
+    if let Some(rounding) = rounding.filter(|it| it.decisions > 0) {
+        unseen.push(format!(
+            "what reads the logits for more than the largest, such as a draw or a monitor of margins: fewer bits move them by up to {:.1e}",
+            rounding.largest_logit_difference
+        ));
+    }
     if policy.compared_segments == 0 {
         unseen.push("the trajectory encoder, which plans are read from executed motion with: the reference records no encodings, or there is none".to_owned());
     }
@@ -376,14 +398,28 @@ fn undecided(rollouts: &Paired) -> Vec<String> {
         .collect()
 }
 
-fn agreement(policy: &Answers, environment: &Physics, rollouts: &Paired) -> String {
+fn agreement(
+    policy: &Answers,
+    rounding: Option<&Rounding>,
+    environment: &Physics,
+    rollouts: &Paired,
+) -> String {
     let physics = if environment.identical_bits {
         "the same bits".to_owned()
     } else {
         format!("within {:.1e}", environment.largest_state_difference)
     };
+    let clear = rounding
+        .filter(|it| it.smallest_margin.is_some())
+        .map_or(String::new(), |it| {
+            format!(
+                " ({:.1} % of them clear by {} times what fewer bits move a logit)",
+                100.0 * it.clear_share,
+                it.margin_factor
+            )
+        });
     format!(
-        "logits within {:.1e} over {} decisions, actions within {:.1e} over {} steps, states {physics} over {} states, {:.1} % of {} episodes with identical completions",
+        "logits within {:.1e} over {} decisions{clear}, actions within {:.1e} over {} steps, states {physics} over {} states, {:.1} % of {} episodes with identical completions",
         policy.largest_logit_difference,
         policy.compared_decisions,
         policy.largest_action_difference,

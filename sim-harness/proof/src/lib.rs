@@ -19,6 +19,7 @@ pub mod physics;
 pub mod purpose;
 pub mod reference;
 pub mod results;
+pub mod rounding;
 pub mod scores;
 pub mod statistics;
 pub mod timing;

@@ -210,7 +210,7 @@ fn float_noise_that_the_reference_shows_is_allowed() {
     assert_eq!(answers.first_difference, None);
     assert_eq!(
         (answers.action_tolerance, answers.logit_tolerance),
-        (4e-4, 2e-2)
+        (4e-4, Some(2e-2))
     );
 }
 

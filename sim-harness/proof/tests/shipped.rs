@@ -6,7 +6,11 @@ use lads_proof::reference::{Reference, Subject};
 
 #[test]
 fn shipped_references_are_whole() {
-    for (name, environment) in [("kitchen", "franka-kitchen"), ("lorel", "lorel-table")] {
+    for (name, environment) in [
+        ("kitchen", "franka-kitchen"),
+        ("kitchen-small", "franka-kitchen"),
+        ("lorel", "lorel-table"),
+    ] {
         let path = Path::new(env!("CARGO_MANIFEST_DIR"))
             .join("../../models")
             .join(format!("{name}.reference.json"));

@@ -8,7 +8,7 @@ use std::panic::resume_unwind;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 
-use lads_compiler::Contract;
+use lads_compiler::{CompileError, Contract};
 use lads_core::{Decision, Isa, Noise, Policy};
 use lads_host::{Memory, MemoryError};
 use thiserror::Error;
@@ -100,6 +100,9 @@ pub enum EvaluationError {
         /// The episode's error.
         source: RolloutError,
     },
+    /// The policy with 32 bits, with which one with fewer bits is compared, does not compile.
+    #[error("with 32 bits: {0}")]
+    Exact(CompileError),
     /// The evaluation was stopped by the caller.
     #[error("interrupted")]
     Interrupted,

@@ -1,25 +1,24 @@
 //! Finds the smallest image that keeps every plan: formats for weights and caches, chosen by the policy's answers with them.
 //!
 //! The policy answers the recorded questions of a reference (open loop, as in [`verify::policy`](crate::verify::policy)) once with 32 bits
-//! and once with each candidate's; [`mod@judge`] compares the two, [`mod@search`] tries candidates from the smallest up. The golden episode alone
+//! and once with each candidate's; [`lads_proof::rounding`] compares the two, as a certificate does, [`mod@search`] tries candidates from the smallest up. The golden episode alone
 //! is not evidence: a policy may replay it with the same bits and decide otherwise elsewhere. What can fail: a bundle that does not compile
 //! even with 32 bits, memory; it can be told to stop.
 
 mod groups;
-pub mod judge;
 pub mod search;
 
 use std::sync::atomic::AtomicBool;
 
 use lads_compiler::{Bundle, CompileError, Image, Options, Storage};
 use lads_core::{Decision, Isa, Policy};
-use lads_proof::answers::{ACTION_TOLERANCE, Replay};
+use lads_proof::answers::{ACTION_TOLERANCE, LOGIT_TOLERANCE, Replay};
 use lads_proof::reference::Reference;
+use lads_proof::rounding::{Allowed, Rounding};
 
 use crate::evaluate::{Assignment, EvaluationError};
-use crate::verify::policy;
+use crate::verify::policy::{self, Questions};
 use groups::Groups;
-use judge::{Judged, judge};
 use search::{Found, Parts, search};
 
 /// Why a bundle cannot be tuned.
@@ -77,20 +76,20 @@ impl Tuning<'_> {
         if let Some(why) = wanted.iter().find_map(|replay| replay.refused.clone()) {
             return Err(TuneError::Refused(why));
         }
-        let tolerance = f64::from(self.bundle.golden().tolerance).min(ACTION_TOLERANCE);
-        let own = judge(&wanted, &wanted, tolerance);
+        let allowed = self.allowed(&exact);
+        let own = Rounding::judge(&wanted, &wanted, allowed);
         if let Some(loss) = &own.loss {
             return Err(TuneError::Unclear(loss.to_string()));
         }
-        let parts = self.parts(&exact, own.evidence.segments > 0)?;
+        let parts = self.parts(&exact, own.segments > 0)?;
         let found = search(&parts, own, &mut |storage| {
             tried(storage);
             match self.compile(storage) {
-                Ok(image) => Ok(judge(&wanted, &self.ask(&image, stop)?, tolerance)),
-                Err(CompileError::Gate { error, .. }) => Ok(Judged::refused(format!(
+                Ok(image) => Ok(Rounding::judge(&wanted, &self.ask(&image, stop)?, allowed)),
+                Err(CompileError::Gate { error, .. }) => Ok(Rounding::refused(format!(
                     "the golden episode does not replay: {error}"
                 ))),
-                Err(error) => Ok(Judged::refused(error.to_string())),
+                Err(error) => Ok(Rounding::refused(error.to_string())),
             }
         });
         let found: Found = found.map_err(TuneError::Asking)?;
@@ -101,8 +100,18 @@ impl Tuning<'_> {
         })
     }
 
-    /// Lists the parts whose storage may change. Entries that read the same weights, as those do that read one token each of one network,
-    /// are one part: stored in two formats, the weights would be there twice. What nobody asked keeps its bits.
+    /// Returns the allowed differences. A draw depends on the values of the logits, so these have to be nearer than a certificate
+    /// wants them: its episodes are others.
+    fn allowed(&self, exact: &Image) -> Allowed {
+        let draws = view(exact).contract().decision() != Decision::Argmax;
+        Allowed {
+            action: f64::from(self.bundle.golden().tolerance).min(ACTION_TOLERANCE),
+            logit: draws.then_some(LOGIT_TOLERANCE / 2.0),
+        }
+    }
+
+    /// Lists the parts whose storage may change. Entries that read the same weights, as those do that read one token each of one network, are one
+    /// part: stored in two formats, the weights would be there twice. What nobody asked keeps its bits.
     fn parts(&self, exact: &Image, encoder_was_asked: bool) -> Result<Parts, CompileError> {
         let smallest = Options {
             storage: Some(Storage::of_weights(search::WEIGHTS[0])),
@@ -138,19 +147,18 @@ impl Tuning<'_> {
     }
 
     fn ask(&self, image: &Image, stop: &AtomicBool) -> Result<Vec<Replay>, EvaluationError> {
-        let policy = Policy::new_checked(image.as_bytes());
-        let policy =
-            policy.unwrap_or_else(|error| unreachable!("the compiler checked it: {error}"));
-        let traced = self.reference.traced_episodes;
-        policy::ask(
-            &policy,
-            // The likeliest index, whatever the contract's rule: margins say nothing of a draw.
-            (self.isa, Decision::Argmax),
-            self.reference,
-            self.assignments,
-            traced,
-            stop,
-            &|| {},
-        )
+        let questions = Questions {
+            reference: self.reference,
+            assignments: self.assignments,
+            episodes: self.reference.traced_episodes,
+        };
+        // The likeliest index, whatever the contract's rule: margins say nothing of a draw.
+        let how = (self.isa, Decision::Argmax);
+        policy::ask(&view(image), how, questions, stop, &|| {})
     }
+}
+
+fn view(image: &Image) -> Policy<'_> {
+    Policy::new_checked(image.as_bytes())
+        .unwrap_or_else(|error| unreachable!("the compiler checked it: {error}"))
 }

@@ -6,8 +6,7 @@
 use std::collections::BTreeSet;
 
 use lads_compiler::{CacheFormat, Storage, WeightFormat};
-
-use super::judge::Judged;
+use lads_proof::rounding::Rounding;
 
 /// Formats of weights with fewer bits than 32, the smallest first; of two of one size the faster first.
 pub(super) const WEIGHTS: [WeightFormat; 3] =
@@ -72,7 +71,7 @@ pub struct Found {
     /// Smallest formats that keep every plan.
     pub storage: Storage,
     /// Comparison of the chosen formats with 32 bits.
-    pub judged: Judged,
+    pub judged: Rounding,
     /// Decisions, part by part.
     pub choices: Vec<Choice>,
 }
@@ -80,8 +79,8 @@ pub struct Found {
 /// Searches for the smallest formats; `exact` is the comparison of 32 bits with themselves, `trial` asks one candidate.
 pub fn search<E>(
     parts: &Parts,
-    exact: Judged,
-    trial: &mut dyn FnMut(&Storage) -> Result<Judged, E>,
+    exact: Rounding,
+    trial: &mut dyn FnMut(&Storage) -> Result<Rounding, E>,
 ) -> Result<Found, E> {
     let mut found = Found {
         judged: exact,
@@ -121,7 +120,7 @@ impl Found {
         part: String,
         kept: &str,
         candidates: impl IntoIterator<Item = (&'static str, Storage)>,
-        trial: &mut dyn FnMut(&Storage) -> Result<Judged, E>,
+        trial: &mut dyn FnMut(&Storage) -> Result<Rounding, E>,
     ) -> Result<(), E> {
         let mut choice = Choice {
             part,
@@ -156,15 +155,15 @@ fn with(storage: &Storage, parts: &BTreeSet<String>, format: WeightFormat) -> St
 fn layers<E>(
     group: &Group,
     found: &mut Found,
-    trial: &mut dyn FnMut(&Storage) -> Result<Judged, E>,
+    trial: &mut dyn FnMut(&Storage) -> Result<Rounding, E>,
 ) -> Result<usize, E> {
     let mut alone = vec![];
     let layers = group.layers.iter().filter(|layer| layer.takes_integers);
     for layer in layers {
         let judged = trial(&with(&found.storage, &layer.nodes, WEIGHTS[0]))?;
         if judged.is_same() {
-            let seen = judged.evidence;
-            let moved = seen.largest_logit_error.max(seen.largest_action_error);
+            let moved = judged.largest_logit_difference;
+            let moved = moved.max(judged.largest_action_difference);
             alone.push((layer, moved / layer.weights.max(1) as f64));
         }
     }
@@ -186,7 +185,8 @@ fn layers<E>(
 mod tests {
     use std::convert::Infallible;
 
-    use super::super::judge::Loss;
+    use lads_proof::rounding::Loss;
+
     use super::*;
 
     fn parts() -> Parts {
@@ -213,12 +213,12 @@ mod tests {
     /// Searches with a policy that is the same while `is_same` says so.
     fn searched(is_same: impl Fn(&Storage) -> bool) -> (Found, usize) {
         let mut trials = 0;
-        let found = search(&parts(), Judged::default(), &mut |storage| {
+        let found = search(&parts(), Rounding::default(), &mut |storage| {
             trials += 1;
             let loss = Loss::Encoded { changed: 1 };
-            Ok::<_, Infallible>(Judged {
+            Ok::<_, Infallible>(Rounding {
                 loss: (!is_same(storage)).then_some(loss),
-                ..Judged::default()
+                ..Rounding::default()
             })
         });
         (found.unwrap_or_else(|never| match never {}), trials)

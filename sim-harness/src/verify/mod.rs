@@ -25,11 +25,14 @@ use crate::environment::Environment;
 use crate::evaluate::{Evaluated, Evaluation, EvaluationError};
 use crate::registry::Opener;
 use certificate::{Certificate, ReferenceUsed, Setting};
+use policy::Questions;
 use reference::Reference;
 
-/// Number of calls that [`run`] makes to `finished`: both open-loop comparisons replay the traced episodes, then all run in closed loop.
+/// Number of calls that [`run`] makes to `finished`: both open-loop comparisons replay the traced episodes, one of them twice if the image has fewer bits than
+/// 32, then all run in closed loop.
 pub fn work(evaluation: &Evaluation<'_>) -> usize {
-    2 * evaluation.assignments.len() * evaluation.setup.traced as usize + evaluation.len()
+    let replays = 1 + policy::rounds(&evaluation.policy);
+    replays * evaluation.assignments.len() * evaluation.setup.traced as usize + evaluation.len()
 }
 
 /// Runs all comparisons that the reference holds for `evaluation`'s instructions and episodes. `evaluation` has the reference's seed and
@@ -45,20 +48,13 @@ pub fn run(
 ) -> Result<Certificate, EvaluationError> {
     let contract = evaluation.policy.contract();
     let traced = evaluation.setup.traced;
-    let replays = policy::ask(
-        &evaluation.policy,
-        (evaluation.isa, contract.decision()),
+    let questions = Questions {
         reference,
-        evaluation.assignments,
-        traced,
-        stop,
-        finished,
-    )?;
-    let stated = evaluation
-        .policy
-        .golden()
-        .map(|golden| f64::from(golden.tolerance()));
-    let (answers, numbering) = Answers::judge(reference, &replays, stated);
+        assignments: evaluation.assignments,
+        episodes: traced,
+    };
+    let image = (&evaluation.policy, evaluation.isa);
+    let (asked, numbering) = policy::judge(image, bundle, questions, stop, finished)?;
     let mut environment = open();
     let physics = physics::replay(
         environment.as_mut(),
@@ -107,12 +103,12 @@ pub fn run(
         reference.contract.as_ref(),
         [&contract::of_image(&evaluation.policy), &bundled],
     );
-    let not_covered = unseen(evaluation, &answers);
+    let not_covered = unseen(evaluation, &asked.policy);
     Ok(Certificate::new(
         setting,
         used,
         compared,
-        answers,
+        asked,
         physics,
         rollouts,
         not_covered,

@@ -1,29 +1,76 @@
-//! Asks the compiled policy what the reference policy was asked; [`lads_proof::answers`] judges.
+//! Asks the compiled policy what the reference policy was asked; [`lads_proof::answers`] and [`lads_proof::rounding`] judge.
 //!
 //! Open loop: at each control step of a traced episode the controller gets the observation that the reference saw, and its history holds
-//! the actions that the reference executed. What can fail: a workspace that is too small for the policy; it can be told to stop.
+//! the actions that the reference executed. What can fail: a workspace that is too small for the policy, a bundle that does not compile with
+//! 32 bits; it can be told to stop.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use lads_compiler::{Bundle, Options};
 use lads_core::{Controller, Decision, Instruction, Isa, Policy};
 use lads_host::Memory;
 use lads_proof::answers::{Replay, Reply};
+use lads_proof::numbering::Numbering;
 use lads_proof::reference::{Reference, Trace};
+use lads_proof::rounding::Asked;
 
 use crate::evaluate::{Assignment, EvaluationError};
 use crate::plans::Segment;
 
-/// Asks `policy`, on the instruction set `isa` and by the rule `decision`, about the first `episodes` traced episodes of each assigned
-/// instruction. `finished` is called after each episode, `stop` ends the work early.
+/// What is asked: the first traced episodes of each assigned instruction.
+#[derive(Debug, Clone, Copy)]
+pub struct Questions<'q> {
+    /// Where they were recorded.
+    pub reference: &'q Reference,
+    /// The instructions.
+    pub assignments: &'q [Assignment],
+    /// How many episodes of each, at most.
+    pub episodes: u32,
+}
+
+/// How often an image is asked for [`judge`]: a second time with 32 bits where it has fewer and selects the largest logit.
+pub fn rounds(policy: &Policy<'_>) -> usize {
+    let selects = policy.index_count() > 0 && policy.contract().decision() == Decision::Argmax;
+    1 + usize::from(selects && !lads_host::is_exact(policy))
+}
+
+/// Asks the image that `policy` is a view of, and `bundle`, which it is of, with 32 bits if the image has fewer, and judges the answers.
+pub fn judge(
+    (policy, isa): (&Policy<'_>, Isa),
+    bundle: &Bundle,
+    questions: Questions<'_>,
+    stop: &AtomicBool,
+    finished: &dyn Fn(),
+) -> Result<(Asked, Numbering), EvaluationError> {
+    let how = (isa, policy.contract().decision());
+    let replays = ask(policy, how, questions, stop, finished)?;
+    let stated = policy.golden().map(|golden| f64::from(golden.tolerance()));
+    let reference = questions.reference;
+    if rounds(policy) == 1 {
+        return Ok(Asked::judge(reference, &replays, None, stated));
+    }
+    let exact = lads_compiler::compile_with(bundle, &Options::exact());
+    let exact = exact.map_err(EvaluationError::Exact)?;
+    let exact = Policy::new_checked(exact.as_bytes())
+        .unwrap_or_else(|error| unreachable!("the compiler checked it: {error}"));
+    let exact = ask(&exact, how, questions, stop, finished)?;
+    Ok(Asked::judge(reference, &replays, Some(&exact), stated))
+}
+
+/// Asks `policy`, on the instruction set `isa` and by the rule `decision`. `finished` is called after each episode, `stop` ends the work
+/// early.
 pub fn ask(
     policy: &Policy<'_>,
     (isa, decision): (Isa, Decision),
-    reference: &Reference,
-    assignments: &[Assignment],
-    episodes: u32,
+    questions: Questions<'_>,
     stop: &AtomicBool,
     finished: &dyn Fn(),
 ) -> Result<Vec<Replay>, EvaluationError> {
+    let Questions {
+        reference,
+        assignments,
+        episodes,
+    } = questions;
     let mut memory = Memory::of(policy).map_err(EvaluationError::Memory)?;
     let mut controller = memory
         .controller_with(policy, isa)

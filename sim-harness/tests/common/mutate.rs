@@ -9,11 +9,11 @@ use std::sync::atomic::AtomicBool;
 
 use lads_compiler::Options;
 use lads_core::Isa;
-use lads_proof::answers::Answers;
 use lads_proof::contract::Compared;
 use lads_proof::reference::Reference;
+use lads_proof::rounding::Asked;
 use lads_sim::evaluate::Assignment;
-use lads_sim::verify;
+use lads_sim::verify::{self, policy::Questions};
 use serde_json::Value;
 
 // Numbers of the fields of ONNX's messages.
@@ -212,14 +212,14 @@ pub enum Outcome {
 #[derive(Debug, Clone)]
 pub struct Judged {
     pub contract: Compared,
-    pub answers: Answers,
+    pub asked: Asked,
 }
 
 impl Judged {
     pub fn different(&self) -> bool {
         !self.contract.differing.is_empty()
             || !self.contract.image_differing.is_empty()
-            || self.answers.first_difference.is_some()
+            || !self.asked.differences().is_empty()
     }
 
     /// Returns the reason that a verdict names first.
@@ -230,12 +230,7 @@ impl Judged {
             .first()
             .map(|it| format!("contract: {}", it.field));
         field
-            .or_else(|| {
-                self.answers
-                    .first_difference
-                    .as_ref()
-                    .map(|it| it.what.clone())
-            })
+            .or_else(|| self.asked.differences().into_iter().next())
             .unwrap_or_default()
     }
 }
@@ -256,18 +251,14 @@ pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usi
             max_steps: 0,
         })
         .collect();
-    let stop = AtomicBool::new(false);
-    let replays = verify::policy::ask(
-        &policy,
-        (Isa::detect(), policy.contract().decision()),
+    let questions = Questions {
         reference,
-        &assignments,
-        1,
-        &stop,
-        &|| {},
-    )
-    .unwrap();
-    let tolerance = policy.golden().map(|golden| f64::from(golden.tolerance()));
+        assignments: &assignments,
+        episodes: 1,
+    };
+    let stop = AtomicBool::new(false);
+    let image = (&policy, Isa::detect());
+    let (asked, _) = verify::policy::judge(image, bundle, questions, &stop, &|| {}).unwrap();
     let stated = serde_json::from_str(bundle.metadata(CONTRACT).unwrap()).unwrap();
     Outcome::Judged(Box::new(Judged {
         contract: Compared::new(
@@ -278,7 +269,7 @@ pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usi
                 &verify::contract::of_bundle(bundle).unwrap(),
             ],
         ),
-        answers: Answers::judge(reference, &replays, tolerance).0,
+        asked,
     }))
 }
 

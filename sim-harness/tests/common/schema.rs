@@ -29,13 +29,13 @@ pub fn check(value: &Value, schema: &Value, root: &Value, path: &str) {
             "maxLength" => value.as_str().unwrap().len() as u64 <= rule.as_u64().unwrap(),
             "minItems" => value.as_array().unwrap().len() as u64 >= rule.as_u64().unwrap(),
             "maxItems" => value.as_array().unwrap().len() as u64 <= rule.as_u64().unwrap(),
-            "required" => rule
-                .as_array()
-                .unwrap()
-                .iter()
-                .all(|key| value.get(key.as_str().unwrap()).is_some()),
+            // What is said of fields says nothing about a value that has none.
+            "required" => value.as_object().is_none_or(|fields| {
+                let mut keys = rule.as_array().unwrap().iter();
+                keys.all(|key| fields.contains_key(key.as_str().unwrap()))
+            }),
             "additionalProperties" => {
-                let others = value.as_object().unwrap().iter();
+                let others = value.as_object().into_iter().flatten();
                 let mut others = others.filter(|(key, _)| schema["properties"].get(key).is_none());
                 if rule.is_object() {
                     others.for_each(|(key, inner)| {

@@ -32,7 +32,7 @@ use lads_pace::BenchError;
 use lads_pace::clock::now;
 use lads_pace::contender::{Contender, Episode};
 use lads_pace::stats::{median, quantile};
-use lads_pace::suite::{Candidate, options, with_contenders};
+use lads_pace::suite::{AUTO, Candidate, options, with_contenders};
 use serde_json::{Value, json};
 
 use crate::measure::Bare;
@@ -125,17 +125,21 @@ fn say(text: &str) {
     eprintln!("{text}");
 }
 
-/// Compiles the shipped policy, with the weights stored in every way that gives the same plans.
+/// Compiles the shipped policy with the weights stored in every way that gives the same plans, and as
+/// it was tuned.
 fn images(bundle: &Bundle) -> Result<Vec<(&'static str, Aligned)>, BenchError> {
     let mut images = vec![];
     for weights in WeightFormat::ALL {
         let full = weights == WeightFormat::F32;
-        match compile_with(bundle, &options(weights)) {
+        match compile_with(bundle, &options(Some(weights))) {
             Ok(image) => images.push((weights.name(), Aligned::new(image.as_bytes()))),
             Err(error) if full => return Err(about("models/kitchen.onnx", error)),
             Err(error) => say(&format!("without {} weights: {error}", weights.name())),
         }
     }
+    let tuned = compile_with(bundle, &options(None));
+    let tuned = tuned.map_err(|error| about("models/kitchen.onnx", error))?;
+    images.push((AUTO, Aligned::new(tuned.as_bytes())));
     Ok(images)
 }
 

@@ -2,6 +2,7 @@
 
 use super::super::answers::Answer;
 use super::super::pairs::{N_RATE_MARGIN, NRatePair, RATE_MARGIN, RatePair};
+use super::super::rounding::Loss;
 use super::super::statistics::{Counts, Pairs};
 use super::*;
 
@@ -19,10 +20,22 @@ fn certificate(n: usize, both: usize, run_only: usize, reference_only: usize) ->
         identical_bits: true,
         ..Physics::default()
     };
-    judged(policy, environment, [n, both, run_only, reference_only])
+    judged(
+        alone(policy),
+        environment,
+        [n, both, run_only, reference_only],
+    )
 }
 
-fn judged(policy: Answers, environment: Physics, outcome: [usize; 4]) -> Certificate {
+/// An image with 32 bits.
+fn alone(policy: Answers) -> Asked {
+    Asked {
+        policy,
+        ..Asked::default()
+    }
+}
+
+fn judged(asked: Asked, environment: Physics, outcome: [usize; 4]) -> Certificate {
     let [n, both, run_only, reference_only] = outcome;
     let mut pairs = Pairs::default();
     let mut counts = Counts::default();
@@ -87,7 +100,7 @@ fn judged(policy: Answers, environment: Physics, outcome: [usize; 4]) -> Certifi
         setting,
         used,
         contract,
-        policy,
+        asked,
         environment,
         rollouts,
         Vec::new(),
@@ -169,21 +182,73 @@ fn equal_rates_do_not_excuse_a_policy_or_an_environment_that_differs() {
         first_difference: Some(place("another plan")),
         ..sound.policy.clone()
     };
-    let found = judged(policy, sound.environment.clone(), [500, 400, 0, 0]);
+    let found = judged(alone(policy), sound.environment.clone(), [500, 400, 0, 0]);
     assert_eq!(found.verdict, Verdict::Different);
     reason(&found, "instruction a, episode 0, step 3: another plan");
     let environment = Physics {
         first_difference: Some(place("another state")),
         ..sound.environment
     };
-    let found = judged(sound.policy, environment, [500, 400, 0, 0]);
+    let found = judged(alone(sound.policy), environment, [500, 400, 0, 0]);
     assert_eq!(found.verdict, Verdict::Different);
     reason(&found, "another state");
 }
 
+/// Of an image with fewer bits three pairs are compared: each with the reference, and both with each other.
+#[test]
+fn fewer_bits_excuse_nothing_that_is_different_with_all_of_them() {
+    let sound = certificate(500, 400, 0, 0);
+    let rounding = Rounding {
+        decisions: 3,
+        smallest_margin: Some(0.5),
+        largest_logit_difference: 0.02,
+        clear_share: 1.0,
+        ..Rounding::default()
+    };
+    let small = || Asked {
+        policy: sound.policy.clone(),
+        exact: Some(sound.policy.clone()),
+        rounding: Some(rounding.clone()),
+    };
+    let verdict = |asked| judged(asked, sound.environment.clone(), [500, 400, 0, 0]);
+    let found = verdict(small());
+    assert_eq!(found.verdict, Verdict::Equivalent);
+    reason(&found, "100.0 % of them clear");
+    let named = found.not_covered.iter().any(|it| it.contains("2.0e-2"));
+    assert!(named, "{:?}", found.not_covered);
+    let mut other = small();
+    let exact = other.exact.as_mut().unwrap();
+    exact.differing_episodes = 1;
+    exact.first_difference = Some(Answer {
+        instruction: "a".to_owned(),
+        episode: 0,
+        step: 3,
+        what: "a logit is off".to_owned(),
+    });
+    let found = verdict(other);
+    assert_eq!(found.verdict, Verdict::Different);
+    reason(&found, "with 32 bits answers otherwise");
+    let unclear = |shown| {
+        let mut asked = small();
+        asked.rounding.as_mut().unwrap().loss = Some(Loss::Unclear {
+            share: 0.5,
+            logit: 0.02,
+            shown,
+        });
+        verdict(asked)
+    };
+    let found = unclear(true);
+    assert_eq!(found.verdict, Verdict::Different);
+    reason(&found, "only 50.0 % of the decisions are clear");
+    let found = unclear(false);
+    assert_eq!(found.verdict, Verdict::Inconclusive);
+    assert_eq!(found.more_episodes_per_instruction, None);
+    reason(&found, "only 50.0 % of the decisions are clear");
+}
+
 #[test]
 fn nothing_compared_is_not_agreement() {
-    let found = judged(Answers::default(), Physics::default(), [500, 400, 0, 0]);
+    let found = judged(Asked::default(), Physics::default(), [500, 400, 0, 0]);
     assert_eq!(found.verdict, Verdict::Inconclusive);
     assert_eq!(
         found.more_episodes_per_instruction, None,

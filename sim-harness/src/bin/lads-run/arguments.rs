@@ -108,12 +108,14 @@ pub struct PolicyArguments {
     pub exact: bool,
 }
 
-/// Instruction sets by their command-line names.
+/// Instruction sets by the names that [`lads_core::Isa::name`] gives, other processors' included.
 #[derive(Debug, Clone, Copy, clap::ValueEnum)]
 pub enum IsaName {
     Portable,
     Avx2,
     Avx512,
+    Neon,
+    Dotprod,
 }
 
 /// Options that choose which episodes run.

@@ -84,9 +84,19 @@ pub fn run(asked: &Tune, stop: &AtomicBool) -> Result<ExitCode, End> {
             error => refused(format_args!("{}: {error}", model.display())),
         })
     })?;
+    let seen = &tuned.found.judged;
     let evidence = Evidence {
         reference_sha256: sha256(&questions),
-        ..tuned.found.judged.evidence.clone()
+        episodes: seen.episodes,
+        steps: seen.steps,
+        decisions: seen.decisions,
+        smallest_margin: seen.smallest_margin,
+        largest_logit_error: seen.largest_logit_difference,
+        segments: seen.segments,
+        clear_share: seen.clear_share,
+        margin_factor: seen.margin_factor,
+        largest_action_error: seen.largest_action_difference,
+        action_tolerance: seen.action_tolerance,
     };
     let record = Record::new(tuned.found.storage.clone(), evidence);
     let written = record.written_into(&bytes).map_err(refused)?;
@@ -112,7 +122,7 @@ impl fmt::Display for Summary<'_> {
                 writeln!(f, "{:<28}   not {format}: {why}", "")?;
             }
         }
-        let seen = &found.judged.evidence;
+        let seen = &found.judged;
         writeln!(
             f,
             "\nthe same plans in {} decisions and {} steps of {} episodes",
@@ -122,7 +132,7 @@ impl fmt::Display for Summary<'_> {
             writeln!(
                 f,
                 "logits within {:.1e}, smallest margin {margin:.1e}; {:.1} % of the decisions are clear by {} times the logits' difference",
-                seen.largest_logit_error,
+                seen.largest_logit_difference,
                 100.0 * seen.clear_share,
                 seen.margin_factor
             )?;
@@ -130,7 +140,7 @@ impl fmt::Display for Summary<'_> {
         writeln!(
             f,
             "actions within {:.1e}, allowed {:.1e}",
-            seen.largest_action_error, seen.action_tolerance
+            seen.largest_action_difference, seen.action_tolerance
         )?;
         let [exact, image] = images.each_ref().map(|image| image.as_bytes().len());
         writeln!(f, "image {image} bytes, with 32 bits {exact}")

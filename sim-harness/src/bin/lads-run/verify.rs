@@ -6,6 +6,8 @@ use std::process::ExitCode;
 use std::sync::atomic::AtomicBool;
 
 use askama::Template as _;
+use lads_proof::answers::Answers;
+use lads_proof::rounding::Rounding;
 use lads_sim::faults::Faults;
 use lads_sim::output;
 use lads_sim::results::versions;
@@ -88,6 +90,41 @@ pub fn run(asked: &Verify, stop: &AtomicBool) -> Result<ExitCode, End> {
     })
 }
 
+/// Prints the summary of a policy's answers to the reference's questions.
+fn alone(f: &mut fmt::Formatter<'_>, which: &str, answers: &Answers) -> fmt::Result {
+    let allowed = answers.logit_tolerance.map_or(String::new(), |tolerance| {
+        format!(" (allowed {tolerance:.1e})")
+    });
+    writeln!(
+        f,
+        "{which:<18} {} of {} replayed episodes differ; logits within {:.1e}{allowed} over {} decisions, actions within {:.1e} (allowed {:.1e}) over \
+         {} steps",
+        answers.differing_episodes,
+        answers.episodes,
+        answers.largest_logit_difference,
+        answers.compared_decisions,
+        answers.largest_action_difference,
+        answers.action_tolerance,
+        answers.compared_steps
+    )
+}
+
+/// Prints the summary of how fewer bits change the answers.
+fn fewer_bits(f: &mut fmt::Formatter<'_>, rounding: &Rounding) -> fmt::Result {
+    let judged = rounding
+        .loss
+        .as_ref()
+        .map_or_else(|| "the same".to_owned(), ToString::to_string);
+    writeln!(
+        f,
+        "  fewer bits       {judged}; logits moved by {:.1e} at most, {:.1} % of {} decisions clear by {} times that",
+        rounding.largest_logit_difference,
+        100.0 * rounding.clear_share,
+        rounding.decisions,
+        rounding.margin_factor
+    )
+}
+
 /// Prints the certificate on a terminal.
 struct Summary<'c>(&'c Certificate);
 
@@ -96,6 +133,8 @@ impl fmt::Display for Summary<'_> {
         let Certificate {
             contract,
             policy,
+            exact,
+            rounding,
             environment,
             rollouts,
             ..
@@ -106,19 +145,13 @@ impl fmt::Display for Summary<'_> {
             "contract           {} fields compared, {differing} values differ",
             contract.fields.len()
         )?;
-        writeln!(
-            f,
-            "policy alone       {} of {} replayed episodes differ; logits within {:.1e} (allowed {:.1e}) over {} decisions, actions within {:.1e} \
-             (allowed {:.1e}) over {} steps",
-            policy.differing_episodes,
-            policy.episodes,
-            policy.largest_logit_difference,
-            policy.logit_tolerance,
-            policy.compared_decisions,
-            policy.largest_action_difference,
-            policy.action_tolerance,
-            policy.compared_steps
-        )?;
+        alone(f, "policy alone", policy)?;
+        if let Some(exact) = exact {
+            alone(f, "  with 32 bits", exact)?;
+        }
+        if let Some(rounding) = rounding {
+            fewer_bits(f, rounding)?;
+        }
         let bits = if environment.identical_bits {
             ", the same bits"
         } else {

@@ -1,0 +1,351 @@
+//! Is a policy whose numbers have fewer bits still the one with 32?
+//!
+//! Both answer the same questions, so that they differ by rounding alone: another checkpoint, other words or another normaliser are in both,
+//! and it is the answers with 32 bits that a reference bounds ([`Answers`], logits by their values). Rounding is judged by what it decides. A logit
+//! that only helps to select the largest reaches the action through the index: every decision must select the same one, and nearly all must be clear by
+//! more than the logits are off, because the questions are a sample, and a decision that was a close call elsewhere may fall out otherwise. What is
+//! in the action must stay inside its tolerance, and a trajectory encoder must see the same plan in every segment: how near it was to another is
+//! not known. `tune` chooses formats by this rule, and a certificate judges an image by it. Nothing here can fail.
+
+use std::fmt;
+
+use serde::{Serialize, Serializer};
+use statrs::distribution::{Binomial, DiscreteCDF as _};
+
+use crate::answers::{Answers, Replay, largest_up_to_a_constant};
+use crate::numbering::Numbering;
+use crate::reference::Reference;
+
+/// A decision is clear if its margin is more than so many times the largest difference of a logit: two logits may be off.
+pub const MARGIN_FACTOR: f64 = 2.0;
+
+/// The share of decisions that have to be clear: of a hundred, one may hang on the rounding, if it came to the worst.
+pub const CLEAR_SHARE: f64 = 0.99;
+
+/// Chance of calling too many decisions unclear where only those that may be are.
+const UNCLEAR: f64 = 0.01;
+
+/// Why it is another policy.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Loss {
+    /// It does not compile, fails the golden episode or refuses a question.
+    Refused(String),
+    /// Decisions selected another index.
+    Selected {
+        /// How many.
+        changed: usize,
+        /// The largest margin of one of them with 32 bits.
+        margin: f64,
+    },
+    /// A logit is off by more than it may.
+    Logit {
+        /// By so much at most.
+        difference: f64,
+        /// What is allowed.
+        tolerance: f64,
+    },
+    /// Every decision is the same, and too many are close calls.
+    Unclear {
+        /// The share that is clear.
+        share: f64,
+        /// Largest difference of a logit.
+        logit: f64,
+        /// Whether the decisions are enough to say so, and not a few with one close call by chance.
+        shown: bool,
+    },
+    /// An action is off.
+    Action {
+        /// By so much at most.
+        difference: f64,
+        /// What is allowed.
+        tolerance: f64,
+    },
+    /// The trajectory encoder sees other plans.
+    Encoded {
+        /// In so many segments.
+        changed: usize,
+    },
+}
+
+impl fmt::Display for Loss {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Refused(why) => f.write_str(why),
+            Self::Selected { changed, margin } => write!(
+                f,
+                "{changed} decisions fall out otherwise, one with a margin of {margin:.1e}"
+            ),
+            Self::Logit {
+                difference,
+                tolerance,
+            } => write!(
+                f,
+                "a logit is off by {difference:.1e}, allowed {tolerance:.1e}"
+            ),
+            Self::Unclear { share, logit, .. } => write!(
+                f,
+                "only {:.1} % of the decisions are clear by {MARGIN_FACTOR} times the logits' {logit:.1e}",
+                100.0 * share
+            ),
+            Self::Action {
+                difference,
+                tolerance,
+            } => write!(
+                f,
+                "an action is off by {difference:.1e}, allowed {tolerance:.1e}"
+            ),
+            Self::Encoded { changed } => {
+                write!(
+                    f,
+                    "the trajectory encoder sees {changed} segments otherwise"
+                )
+            }
+        }
+    }
+}
+
+impl Loss {
+    /// Whether the questions are enough to call it another policy.
+    fn is_shown(&self) -> bool {
+        !matches!(self, Self::Unclear { shown: false, .. })
+    }
+}
+
+impl Serialize for Loss {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+/// What fewer bits do to a policy's answers.
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
+pub struct Rounding {
+    /// Episodes replayed.
+    pub episodes: usize,
+    /// Control steps in them.
+    pub steps: usize,
+    /// Decisions in them.
+    pub decisions: usize,
+    /// The smallest lead of a selected index over the second best, with 32 bits; `None` where no decision has two logits.
+    pub smallest_margin: Option<f64>,
+    /// Largest difference of a logit, up to a constant added to all of a decision's.
+    pub largest_logit_difference: f64,
+    /// Share of the decisions with two logits or more whose margin is more than `margin_factor` times that difference.
+    pub clear_share: f64,
+    /// The factor.
+    pub margin_factor: f64,
+    /// Segments that the trajectory encoder saw.
+    pub segments: usize,
+    /// Largest difference of an action's element.
+    pub largest_action_difference: f64,
+    /// What it may be.
+    pub action_tolerance: f64,
+    /// Why it is another policy, in words; `None` if it is the same.
+    pub loss: Option<Loss>,
+}
+
+/// What may be off.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Allowed {
+    /// An action's element.
+    pub action: f64,
+    /// A logit, where its value matters, as it does to a draw; `None` where the largest is selected.
+    pub logit: Option<f64>,
+}
+
+impl Rounding {
+    /// Compares the answers with fewer bits to those of the same policy with 32.
+    pub fn judge(exact: &[Replay], rounded: &[Replay], allowed: Allowed) -> Self {
+        let mut seen = Self {
+            episodes: exact.len(),
+            margin_factor: MARGIN_FACTOR,
+            action_tolerance: allowed.action,
+            ..Self::default()
+        };
+        let mut margins = vec![];
+        let (mut changed, mut largest_changed) = (0, 0.0_f64);
+        let (mut refused, mut encoded) = (None, 0);
+        for (wanted, got) in exact.iter().zip(rounded) {
+            if let Some(why) = &got.refused {
+                refused.get_or_insert_with(|| why.clone());
+            }
+            let segments = wanted.encoded.as_deref().unwrap_or_default();
+            seen.segments += segments.len();
+            encoded += match &got.encoded {
+                Some(got) if got.len() == segments.len() => segments
+                    .iter()
+                    .zip(got)
+                    .filter(|(wanted, got)| wanted != got)
+                    .count(),
+                // An encoder that refuses a segment stops there.
+                _ => segments.len(),
+            };
+            for (wanted, got) in wanted.replies.iter().zip(&got.replies) {
+                seen.steps += 1;
+                let action = largest(&wanted.action, &got.action);
+                seen.largest_action_difference = seen.largest_action_difference.max(action);
+                if !wanted.decided && !got.decided {
+                    continue;
+                }
+                seen.decisions += 1;
+                let margin = wanted.margin.map(f64::from);
+                margins.extend(margin);
+                let logits = wanted.logits.iter().zip(&got.logits);
+                let logit = largest_up_to_a_constant(
+                    logits.map(|(&wanted, &got)| f64::from(got) - f64::from(wanted)),
+                );
+                seen.largest_logit_difference = seen.largest_logit_difference.max(logit);
+                if (wanted.plan, wanted.decided) != (got.plan, got.decided) {
+                    changed += 1;
+                    largest_changed = largest_changed.max(margin.unwrap_or(f64::INFINITY));
+                }
+            }
+        }
+        let clear = MARGIN_FACTOR * seen.largest_logit_difference;
+        let clear = margins.iter().filter(|&&margin| margin > clear).count();
+        seen.clear_share = clear as f64 / margins.len().max(1) as f64;
+        seen.smallest_margin = margins.iter().copied().reduce(f64::min);
+        let too_far = allowed
+            .logit
+            .filter(|&tolerance| seen.largest_logit_difference > tolerance);
+        seen.loss = if let Some(why) = refused {
+            Some(Loss::Refused(why))
+        } else if changed > 0 {
+            Some(Loss::Selected {
+                changed,
+                margin: largest_changed,
+            })
+        } else if let Some(tolerance) = too_far {
+            Some(Loss::Logit {
+                difference: seen.largest_logit_difference,
+                tolerance,
+            })
+        } else if !margins.is_empty() && seen.clear_share < CLEAR_SHARE {
+            Some(Loss::Unclear {
+                share: seen.clear_share,
+                logit: seen.largest_logit_difference,
+                shown: too_many(margins.len() - clear, margins.len()),
+            })
+        } else if encoded > 0 {
+            Some(Loss::Encoded { changed: encoded })
+        } else if seen.largest_action_difference > allowed.action {
+            Some(Loss::Action {
+                difference: seen.largest_action_difference,
+                tolerance: allowed.action,
+            })
+        } else {
+            None
+        };
+        seen
+    }
+
+    /// A policy that was not asked at all.
+    pub fn refused(why: String) -> Self {
+        Self {
+            largest_logit_difference: f64::INFINITY,
+            largest_action_difference: f64::INFINITY,
+            loss: Some(Loss::Refused(why)),
+            ..Self::default()
+        }
+    }
+
+    /// Whether it is the same policy.
+    pub fn is_same(&self) -> bool {
+        self.loss.is_none()
+    }
+}
+
+/// Whether so many unclear decisions are more than chance makes of the share that may be.
+fn too_many(unclear: usize, decisions: usize) -> bool {
+    let by_chance = Binomial::new(1.0 - CLEAR_SHARE, decisions as u64);
+    by_chance.is_ok_and(|by_chance| by_chance.sf((unclear as u64).saturating_sub(1)) < UNCLEAR)
+}
+
+/// The largest difference of an element; infinite where one is no number.
+fn largest(wanted: &[f32], got: &[f32]) -> f64 {
+    wanted.iter().zip(got).fold(0.0, |largest, (a, b)| {
+        let difference = f64::from((a - b).abs());
+        if difference.is_nan() {
+            f64::INFINITY
+        } else {
+            largest.max(difference)
+        }
+    })
+}
+
+/// The policy alone: what the image answers to a reference's questions and, where it has fewer bits than 32, what it would with 32.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Asked {
+    /// The image that runs, beside the reference.
+    pub policy: Answers,
+    /// The same bundle with 32 bits, beside the reference; `None` where that is the image that runs.
+    pub exact: Option<Answers>,
+    /// The image beside the same bundle with 32 bits.
+    pub rounding: Option<Rounding>,
+}
+
+impl Asked {
+    /// Judges the replays of an image and, if its numbers have fewer bits and it selects the largest logit, those of the same bundle with 32;
+    /// `stated_tolerance` is the bundle's own for an action element. Without the latter the logits' values are bounded, whatever the image.
+    pub fn judge(
+        reference: &Reference,
+        replays: &[Replay],
+        exact: Option<&[Replay]>,
+        stated_tolerance: Option<f64>,
+    ) -> (Self, Numbering) {
+        let Some(exact) = exact else {
+            let (policy, numbering) = Answers::judge(reference, replays, stated_tolerance);
+            let asked = Self {
+                policy,
+                ..Self::default()
+            };
+            return (asked, numbering);
+        };
+        let (answers, numbering) = Answers::judge(reference, exact, stated_tolerance);
+        let policy = Answers::judge_rounded(reference, replays, stated_tolerance, &numbering);
+        let allowed = Allowed {
+            action: answers.action_tolerance,
+            logit: None,
+        };
+        let asked = Self {
+            policy,
+            exact: Some(answers),
+            rounding: Some(Rounding::judge(exact, replays, allowed)),
+        };
+        (asked, numbering)
+    }
+
+    fn loss(&self) -> Option<&Loss> {
+        self.rounding.as_ref()?.loss.as_ref()
+    }
+
+    /// What the decisions are too few to tell.
+    pub fn undecided(&self) -> Option<String> {
+        let loss = self.loss().filter(|loss| !loss.is_shown())?;
+        Some(format!(
+            "whether fewer bits make another policy of it: {loss}, which is not shown to be too few; a reference with more traced episodes would"
+        ))
+    }
+
+    /// Why it is another policy than the reference's, a sentence each.
+    pub fn differences(&self) -> Vec<String> {
+        let beside = |answers: &Answers, which: &str| {
+            let answer = answers.first_difference.as_ref()?;
+            Some(format!(
+                "the policy{which} answers otherwise in {} of {} replayed episodes, first in {answer}",
+                answers.differing_episodes, answers.episodes
+            ))
+        };
+        let exact = self.exact.as_ref();
+        let loss = self.loss().filter(|loss| loss.is_shown());
+        let found = [
+            beside(&self.policy, ""),
+            exact.and_then(|answers| beside(answers, " with 32 bits")),
+            loss.map(|why| format!("with fewer bits it is not the same policy as with 32: {why}")),
+        ];
+        found.into_iter().flatten().collect()
+    }
+}
+
+#[cfg(test)]
+mod tests;
