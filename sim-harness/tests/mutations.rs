@@ -137,11 +137,12 @@ fn damaged_weights_are_different() {
 #[test]
 fn changes_are_different_from_the_bounds_on() {
     use lads_proof::answers::{ACTION_TOLERANCE, LOGIT_TOLERANCE};
+    type Moved = fn(&Judged) -> f64;
     let (model, reference) = shipped();
     let noise = reference.float_noise.unwrap();
     assert!(2.0 * noise.logit < LOGIT_TOLERANCE);
     // Adds to one logit, or to one element of the action, so much.
-    let cases: [(&str, f64, fn(&Judged) -> f64); 2] = [
+    let cases: [(&str, f64, Moved); 2] = [
         ("high_level.head.bias", LOGIT_TOLERANCE, |found| {
             found.asked.policy.largest_logit_difference
         }),
@@ -238,27 +239,14 @@ fn every_field_of_the_contract_is_compared_or_refused() {
     );
 }
 
-/// Tests that an image is compared with its bundle in every contract field that it holds: one change of each kind is found and named.
-#[test]
-fn an_image_of_another_bundle_is_told_apart_by_every_kind_of_field() {
+/// Returns one change of each kind of field: where, the new value, and the field that the comparison names.
+fn one_change_each(contract: &serde_json::Value) -> Vec<(String, serde_json::Value, String)> {
     use serde_json::json;
-    let model = Model::open(&project_file("models/kitchen-small.onnx"));
-    let bundle = lads_compiler::Bundle::from_bytes(model.bytes()).unwrap();
-    let said = lads_sim::verify::contract::of_bundle(&bundle).unwrap();
-    let fields = |other: &Model| -> Vec<String> {
-        let opened = lads_host::from_bytes_with(other.bytes(), &Options::exact()).unwrap();
-        let image = lads_sim::verify::contract::of_image(&opened.policy());
-        let found = lads_proof::contract::Compared::new(&json!({}), None, [&image, &said]);
-        let named = found.image_differing.into_iter().map(|it| it.field);
-        named.filter(|field| field != "bundle_sha256").collect()
-    };
-    assert_eq!(fields(&model), [""; 0]);
     let joint = "channels[observation].elements[panda_joint1].joint";
     let (observation, action) = (
         "/channels/0/elements/0",
         "channels[action].elements[panda_joint1_velocity]",
     );
-    let contract = model.contract();
     let place = contract["channels"]
         .as_array()
         .unwrap()
@@ -266,7 +254,7 @@ fn an_image_of_another_bundle_is_told_apart_by_every_kind_of_field() {
         .position(|channel| channel["role"] == "action")
         .unwrap();
     let acting = format!("/channels/{place}/elements/0");
-    let cases = [
+    vec![
         (
             format!("{observation}/joint"),
             json!("other"),
@@ -360,7 +348,26 @@ fn an_image_of_another_bundle_is_told_apart_by_every_kind_of_field() {
                 contract["instructions"][3]["id"].as_str().unwrap()
             ),
         ),
-    ];
+    ]
+}
+
+/// Tests that an image is compared with its bundle in every contract field that it holds: one change of each kind is found and named.
+#[test]
+fn an_image_of_another_bundle_is_told_apart_by_every_kind_of_field() {
+    use serde_json::json;
+    let model = Model::open(&project_file("models/kitchen-small.onnx"));
+    let bundle = lads_compiler::Bundle::from_bytes(model.bytes()).unwrap();
+    let said = lads_sim::verify::contract::of_bundle(&bundle).unwrap();
+    let fields = |other: &Model| -> Vec<String> {
+        let opened = lads_host::from_bytes_with(other.bytes(), &Options::exact()).unwrap();
+        let image = lads_sim::verify::contract::of_image(&opened.policy());
+        let found = lads_proof::contract::Compared::new(&json!({}), None, [&image, &said]);
+        let named = found.image_differing.into_iter().map(|it| it.field);
+        named.filter(|field| field != "bundle_sha256").collect()
+    };
+    assert_eq!(fields(&model), [""; 0]);
+    let contract = model.contract();
+    let cases = one_change_each(&contract);
     for (pointer, value, wanted) in cases {
         let mut changed = contract.clone();
         let (parent, key) = pointer.rsplit_once('/').unwrap();
