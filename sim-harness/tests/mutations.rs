@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use lads_compiler::Options;
 use lads_proof::reference::Reference;
 use mutate::{Judged, Model, Outcome};
+use serde_json::{Value, json};
 
 /// Bias that is added at the end of the low level.
 const LAST_BIAS: &str = "low_level.layer.6.bias";
@@ -221,7 +222,7 @@ fn every_field_of_the_contract_is_compared_or_refused() {
         let found = lads_proof::contract::Compared::new(
             &changed,
             reference.contract.as_ref(),
-            [&serde_json::Value::Null; 2],
+            [&Value::Null; 2],
         );
         let history = ["/version", "/provenance"]
             .iter()
@@ -240,121 +241,56 @@ fn every_field_of_the_contract_is_compared_or_refused() {
 }
 
 /// Returns one change of each kind of field: where, the new value, and the field that the comparison names.
-fn one_change_each(contract: &serde_json::Value) -> Vec<(String, serde_json::Value, String)> {
-    use serde_json::json;
-    let joint = "channels[observation].elements[panda_joint1].joint";
-    let (observation, action) = (
-        "/channels/0/elements/0",
-        "channels[action].elements[panda_joint1_velocity]",
-    );
-    let place = contract["channels"]
-        .as_array()
-        .unwrap()
+fn one_change_each(contract: &Value) -> Vec<(String, Value, String)> {
+    let channels = contract["channels"].as_array().unwrap();
+    let acting = channels
         .iter()
         .position(|channel| channel["role"] == "action")
         .unwrap();
-    let acting = format!("/channels/{place}/elements/0");
+    let observed = |field: &str, value: Value| {
+        let pointer = format!("/channels/0/elements/0/{field}");
+        let named = format!("channels[observation].elements[panda_joint1].{field}");
+        (pointer, value, named)
+    };
+    let acted = |field: &str, value: Value| {
+        let pointer = format!("/channels/{acting}/elements/0/{field}");
+        let named = format!("channels[action].elements[panda_joint1_velocity].{field}");
+        (pointer, value, named)
+    };
+    let other = |pointer: &str, value: Value, named: &str| {
+        let (pointer, named) = (pointer.to_owned(), named.to_owned());
+        (pointer, value, named)
+    };
+    let instruction = contract["instructions"][3]["id"].as_str().unwrap();
+    let text = format!("instructions[{instruction}].text");
+    let reference = format!("/channels/{acting}/reference");
+    let quaternions = "channels[observation].quaternion_order";
+    let threshold = "/language/acceptance/threshold";
     vec![
-        (
-            format!("{observation}/joint"),
-            json!("other"),
-            joint.to_owned(),
-        ),
-        (
-            format!("{observation}/joint"),
-            json!(null),
-            joint.to_owned(),
-        ),
-        (
-            format!("{observation}/interface"),
-            json!("effort"),
-            joint.replace(".joint", ".interface"),
-        ),
-        (
-            format!("{observation}/unit"),
-            json!("deg"),
-            joint.replace(".joint", ".unit"),
-        ),
-        (
-            format!("{observation}/max"),
-            json!(9.5),
-            joint.replace(".joint", ".max"),
-        ),
-        (
-            format!("{acting}/scale"),
-            json!(0.5),
-            format!("{action}.scale"),
-        ),
-        (
-            format!("{acting}/offset"),
-            json!(0.5),
-            format!("{action}.offset"),
-        ),
-        (
-            format!("{acting}/physical_unit"),
-            json!("deg/s"),
-            format!("{action}.physical_unit"),
-        ),
-        (
-            format!("/channels/{place}/reference"),
-            json!("nothing"),
-            "channels[action].reference".to_owned(),
-        ),
-        (
-            "/channels/0/quaternion_order".to_owned(),
-            json!("xyzw"),
-            "channels[observation].quaternion_order".to_owned(),
-        ),
-        (
-            "/environment/version".to_owned(),
-            json!("2"),
-            "environment[1]".to_owned(),
-        ),
-        (
-            "/control_period_s".to_owned(),
-            json!(0.05),
-            "control_period_s".to_owned(),
-        ),
-        (
-            "/context/steps".to_owned(),
-            json!(40),
-            "context.steps".to_owned(),
-        ),
-        (
-            "/context/beyond".to_owned(),
-            json!("refuse"),
-            "context.beyond".to_owned(),
-        ),
-        (
-            "/family/decision/rule".to_owned(),
-            json!("sample"),
-            "decision.rule".to_owned(),
-        ),
-        (
-            "/language/encoder".to_owned(),
-            json!("other"),
-            "language[0]".to_owned(),
-        ),
-        (
-            "/language/acceptance/threshold".to_owned(),
-            json!(0.5),
-            "acceptance".to_owned(),
-        ),
-        (
-            "/instructions/3/text".to_owned(),
-            json!("sit down"),
-            format!(
-                "instructions[{}].text",
-                contract["instructions"][3]["id"].as_str().unwrap()
-            ),
-        ),
+        observed("joint", json!("other")),
+        observed("joint", json!(null)),
+        observed("interface", json!("effort")),
+        observed("unit", json!("deg")),
+        observed("max", json!(9.5)),
+        acted("scale", json!(0.5)),
+        acted("offset", json!(0.5)),
+        acted("physical_unit", json!("deg/s")),
+        other(&reference, json!("nothing"), "channels[action].reference"),
+        other("/channels/0/quaternion_order", json!("xyzw"), quaternions),
+        other("/environment/version", json!("2"), "environment[1]"),
+        other("/control_period_s", json!(0.05), "control_period_s"),
+        other("/context/steps", json!(40), "context.steps"),
+        other("/context/beyond", json!("refuse"), "context.beyond"),
+        other("/family/decision/rule", json!("sample"), "decision.rule"),
+        other("/language/encoder", json!("other"), "language[0]"),
+        other(threshold, json!(0.5), "acceptance"),
+        other("/instructions/3/text", json!("sit down"), &text),
     ]
 }
 
 /// Tests that an image is compared with its bundle in every contract field that it holds: one change of each kind is found and named.
 #[test]
 fn an_image_of_another_bundle_is_told_apart_by_every_kind_of_field() {
-    use serde_json::json;
     let model = Model::open(&project_file("models/kitchen-small.onnx"));
     let bundle = lads_compiler::Bundle::from_bytes(model.bytes()).unwrap();
     let said = lads_sim::verify::contract::of_bundle(&bundle).unwrap();
@@ -396,8 +332,7 @@ fn an_image_of_another_bundle_is_told_apart_by_every_kind_of_field() {
 fn another_rule_is_different_and_runs() {
     let (model, reference) = shipped();
     let mut contract = model.contract();
-    contract["family"]["decision"] =
-        serde_json::json!({"rule": "sample", "temperature": 5.0, "seed": 0});
+    contract["family"]["decision"] = json!({"rule": "sample", "temperature": 5.0, "seed": 0});
     let found = judged(&model.with_contract(&contract), &reference);
     let fields: Vec<_> = found
         .contract
