@@ -19,6 +19,7 @@ use crate::plans::PlanBook;
 use crate::random::Stream;
 use crate::results::{self, Asked};
 use crate::rollout::{Actor, Driver, Episode, Onlooker, RolloutError, Task, Timing};
+use crate::sight::{Sight, SightError};
 use crate::spoken::WordBook;
 use crate::trace::Trace;
 
@@ -87,6 +88,9 @@ pub enum EvaluationError {
     /// There is no memory for the policy's controller.
     #[error(transparent)]
     Memory(MemoryError),
+    /// The policy's cameras show nothing.
+    #[error(transparent)]
+    Sight(SightError),
     /// An episode could not be finished.
     #[error("episode {episode} of instruction {instruction}: {source}")]
     Rollout {
@@ -232,7 +236,9 @@ impl Evaluation<'_> {
         let controller = memory
             .controller_with(&self.policy, self.isa)
             .map_err(EvaluationError::Memory)?;
-        let mut driver = Driver::new(controller, environment.as_mut());
+        let sight = Sight::of(self.contract, &self.policy, environment.as_ref());
+        let sight = sight.map_err(EvaluationError::Sight)?;
+        let mut driver = Driver::new(controller, environment.as_mut(), sight);
         if self.setup.traced > 0 {
             driver.record();
         }

@@ -88,6 +88,9 @@ pub enum Job {
     View(Rollouts),
     /// Run the episodes, and film one of the first instruction (needs the cargo feature `record`, and EGL, which needs no display)
     Record(Record),
+    /// Draw what the environment's camera sees in every state of a dataset, for training on images (needs the cargo feature `camera`, and
+    /// EGL); goes on where it was stopped
+    Frames(Frames),
 }
 
 /// Which policy, and how its kernels run.
@@ -306,6 +309,18 @@ pub struct Record {
     pub episode: u32,
     #[command(flatten)]
     pub rollouts: Rollouts,
+}
+
+#[derive(Debug, Args)]
+pub struct Frames {
+    /// The dataset, made by lads-collect
+    pub data: PathBuf,
+    /// The frames, a safetensors file: a cache, which the dataset makes again
+    #[arg(short, long, value_name = "FILE")]
+    pub output: PathBuf,
+    /// Threads; left out, one per core
+    #[arg(long)]
+    pub threads: Option<usize>,
 }
 
 /// What a job wants of its episodes, whichever job it is.
