@@ -305,8 +305,9 @@ def from_tables(table, environment, instructions, where):
     ):
         if value not in allowed:
             raise UserError(f"{where}: {name} = {value!r}: must be one of {', '.join(allowed)}")
-    if config.images.channel and (config.system.kind != "lads" or config.system.regressed or config.training.schedule != "staged"):
-        raise UserError(f"{where}: [images] goes with system lads, not regressed, and with schedule staged only")
+    plain = config.system.kind == "lads" and not config.system.regressed and config.training.schedule == "staged" and not config.data.renoise
+    if config.images.channel and not plain:
+        raise UserError(f"{where}: [images] goes with system lads, not regressed, schedule staged, and without renoise only")
     if config.high_level.hidden % config.high_level.heads:
         raise UserError("high_level.hidden must be a multiple of high_level.heads")
     steps, period = config.high_level.context_steps, config.period

@@ -1,4 +1,4 @@
-"""Frames of a camera as what policies learn from: the file of `lads-run frames`, the encoder, augmentation, a corpus of images.
+"""Frames of a camera as what policies learn from: the file of `lads-run frames`, augmentation, a corpus of images.
 
 Shapes: N frames, r rows, c columns, F features; E episodes, T control steps. Frames are bytes [r, c, 3]; between augmentation and encoder they
 are floats 0 to 255. What can fail: a file that is half written, or of another dataset.
@@ -12,11 +12,9 @@ import struct
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import nn
 
 from .config import UserError
 from .corpus import Corpus
-from .kinds import images
 
 FORMAT = "lads-frames"
 BATCH = 256  # frames that are encoded at a time where nothing is learnt
@@ -39,35 +37,6 @@ def read(path, dataset_sha256):
     if metadata["dataset_sha256"] != dataset_sha256:
         raise UserError(f"{path}: made of another dataset; make it anew with lads-run frames")
     return data.reshape(shape), rendering
-
-
-class FrameEncoder(nn.Module):
-    """Convolutions with kernels of 4 and strides 2 and 1 by turns, then dense layers: the paper's encoder of 64x64 frames."""
-
-    def __init__(self, config, size):
-        super().__init__()
-        camera = images.Camera(config.channel, tuple(size), images.lorel(config.widths))
-        self.convolutions = images.Encoder(camera)
-        widths = [self.convolutions.features(), *config.hidden, config.features]
-        self.dense = nn.ModuleList(nn.Linear(k, n) for k, n in zip(widths, widths[1:]))
-
-    def forward(self, frames):
-        """frames [N, r, c, 3] -> features [N, F]."""
-        x = self.convolutions(frames)
-        for layer in self.dense[:-1]:
-            x = F.relu(layer(x))
-        return self.dense[-1](x)
-
-    def build(self, entry):
-        """Adds the encoder to an entry of a graph -> the features."""
-        x = self.convolutions.build(entry)
-        last = len(self.dense) - 1
-        for number, layer in enumerate(self.dense):
-            weight, bias = (entry.weight(f"frames.dense{number}.{part}", getattr(layer, part)) for part in ("weight", "bias"))
-            x = entry.gemm(x, weight, bias, "features" if number == last else f"dense{number}")
-            x = x if number == last else entry.op("Relu", [x], f"dense{number}.relu")
-        entry.output("features", [1, self.dense[-1].out_features])
-        return x
 
 
 def augmented(frames, owners, count, config):
@@ -110,7 +79,7 @@ class FrameCorpus(Corpus):
     def __init__(self, dataset, setting, encoded, device):
         super().__init__(dataset, setting, encoded, device)
         self.frames = dataset.frames
-        self.states_seen = self.observations  # [E, T, O] the normalised states that the frames show
+        self.shown_states = self.observations  # [E, T, O] the normalised states that the frames show
         self.places = self._padded(torch.from_numpy(dataset.frame_rows)[:, None], dataset)[..., 0]
         features = setting.observation_len
         self.observations = torch.zeros(*self.places.shape, features, device=device)

@@ -10,23 +10,14 @@ The paper has an encoder for each part; sharing a frozen one is a deviation that
 
 import torch
 import torch.nn.functional as F
-from torch import nn
 
-from .. import graphs
-from ..frames import FrameEncoder, augmented
-from ..model import Lads
+from ..frames import augmented
+from ..kinds import sighted
 from . import lads
 from .base import Exported
 
 STARTERS = 256  # episodes whose segments start the codebook
-ENTRY = "observation_encoder/encode"
-
-
-class Networks(Lads):
-    def __init__(self, setting, encoded):
-        super().__init__(setting, encoded)
-        self.frames = FrameEncoder(setting.config.images, setting.rendering["size"])
-        self.state = nn.Linear(setting.observation_len, setting.state_len)
+Networks = sighted.Sighted
 
 
 class Training(lads.Training):
@@ -49,7 +40,7 @@ class Training(lads.Training):
         if encoder.training:
             frames = augmented(frames, rows, len(episodes), self.config.images)
         features = encoder(frames)
-        shown = self.corpus.states_seen[episodes[rows], steps]
+        shown = self.corpus.shown_states[episodes[rows], steps]
         self.state_loss = F.mse_loss(self.networks.state(features), shown)
         table = features.new_zeros(len(episodes), self.corpus.steps, features.shape[1])
         return self.corpus.segments(episodes, offsets, table.index_put((rows, steps), features))
@@ -71,11 +62,5 @@ class Training(lads.Training):
 
 
 def export(networks, setting, encoded):
-    graph, name = graphs.Graph(), "features"
-    graphs.known_instructions(graph, networks.high_level, encoded)
-    networks.frames.build(graphs.Entry(graph, ENTRY))
-    for first in (True, False):
-        graphs.high_level_step(graph, networks.high_level, networks.normalizer, first, observed=name)
-    graphs.codebook_lookup(graph, graphs.to_numpy(networks.codebook.codes))
-    graphs.low_level_act(graph, networks.low_level, networks.normalizer, observed=name)
-    return Exported(graph.model("lads"), lads.family(setting) | {"features": setting.observation_len})
+    family = lads.family(setting) | {"features": setting.observation_len}
+    return Exported(sighted.graph(networks, encoded), family)

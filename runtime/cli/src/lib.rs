@@ -11,6 +11,7 @@ mod act;
 mod bench;
 mod compile;
 mod emit;
+mod images;
 mod import;
 mod inspect;
 mod line;
@@ -77,6 +78,10 @@ enum Command {
         /// What to do: the text or the id of an instruction that the policy knows; none for a policy that takes none
         #[arg(long)]
         instruction: Option<String>,
+        /// Where the frames of a camera come from: a folder of PNG files, one for each control step in the order of their names; with several
+        /// cameras CHANNEL=FOLDER for each; or `raw` for the bytes of frames on stdin, without lines. Left out, a line has every byte
+        #[arg(long, value_name = "FOLDER|raw")]
+        images: Vec<String>,
         /// Append the index in force, such as that of a latent plan, to every action
         #[arg(long)]
         plans: bool,
@@ -146,6 +151,7 @@ fn run(command: Command) -> Result<(), Refusal> {
         Command::Act {
             model,
             instruction,
+            images,
             plans,
             sample,
             seed,
@@ -154,6 +160,7 @@ fn run(command: Command) -> Result<(), Refusal> {
             let request = act::Request {
                 instruction: instruction.as_deref(),
                 plans,
+                images: &images,
                 sample,
             };
             act::act(

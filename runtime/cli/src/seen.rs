@@ -21,6 +21,8 @@ struct Values {
     /// Names of the elements; none for images and the like.
     elements: Vec<String>,
     held: Held,
+    /// Whether its values come from elsewhere than a line.
+    beside: bool,
 }
 
 enum Held {
@@ -30,17 +32,27 @@ enum Held {
 }
 
 impl Seen {
-    /// Zeros for the observation channels of a policy.
-    pub fn of(contract: &Contract) -> Self {
+    /// Zeros for the observation channels of a policy, of which those `beside` are in no line.
+    pub fn of(contract: &Contract, beside: &[ChannelId]) -> Self {
         let channels: Vec<Values> = contract
             .observations()
-            .map(|channel| Values::of(&channel))
+            .map(|channel| Values::of(&channel, beside.contains(&channel.id())))
             .collect();
-        let numbers = vec![0.0; channels.iter().map(|values| values.held.len()).sum()];
+        let in_lines = channels.iter().filter(|values| !values.beside);
+        let numbers = vec![0.0; in_lines.map(|values| values.held.len()).sum()];
         Self { channels, numbers }
     }
 
-    /// Elements of all channels.
+    /// The bytes of a channel; none of one that has no bytes.
+    pub fn bytes(&mut self, id: ChannelId) -> &mut [u8] {
+        let found = self.channels.iter_mut().find(|values| values.id == id);
+        match found.map(|values| &mut values.held) {
+            Some(Held::U8(bytes)) => bytes,
+            _ => &mut [],
+        }
+    }
+
+    /// Elements of a line.
     pub fn len(&self) -> usize {
         self.numbers.len()
     }
@@ -55,7 +67,7 @@ impl Seen {
         })?;
         let mut rest = &self.numbers[..];
         let mut place = 0;
-        for values in &mut self.channels {
+        for values in self.channels.iter_mut().filter(|values| !values.beside) {
             let (own, behind) = rest.split_at(values.held.len());
             rest = behind;
             if let Err(element) = values.held.take(own) {
@@ -84,7 +96,7 @@ impl Seen {
 
     /// Channel and element of the value at a place.
     fn at(&self, mut place: usize) -> String {
-        for values in &self.channels {
+        for values in self.channels.iter().filter(|values| !values.beside) {
             if place < values.held.len() {
                 return values.element(place);
             }
@@ -95,10 +107,11 @@ impl Seen {
 }
 
 impl Values {
-    fn of(channel: &Channel<'_>) -> Self {
+    fn of(channel: &Channel<'_>, beside: bool) -> Self {
         let len = channel.len();
         Self {
             id: channel.id(),
+            beside,
             name: channel.name().to_owned(),
             elements: (channel.elements())
                 .map(|element| element.name.to_owned())
@@ -172,6 +185,7 @@ mod tests {
             name: name.into(),
             elements: elements.iter().map(ToString::to_string).collect(),
             held,
+            beside: false,
         }
     }
 

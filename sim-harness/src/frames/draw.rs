@@ -39,7 +39,7 @@ impl Frames {
         if !rendering.reflections {
             model.mat_reflectance_mut().fill(0.0);
         }
-        model.vis_mut().map.shadowclip = rendering.shadow_clip;
+        model.vis_mut().map.shadowclip = rendering.shadow_clip as f32;
         let [rows, columns] = rendering.drawn;
         let quality = Quality {
             size: [columns, rows],

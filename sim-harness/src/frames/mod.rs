@@ -37,7 +37,7 @@ pub struct Rendering {
     /// Edge of the shadow map in texels; 0 for no shadows.
     pub shadow_size: u32,
     /// Half of the shadow map's extent, as a share of the scene's: the smaller, the sharper the shadows in the middle.
-    pub shadow_clip: f32,
+    pub shadow_clip: f64,
     /// Whether floors and boxes mirror what stands on them.
     pub reflections: bool,
     /// Bodies whose own geoms are left out.

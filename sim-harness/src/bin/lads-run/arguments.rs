@@ -318,6 +318,9 @@ pub struct Frames {
     /// The frames, a safetensors file: a cache, which the dataset makes again
     #[arg(short, long, value_name = "FILE")]
     pub output: PathBuf,
+    /// How they are drawn, as JSON (its form: the `rendering` of a bundle's image channel); left out, as the environment's benchmark has it
+    #[arg(long, value_name = "FILE")]
+    pub rendering: Option<PathBuf>,
     /// Threads; left out, one per core
     #[arg(long)]
     pub threads: Option<usize>,

@@ -7,9 +7,12 @@ pub use without::run;
 
 #[cfg(feature = "camera")]
 mod with {
+    use std::fmt::Display;
+    use std::path::Path;
     use std::process::ExitCode;
     use std::sync::atomic::AtomicBool;
 
+    use lads_sim::frames::Rendering;
     use lads_sim::frames::cache::{self, States};
     use lads_sim::{assets, registry};
 
@@ -24,11 +27,13 @@ mod with {
         let id = &states.environment;
         let noise = registry::default_noise(id).unwrap_or("none");
         let open = registry::load(id, noise, &assets::vendor_dir()).map_err(refused)?;
-        let rendering = open().rendering().ok_or_else(|| {
-            refused(format!(
-                "environment {id} has no camera; name a dataset of another"
-            ))
-        })?;
+        let rendering = match &asked.rendering {
+            Some(path) => read(path)?,
+            None => open().rendering().ok_or_else(|| {
+                let wrong = format!("environment {id} has no camera");
+                refused(format!("{wrong}; name a dataset of another"))
+            })?,
+        };
         let bar = progress_over(states.len(), "frames");
         let made = cache::make(
             (&states, &rendering),
@@ -48,6 +53,20 @@ mod with {
         }
         print(&format!("{} frames in {path}\n", made.all))?;
         Ok(ExitCode::SUCCESS)
+    }
+
+    /// The rendering in a file.
+    fn read(path: &Path) -> Result<Rendering, End> {
+        let refused = |wrong: &dyn Display| {
+            refused(format!(
+                "--rendering {}: {wrong}; take the `rendering` of a bundle's image channel",
+                path.display()
+            ))
+        };
+        let text = lads_host::input::read_to_string(path).map_err(|error| refused(&error))?;
+        let rendering: Rendering = serde_json::from_str(&text).map_err(|error| refused(&error))?;
+        rendering.check().map_err(|wrong| refused(&wrong))?;
+        Ok(rendering)
     }
 }
 
