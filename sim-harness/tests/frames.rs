@@ -11,6 +11,7 @@ use lads_sim::environment::Environment;
 use lads_sim::film::FilmError;
 use lads_sim::frames::cache::{self, CacheError, States};
 use lads_sim::frames::{Frames, Rendering};
+use lads_sim::kitchen::{self, Kitchen, Noise};
 use lads_sim::lorel::collect::{Settings, collect};
 use lads_sim::lorel::{Lorel, Scene};
 use safetensors::SafeTensors;
@@ -64,6 +65,22 @@ fn a_wider_picture_is_squeezed_to_the_size() {
     };
     let mut frames = Frames::new(&lorel, &narrow).unwrap();
     assert_eq!(frames.draw(lorel.state()).unwrap().len(), 16 * 16 * 3);
+}
+
+#[test]
+fn the_kitchen_has_frames_too() {
+    let kitchen = Kitchen::new(&kitchen::Scene::load(&vendor_dir()).unwrap(), Noise::None);
+    let rendering = kitchen.rendering().unwrap();
+    assert_eq!(rendering.size, [224, 224]);
+    let mut frames = Frames::new(&kitchen, &rendering).unwrap();
+    let first = frames.draw(kitchen.state()).unwrap().to_vec();
+    assert_eq!(first.len(), 224 * 224 * 3);
+    // Not black, and not of one colour.
+    let mean = first.iter().map(|&value| f64::from(value)).sum::<f64>() / first.len() as f64;
+    let (low, high) = (first.iter().min(), first.iter().max());
+    assert!((40.0..220.0).contains(&mean), "{mean}");
+    assert!(low < Some(&30) && high > Some(&200), "{low:?} to {high:?}");
+    assert_eq!(frames.draw(kitchen.state()).unwrap(), first);
 }
 
 #[test]

@@ -268,7 +268,8 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         let reset_cpu = cpu_time();
         self.environment.reset(task.seed, task.commanded);
         let mut link = Link::new(task.faults, task.seed);
-        self.sense(&mut link, 0)?;
+        let sees = task.actor == Actor::Policy;
+        self.sense(&mut link, sees, 0)?;
         self.executed.fill(0.0);
         self.timing.simulator_cpu += cpu_since(reset_cpu);
 
@@ -300,7 +301,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
                 Some(stream) => self.uniform_step(step, stream)?,
             }
             step += 1;
-            self.sense(&mut link, step)?;
+            self.sense(&mut link, sees, step)?;
         }
         let success = self.succeeded(task);
         let go = self.look(task, Stand::Ended { success });
@@ -390,12 +391,16 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         Ok((selected, elapsed_ns))
     }
 
-    /// Lets what the policy sees follow the environment, as far as the link lets it through; `step` sees it.
-    fn sense(&mut self, link: &mut Link, step: usize) -> Result<(), RolloutError> {
+    /// Lets what the policy sees follow the environment, as far as the link lets it through; `step` sees it. Only who `sees`
+    /// needs frames.
+    fn sense(&mut self, link: &mut Link, sees: bool, step: usize) -> Result<(), RolloutError> {
         let (observation, state) = (self.environment.observation(), self.environment.state());
         link.sense(observation, state, &mut self.observation);
-        let looked = self.sight.look(state);
-        looked.map_err(|error| RolloutError::Sight { step, error })
+        if sees {
+            let looked = self.sight.look(state);
+            looked.map_err(|error| RolloutError::Sight { step, error })?;
+        }
+        Ok(())
     }
 
     /// Hands the environment the action that the actuators execute.

@@ -8,7 +8,7 @@
 //! every t      act:    (s_t, plan)       -> a_t
 //! ```
 //!
-//! Where the contract says `features`, an encoder runs first in every step, and both levels read what it gives in place of s_t.
+//! Where the contract says `features`, an encoder runs first in every step, and both levels read what it gives instead.
 
 use lads_image::records::Event;
 use serde::Deserialize;

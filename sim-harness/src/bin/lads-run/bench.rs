@@ -60,6 +60,12 @@ pub fn with<R>(
         ))
     })?;
     let images = contract.observations().any(sight::is_image);
+    if images {
+        // Its cameras, before the first episode.
+        let sight = sight::Sight::of(contract, &policy, environment.as_ref());
+        let model = wanted.policy.model.display();
+        sight.map_err(|error| refused(format!("{model}: {error}")))?;
+    }
     if images && wanted.faults != Faults::default() {
         return Err(refused(
             "the policy sees images, which no fault delays or loses; leave the faults out",
