@@ -1,6 +1,7 @@
 """Command line: demonstrations to a policy to one ONNX file."""
 
 import argparse
+import dataclasses
 import hashlib
 import sys
 from pathlib import Path
@@ -58,7 +59,8 @@ def _train(arguments):
     if arguments.threads:
         torch.set_num_threads(arguments.threads)
     setting = config.load(arguments.config, *arguments.system)
-    data = dataset.load(arguments.data, setting)
+    data = dataset.load(arguments.data, setting, arguments.frames)
+    setting = dataclasses.replace(setting, rendering=data.rendering)
     device = _device(arguments.device)
     trainer = training.Trainer(setting, data, _encode(setting), arguments.out, device, arguments.seed)
     if not trainer.run(resume=arguments.resume):
@@ -190,7 +192,7 @@ def _parser():
     random = commands.add_parser("random", help="a bundle with random weights, for tests")
     network = random.add_mutually_exclusive_group(required=True)
     network.add_argument("--config", help="a LADS policy of this configuration")
-    network.add_argument("--kind", help="a small policy of this kind: lads, lang_dt, lisa, vae, lcsd, skilldiffuser, history, plain, recurrent, stacked, camera, images; or with an encoder of the field's sizes: lorel-encoder, lite0, resnet18")
+    network.add_argument("--kind", help="a small policy of this kind: lads, lang_dt, lisa, vae, lcsd, skilldiffuser, history, plain, recurrent, stacked, camera, images, sighted; or with an encoder of the field's sizes: lorel-encoder, lite0, resnet18")
     random.add_argument("-o", "--output", required=True)
     random.add_argument("--seed", type=int, default=0)
     random.set_defaults(run_command=_random)
@@ -212,6 +214,7 @@ def _parser():
     train.add_argument("--config", required=True, help="one TOML file per setting, in exporter/configs")
     train.add_argument("--system", action="append", default=[], metavar="FILE", help="values of a system over those of --config, such as configs/kitchen/lisa.toml")
     train.add_argument("--data", required=True, help=".safetensors of lads-collect, or D4RL kitchen .hdf5")
+    train.add_argument("--frames", metavar="FILE", help="frames of the dataset, made by lads-run frames, for a setting with a camera")
     train.add_argument("--out", required=True, help="folder of the run: checkpoint, curves, summary")
     train.add_argument("--resume", action="store_true", help="continue from the run's checkpoint")
     train.add_argument("--device", choices=("cpu", "cuda"), default="cpu")

@@ -67,6 +67,24 @@ class Alignment:
 
 
 @dataclass(frozen=True)
+class Images:
+    """What a policy sees with a camera, in place of the state; the paper's is LISA's."""
+
+    channel: str  # name of the camera's channel; "" for a policy that observes the state
+    widths: list  # channels of the convolutions
+    hidden: list  # units of the dense layers behind them
+    features: int  # what they come to
+    state_weight: float  # of the loss by which the features tell the state in the first stage; 0 is the paper's
+    jitter: float  # of brightness, contrast, saturation and hue, drawn for each trajectory
+    turn_degrees: float
+    shift: float  # share of the frame's sides
+    scale: float
+
+
+NO_IMAGES = {"channel": "", "widths": [], "hidden": [], "features": 0, "state_weight": 0.0, "jitter": 0.0, "turn_degrees": 0.0, "shift": 0.0, "scale": 0.0}
+
+
+@dataclass(frozen=True)
 class Data:
     std_floor: float  # observations are z-scored with max(std, std_floor)
     validation_every: int  # every n-th episode is held out
@@ -185,6 +203,7 @@ class Config:
     encoder: Encoder
     alignment: Alignment
     data: Data
+    images: Images
     training: Training
     system: object  # one of SYSTEMS
 
@@ -256,10 +275,17 @@ class Setting:
     environment: dict
     instructions: list  # of {id, text, sub_tasks, split}, in the file's order
     tables: list  # what `from_tables` read, as plain data; stored in checkpoints
+    rendering: dict | None = None  # how the frames are drawn that the policy sees
+
+    @property
+    def state_len(self):
+        """Elements of the environment's own observation."""
+        return len(self.environment["observation"])
 
     @property
     def observation_len(self):
-        return len(self.environment["observation"])
+        """Elements of what the networks observe: the state, or the features of a frame."""
+        return self.config.images.features or self.state_len
 
     @property
     def action_len(self):
@@ -268,7 +294,7 @@ class Setting:
 
 def from_tables(table, environment, instructions, where):
     """Checks the three tables of a setting against each other."""
-    config = _build(Config, {"system": LADS} | table, str(where))
+    config = _build(Config, {"system": LADS, "images": NO_IMAGES} | table, str(where))
     for name, value, allowed in (
         ("decision", config.decision, ("argmax", "sample")),
         ("beyond_context", config.beyond_context, ("restart", "refuse")),
@@ -280,6 +306,9 @@ def from_tables(table, environment, instructions, where):
     ):
         if value not in allowed:
             raise UserError(f"{where}: {name} = {value!r}: must be one of {', '.join(allowed)}")
+    plain = config.system.kind == "lads" and not config.system.regressed and config.training.schedule == "staged" and not config.data.renoise
+    if config.images.channel and not plain:
+        raise UserError(f"{where}: [images] goes with system lads, not regressed, schedule staged, and without renoise only")
     if config.high_level.hidden % config.high_level.heads:
         raise UserError("high_level.hidden must be a multiple of high_level.heads")
     steps, period = config.high_level.context_steps, config.period

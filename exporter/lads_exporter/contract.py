@@ -45,20 +45,26 @@ def array(name, role, shape, dtype="f32", **more):
     return {"name": name, "role": role, "dtype": dtype, "shape": list(shape), **more}
 
 
+def frames(name, rendering):
+    """Makes the channel of a camera whose frames are drawn as `rendering` states."""
+    return array(name, "observation", [*rendering["size"], 3], "u8", layout="hwc", min=0, max=255, rendering=rendering)
+
+
 def element(row):
     """Takes what a contract keeps from a row of an environment file."""
     keep = ("name", "unit", "min", "max", "joint", "interface", "scale", "offset", "physical_unit")
     return {key: row[key] for key in keep if key in row}
 
 
-def channels(environment, words=None, noise=None, segment=None):
+def channels(environment, words=None, noise=None, segment=None, image=None):
     """Lists the channels of a policy on one observation vector.
 
     words: [L, E] of an instruction; noise: the shape of one draw; segment: the steps that a trajectory encoder reads.
+    image: the channel of a camera, which is observed in place of the vector.
     """
     observation, action = ([element(row) for row in environment[key]] for key in (OBSERVATION, ACTION))
     reference = environment.get("reference", "not stated")
-    found = [vector(OBSERVATION, "observation", observation, quaternion_order=environment["quaternion_order"])]
+    found = [image or vector(OBSERVATION, "observation", observation, quaternion_order=environment["quaternion_order"])]
     if words:
         found.append(array(WORDS, "instruction", words))
     if noise:

@@ -110,8 +110,11 @@ class Corpus:
         starts = (steps - torch.randint(self.horizon, (batch,), generator=generator)).clamp(min=0)
         return tuple(x.to(self.device) for x in (episodes, steps, starts))
 
-    def segments(self, episodes, offsets):
-        """Cuts each episode into windows of H steps that start at its offset; the last one may be shorter."""
+    def segments(self, episodes, offsets, seen=None):
+        """Cuts each episode into windows of H steps that start at its offset; the last one may be shorter.
+
+        seen [B, T, O]: observations in place of the corpus' own, a row for each of the episodes.
+        """
         rows, starts, places = [], [], []
         for row, (length, offset) in enumerate(zip(self.lengths[episodes].tolist(), offsets.tolist())):
             begin = torch.arange(min(offset, length - 1), length, self.horizon)
@@ -119,14 +122,15 @@ class Corpus:
             starts.append(begin)
             places.append(torch.arange(len(begin)))
         rows, starts, places = torch.cat(rows), torch.cat(starts), torch.cat(places)
-        return self._windows(episodes[rows], starts, rows, places)
+        return self._windows(episodes[rows], starts, rows, places, seen)
 
-    def _windows(self, episodes, starts, rows, places):
+    def _windows(self, episodes, starts, rows, places, seen=None):
         steps = (starts[:, None] + torch.arange(self.horizon)).to(self.device)
         lengths = (self.lengths[episodes] - starts).clamp(max=self.horizon).to(self.device)
         at = episodes.to(self.device)[:, None], steps
-        tensors = (table[at] for table in (self.observations, self.actions, self.executed))
-        return Segments(*tensors, lengths, rows.to(self.device), steps[:, 0], places.to(self.device), self.shown(*at))
+        actions, executed, rows = self.actions[at], self.executed[at], rows.to(self.device)
+        own, shown = (self.observations[at], self.shown(*at)) if seen is None else 2 * (seen[rows[:, None], steps],)
+        return Segments(own, actions, executed, lengths, rows, steps[:, 0], places.to(self.device), shown)
 
     def every_window(self, episodes):
         """Yields the windows that start at each step of the episodes, one episode after the other."""

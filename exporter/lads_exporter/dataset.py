@@ -7,12 +7,13 @@ instruction is refused (safetensors) or left out and counted (D4RL), so the spli
 import hashlib
 import json
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
+from . import frames as frame_file
 from .config import UserError
 
 FORMAT, VERSION = "lads-dataset", "1"
@@ -31,6 +32,9 @@ class Dataset:
     instruction: np.ndarray  # [E], index into the setting's instructions
     sha256: str
     notes: dict = field(default_factory=dict)  # counts for the model card
+    frames: np.ndarray | None = None  # [T', r, c, 3] what a camera sees, where the setting has one
+    frame_rows: np.ndarray | None = None  # [T] the row of `frames` for each step
+    rendering: dict | None = None  # how they were drawn
     texts: list | None = None  # the file's own instructions, where it has others than the setting; `instruction` points here
 
     def __len__(self):
@@ -47,15 +51,23 @@ class Dataset:
         return np.abs(self.observations - self.states).max(0)
 
 
-def load(path, setting):
-    """Reads a dataset for a setting; the suffix .hdf5 or .h5 means D4RL."""
+def load(path, setting, frames=None):
+    """Reads a dataset for a setting, with the file of its frames where the setting has a camera; the suffix .hdf5 or .h5 means D4RL."""
     path = Path(path)
     if not path.is_file():
         raise UserError(f"no dataset at {path}; collect one first (make collect)")
     read = _read_d4rl if path.suffix in (".hdf5", ".h5") else _read_safetensors
     dataset = read(path, setting)
     _check(dataset, path, setting)
-    return dataset
+    if bool(setting.config.images.channel) != bool(frames):
+        wants = "sees frames: give those of the dataset with --frames" if frames is None else "sees no frames; leave --frames out"
+        raise UserError(f"{setting.config.name} {wants}")
+    if frames is None:
+        return dataset
+    drawn, rendering = frame_file.read(frames, dataset.sha256)
+    if len(drawn) != int(dataset.offsets[-1]):
+        raise UserError(f"{frames}: {len(drawn)} frames for {int(dataset.offsets[-1])} control steps; make it anew with lads-run frames")
+    return replace(dataset, frames=drawn, frame_rows=np.arange(len(drawn)), rendering=rendering)
 
 
 def sha256(path):
@@ -65,7 +77,7 @@ def sha256(path):
 
 def _check(dataset, path, setting):
     """Checks what every reader must have established: shapes, finite values, a usable split."""
-    sizes = {"O": setting.observation_len, "A": setting.action_len}
+    sizes = {"O": setting.state_len, "A": setting.action_len}
     total = int(dataset.offsets[-1])
     for name, width in _WIDTHS.items():
         array = getattr(dataset, name)
@@ -136,7 +148,7 @@ def _read_safetensors(path, setting):
         translate[labels],
         sha256(path),
         notes,
-        own,
+        texts=own,
     )
 
 
@@ -171,7 +183,7 @@ def _read_d4rl(path, setting):
     if "sub_task" not in setting.environment:
         raise UserError(f"{setting.config.environment}: no sub_task table, which labels D4RL episodes")
     sub_tasks, radius = setting.environment["sub_task"], setting.environment["sub_task_radius"]
-    width = setting.observation_len
+    width = setting.state_len
     if observations.ndim != 2 or observations.shape[1] < width or len(observations) != len(actions) or len(ends) != len(actions):
         raise UserError(f"{path}: not a D4RL kitchen file: observations {observations.shape}, actions {actions.shape}")
     labels = {frozenset(row["sub_tasks"]): index for index, row in enumerate(setting.instructions) if row["split"] == "seen"}

@@ -207,17 +207,18 @@ def high_level_instruct(graph, policy, words_len):
     Transformer(entry, policy, words_len, cached=False).run(x, record_only=True)
 
 
-def high_level_state(graph, policy, normalizer, first=False, previous=None):
+def high_level_state(graph, policy, normalizer, first=False, previous=None, observed="observation"):
     """Adds the nodes of `high_level/start` or `high_level/step` up to the state token -> the entry, its row [1, d], the observation's
     embedding.
 
     previous: the name of the input for the previous action; without it the history is of observations only.
+    observed: the name of the input for the observation.
     """
     entry = Entry(graph, "high_level/start" if first else "high_level/step")
     tokens = []
     if previous and not first:
         action = entry.input(previous, [1, policy.embed_action.in_features])
-    observation = entry.input("observation", [1, policy.embed_observation.in_features])
+    observation = entry.input(observed, [1, policy.embed_observation.in_features])
     timestep = entry.input("timestep", [1], TensorProto.INT64)
     times = entry.weight("high_level.embed_timestep", policy.embed_timestep.weight)
     if previous and not first:
@@ -235,9 +236,9 @@ def head(entry, x, module, out, name="high_level.head"):
     entry.output(out, [1, module.out_features])
 
 
-def high_level_step(graph, policy, normalizer, first, out="logits", previous="action"):
+def high_level_step(graph, policy, normalizer, first, out="logits", previous="action", observed="observation"):
     """Adds `high_level/start` (first: the observation only) and `high_level/step` (previous action, then observation)."""
-    entry, x, _ = high_level_state(graph, policy, normalizer, first, previous)
+    entry, x, _ = high_level_state(graph, policy, normalizer, first, previous, observed)
     head(entry, x, policy.head, out)
 
 
@@ -264,11 +265,11 @@ def codebook_lookup(graph, codes):
     entry.output("plan", [1, codes.shape[1]])
 
 
-def low_level_act(graph, policy, normalizer):
+def low_level_act(graph, policy, normalizer, observed="observation"):
     """Adds the low level's MLP with batch norm folded into the linear layer before it."""
     entry = Entry(graph, "low_level/act")
     observations = len(normalizer.mean)
-    observation = entry.input("observation", [1, observations])
+    observation = entry.input(observed, [1, observations])
     plan = entry.input("plan", [1, policy.first.in_features - observations])
     centred = entry.centred(observation, normalizer, "observation_centred")
     x = entry.op("Concat", [centred, plan], "observation_and_plan", axis=1)

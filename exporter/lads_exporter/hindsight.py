@@ -78,6 +78,7 @@ def relabel(dataset, setting, count, latest, most, seed):
         states=part(dataset.states),
         actions=part(dataset.actions),
         executed=part(dataset.executed),
+        frame_rows=part(dataset.frame_rows),
         offsets=np.cumsum([0, *(length - starts)]),
         instruction=labels,
         texts=list(index),

@@ -43,7 +43,8 @@ def randomize(lads, setting, seed):
         for norm in lads.low_level.norms:
             norm.running_mean.copy_(0.2 * draw(norm.running_mean))
             norm.running_var.copy_(0.5 + torch.rand(norm.running_var.shape, generator=generator))
-        place_normalizer(lads.normalizer, setting.environment["observation"])
+        if setting.rendering is None:  # features are not normalised
+            place_normalizer(lads.normalizer, setting.environment["observation"])
         lads.codebook.codes.copy_(draw(lads.codebook.codes))
         lads.codebook.started.fill_(True)
 

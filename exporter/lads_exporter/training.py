@@ -5,6 +5,7 @@ resumed run does what an uninterrupted one would have done. An interrupt finishe
 """
 
 import csv
+import dataclasses
 import io
 import json
 import math
@@ -24,12 +25,13 @@ from . import __version__, config as configuration, language, systems
 from .output import write_atomically
 from .config import UserError
 from .corpus import Corpus
+from .frames import FrameCorpus
 from .hindsight import relabel
 
 LOG_EVERY, VALIDATE_EVERY, SAVE_SECONDS = 50, 500, 120
 CHECKPOINT, CURVES, SUMMARY = "checkpoint.pt", "curves.csv", "summary.json"
 COLUMNS = ("stage", "step", "learning_rate", "ms_per_step", "loss", "bc", "commitment", "align", "ce", "kl", "noise", "language", "perplexity",
-           "revived", "val_bc", "val_perplexity", "val_ce", "val_accuracy", "val_kl", "val_noise")  # fmt: skip
+           "revived", "state", "val_state", "val_bc", "val_perplexity", "val_ce", "val_accuracy", "val_kl", "val_noise")  # fmt: skip
 
 
 @contextmanager
@@ -100,13 +102,15 @@ class Trainer:
             "language_sha256": encoded.sha256,
             "seed": seed,
         }
+        if dataset.rendering is not None:
+            self.identity["rendering"] = dataset.rendering
         torch.manual_seed(self.seed_of("", "weights", 0))
         self.networks = systems.of(self.config).Networks(setting, encoded).to(device)
         data = self.config.data
         if data.hindsight > 0:
             dataset = relabel(dataset, setting, data.hindsight, data.hindsight_latest, data.hindsight_most, self.seed_of("", "hindsight", 0))
         own = encoded if dataset.texts is None else language.encode(self.config.language, dataset.texts)
-        self.corpus = Corpus(dataset, setting, own, device)
+        self.corpus = (Corpus if dataset.frames is None else FrameCorpus)(dataset, setting, own, device)
         self.networks.normalizer.mean.copy_(self.corpus.mean)
         self.networks.normalizer.std.copy_(self.corpus.std)
         self.system = systems.of(self.config).Training(self.networks, self.corpus, setting, self.seed_of)
@@ -249,7 +253,8 @@ def golden_candidates(dataset, episodes, setting, most=24):
         index = np.array([known.index(text) if text in known else -1 for text in dataset.texts])[dataset.instruction]
         episodes = [episode for episode in episodes if index[episode] >= 0]
     chosen = episodes[:: max(1, len(episodes) // most)][:most]
-    return [(int(index[e]), torch.from_numpy(dataset.observations[dataset.rows(e)].copy())) for e in chosen]
+    seen = lambda rows: dataset.observations[rows].copy() if dataset.frames is None else dataset.frames[dataset.frame_rows[rows]]
+    return [(int(index[e]), torch.from_numpy(seen(dataset.rows(e)))) for e in chosen]
 
 
 def _short(validation):
@@ -277,6 +282,7 @@ def load_run(folder, *over):
     for one in over:
         table = configuration.layered(table, configuration.read_toml(one))
     setting = configuration.from_tables(table, *beside, path)
+    setting = dataclasses.replace(setting, rendering=saved["identity"].get("rendering"))
     names = systems.of(setting.config).Training.stages(setting.config)
     if saved["position"]["stage"] < len(names):
         raise UserError(f"{folder} is not finished (stage {names[saved['position']['stage']]}); continue it with --resume")

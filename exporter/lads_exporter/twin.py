@@ -275,6 +275,8 @@ def _first_or_later(twin):
 
 
 def _lads(twin):
+    if "features" in twin.family:
+        twin.run("observation_encoder/encode")
     _first_or_later(twin)
     if twin.decides:
         twin.select()

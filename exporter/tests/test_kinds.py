@@ -27,7 +27,8 @@ class Made:
         self.policy, self.model = kinds.export(name, SEED)
         self.contract = contracts.of(self.model)
         self.channels = random_policy.channels(self.contract, STEPS, seed=8)
-        self.observations = torch.from_numpy(self.channels["observation"])
+        observations = self.channels.get("observation")  # none of a policy that has a camera alone
+        self.observations = None if observations is None else torch.from_numpy(observations)
         self.words = torch.from_numpy(common.WORDS.instructions[1].words)
         self.rollout = twin.open_loop(twin.Twin(self.model), 1 if self.contract.get("instructions") else None, self.channels)
         self.actions = torch.from_numpy(np.stack(self.rollout.actions))
@@ -55,7 +56,14 @@ def made(request):
 
 
 def lads(made):
-    normed = made.policy.normalizer(made.observations)
+    return on(made, made.policy.normalizer(made.observations))
+
+
+def sighted(made):
+    return on(made, made.policy.frames(torch.from_numpy(made.channels["camera"])))
+
+
+def on(made, normed):
     plans = made.plans(made.policy.high_level([made.words], normed[None], made.actions[None])[0])
     return plans, made.policy.low_level(normed, made.policy.codebook.codes[plans])
 
@@ -105,7 +113,7 @@ def plain(made):
     return None, made.policy(*(torch.from_numpy(rows) for rows in made.channels.values()))
 
 
-WHOLE = {"lads": lads, "lang_dt": lang_dt, "lisa": lisa, "history": history, "vae": vae, "lcsd": lcsd, "skilldiffuser": skilldiffuser}
+WHOLE = {"lads": lads, "sighted": sighted, "lang_dt": lang_dt, "lisa": lisa, "history": history, "vae": vae, "lcsd": lcsd, "skilldiffuser": skilldiffuser}
 
 
 @torch.no_grad()

@@ -7,8 +7,9 @@ pub mod command;
 pub mod demonstrations;
 pub mod environments;
 pub mod evaluation;
-#[cfg(feature = "record")]
+#[cfg(feature = "camera")]
 pub mod film;
+pub mod frames;
 pub mod output;
 pub mod random;
 pub mod recordings;
@@ -22,7 +23,7 @@ pub mod viewer;
 // Rooms keep the modules in order; their users name the modules.
 pub use demonstrations::{collect, dataset, expert, instructions};
 pub use environments::{assets, environment, fit, kitchen, lorel, registry};
-pub use evaluation::{evaluate, faults, results, rollout, spoken, table};
+pub use evaluation::{evaluate, faults, results, rollout, sight, spoken, table};
 pub use recordings::{plans, recorder, replay, trace};
 
 /// The examples of the project's README compile as typed.

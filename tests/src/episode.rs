@@ -13,7 +13,7 @@ use safetensors::{SafeTensors, tensor::TensorView};
 pub const FOLDER: &str = "LADS_FAMILIES";
 
 /// Kinds of random policies.
-pub const KINDS: [&str; 12] = [
+pub const KINDS: [&str; 13] = [
     "lads",
     "lang_dt",
     "lisa",
@@ -26,6 +26,7 @@ pub const KINDS: [&str; 12] = [
     "stacked",
     "camera",
     "images",
+    "sighted",
 ];
 
 /// Returns the folder of the bundles and episodes.

@@ -25,4 +25,5 @@ MODULES = {
 
 def of(config):
     """Returns the module of the system that a configuration names."""
-    return import_module(f".{MODULES[config.system.kind]}", __name__)
+    seen = "_images" if config.images.channel else ""
+    return import_module(f".{MODULES[config.system.kind]}{seen}", __name__)

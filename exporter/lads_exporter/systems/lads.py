@@ -62,12 +62,19 @@ class Training(base.Training):
             return torch.zeros(len(episodes), dtype=torch.long)
         return torch.randint(self.corpus.horizon, (len(episodes),), generator=generator)
 
+    def segments(self, episodes, offsets):
+        return self.corpus.segments(episodes, offsets)
+
+    def starters(self):
+        """The episodes whose segments start the codebook."""
+        return self.corpus.train
+
     def plans(self, episodes, offsets):
         """Computes L_BC, the commitment term of L_VQ and L_align (equations 5, 6, 10); and the segments' codes [B, T].
 
         The code of a segment stands at the step at which it starts, -1 at all other steps.
         """
-        networks, segments = self.networks, self.corpus.segments(episodes, offsets)
+        networks, segments = self.networks, self.segments(episodes, offsets)
         latents = networks.encoder(segments.observations, segments.executed, segments.lengths)
         plans, index, commitment = networks.codebook(latents)
         losses = {"bc": self.cloning(segments, plans), "commitment": commitment}
@@ -133,8 +140,8 @@ class Training(base.Training):
     @torch.no_grad()
     def _start_codebook(self, generator):
         latents = []
-        for episodes in self.corpus.train.split(64):
-            segments = self.corpus.segments(episodes, self.offsets(episodes, generator))
+        for episodes in self.starters().split(64):
+            segments = self.segments(episodes, self.offsets(episodes, generator))
             latents.append(self.networks.encoder(segments.observations, segments.executed, segments.lengths))
         self.networks.codebook.start(torch.cat(latents))
 

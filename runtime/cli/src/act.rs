@@ -1,9 +1,10 @@
 //! `lads act`: the controller on a pipe. One observation per line of input, one action per line of output, flushed, in the same form.
 //!
 //! A line holds the elements of all observation channels, one channel after the other in the
-//! policy's order. No more of it is read than an observation can need. An empty line starts a new
-//! episode of the same instruction and is not answered. An observation that is refused ends the
-//! command with the number of its line; the lines before it have been answered.
+//! policy's order, except those whose frames come from elsewhere ([`crate::images`]); if that is all
+//! of them, a step needs no line. No more of a line is read than an observation can need. An empty
+//! line starts a new episode of the same instruction and is not answered. An observation that is
+//! refused ends the command with the number of its line; the lines before it have been answered.
 
 use std::fmt::Display;
 use std::io::{BufRead, ErrorKind, Read as _, Write};
@@ -11,6 +12,7 @@ use std::io::{BufRead, ErrorKind, Read as _, Write};
 use lads_core::{Controller, Decision, Instruction, Policy, StepError};
 use lads_host::Memory;
 
+use crate::images::Images;
 use crate::line;
 use crate::model::Model;
 use crate::refusal::Refusal;
@@ -28,6 +30,8 @@ pub struct Request<'r> {
     pub instruction: Option<&'r str>,
     /// Append the index in force to every action.
     pub plans: bool,
+    /// Where frames of cameras come from: folders, or stdin.
+    pub images: &'r [String],
     /// Sample indices, from the stream with this seed, instead of following the contract's rule.
     pub sample: Option<u64>,
 }
@@ -54,6 +58,7 @@ pub fn act(
         let wrong = "the policy selects no index";
         return Err(Refusal::new("--plans", wrong, "leave it out"));
     }
+    let images = Images::of(request.images, policy.contract())?;
     let mut memory = Memory::of(&policy).map_err(|error| model.refused(error))?;
     let mut controller = memory
         .controller(&policy)
@@ -74,6 +79,7 @@ pub fn act(
         policy,
         controller,
         plans: request.plans,
+        images,
     };
     pipe.answer_all(input, output)
 }
@@ -93,6 +99,7 @@ struct Pipe<'p, 'm> {
     policy: Policy<'p>,
     controller: Controller<'p, 'm>,
     plans: bool,
+    images: Option<Images>,
 }
 
 impl Pipe<'_, '_> {
@@ -101,11 +108,27 @@ impl Pipe<'_, '_> {
         mut input: impl BufRead,
         mut output: impl Write,
     ) -> Result<(), Refusal> {
-        let mut seen = Seen::of(self.policy.contract());
+        let images = self.images.take();
+        let beside = images.as_ref().map(Images::channels).unwrap_or_default();
+        let mut seen = Seen::of(self.policy.contract(), &beside);
         let mut action = vec![0.0; self.policy.contract().action_len()];
         let most = BYTES_BESIDE + BYTES_PER_ELEMENT * seen.len();
         let (mut bytes, mut answered) = (vec![], String::new());
+        let mut frame = 0;
         for number in 1_u64.. {
+            if let Some(images) = images.as_ref().filter(|_| seen.len() == 0) {
+                if !images.show(frame, &mut input, &mut seen)? {
+                    break;
+                }
+                frame += 1;
+                let plan = self.step(&seen, &mut action);
+                let plan = plan.map_err(|wrong| self.refuse(number, &wrong))?;
+                line::format(line::Form::Csv, &action, plan, &mut answered);
+                if !send(&mut output, &answered)? {
+                    break;
+                }
+                continue;
+            }
             bytes.clear();
             let unreadable = |wrong: &dyn Display| {
                 let line = format_args!("input line {number}").to_string();
@@ -127,36 +150,26 @@ impl Pipe<'_, '_> {
                 self.controller.reset();
                 continue;
             }
-            let plan = self.answer(asked, &mut seen, &mut action);
-            let (form, plan) = plan.map_err(|wrong| self.refuse(number, &wrong))?;
-            line::format(form, &action, plan, &mut answered);
-            match output
-                .write_all(answered.as_bytes())
-                .and_then(|()| output.flush())
-            {
-                Err(error) if error.kind() == ErrorKind::BrokenPipe => break,
-                Err(error) => {
-                    return Err(Refusal::new(
-                        "output",
-                        error,
-                        "connect it to a reader or a place with room",
-                    ));
+            let form = seen.read(asked);
+            let form = form.map_err(|wrong| self.refuse(number, &wrong))?;
+            if let Some(images) = &images {
+                if !images.show(frame, &mut input, &mut seen)? {
+                    return Err(images.exhausted());
                 }
-                Ok(()) => {}
+                frame += 1;
+            }
+            let plan = self.step(&seen, &mut action);
+            let plan = plan.map_err(|wrong| self.refuse(number, &wrong))?;
+            line::format(form, &action, plan, &mut answered);
+            if !send(&mut output, &answered)? {
+                break;
             }
         }
         Ok(())
     }
 
-    /// Runs one control step; on success returns the form of the line, and the index in force if
-    /// requested.
-    fn answer(
-        &mut self,
-        asked: &str,
-        seen: &mut Seen,
-        action: &mut [f32],
-    ) -> Result<(line::Form, Option<u32>), String> {
-        let form = seen.read(asked)?;
+    /// Runs one control step; on success returns the index in force if requested.
+    fn step(&mut self, seen: &Seen, action: &mut [f32]) -> Result<Option<u32>, String> {
         let report =
             self.controller
                 .step_with(&seen.given(), action)
@@ -165,7 +178,7 @@ impl Pipe<'_, '_> {
                     other => other.to_string(),
                 })?;
         let selected = report.selected.map(|selected| selected.index);
-        Ok((form, selected.filter(|_| self.plans)))
+        Ok(selected.filter(|_| self.plans))
     }
 
     fn refuse(&self, number: u64, wrong: &str) -> Refusal {
@@ -175,5 +188,20 @@ impl Pipe<'_, '_> {
             channels.map(|channel| channel.len()).sum::<usize>()
         );
         Refusal::new(format_args!("input line {number}"), wrong, remedy)
+    }
+}
+
+/// Writes a line; `false` where nobody reads any more.
+fn send(output: &mut impl Write, line: &str) -> Result<bool, Refusal> {
+    let sent = output
+        .write_all(line.as_bytes())
+        .and_then(|()| output.flush());
+    match sent {
+        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(false),
+        Err(error) => {
+            let remedy = "connect it to a reader or a place with room";
+            Err(Refusal::new("output", error, remedy))
+        }
+        Ok(()) => Ok(true),
     }
 }

@@ -16,6 +16,7 @@ mod act;
 mod bench;
 mod compile;
 mod emit;
+mod images;
 mod import;
 mod inspect;
 mod line;
@@ -86,6 +87,10 @@ enum Command {
         /// for a policy that takes none
         #[arg(long)]
         instruction: Option<String>,
+        /// Where the frames of a camera come from: a folder of PNG files, one for each control step in the order of their names; with several
+        /// cameras CHANNEL=FOLDER for each; or `raw` for the bytes of frames on stdin, without lines. Left out, a line has every byte
+        #[arg(long, value_name = "FOLDER|raw")]
+        images: Vec<String>,
         /// Append the index in force, such as that of a latent plan, to every action
         #[arg(long)]
         plans: bool,
@@ -156,6 +161,7 @@ fn run(command: Command) -> Result<(), Refusal> {
         Command::Act {
             model,
             instruction,
+            images,
             plans,
             sample,
             seed,
@@ -164,6 +170,7 @@ fn run(command: Command) -> Result<(), Refusal> {
             let request = act::Request {
                 instruction: instruction.as_deref(),
                 plans,
+                images: &images,
                 sample,
             };
             act::act(

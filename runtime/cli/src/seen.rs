@@ -22,6 +22,8 @@ struct Values {
     /// Names of the elements; empty for images and the like.
     elements: Vec<String>,
     held: Held,
+    /// True if the channel's values are not part of a line.
+    beside: bool,
 }
 
 enum Held {
@@ -31,17 +33,28 @@ enum Held {
 }
 
 impl Seen {
-    /// Makes zeros for the observation channels of a policy.
-    pub fn of(contract: &Contract) -> Self {
+    /// Makes zeros for the observation channels of a policy, of which those in `beside` are not part
+    /// of a line.
+    pub fn of(contract: &Contract, beside: &[ChannelId]) -> Self {
         let channels: Vec<Values> = contract
             .observations()
-            .map(|channel| Values::of(&channel))
+            .map(|channel| Values::of(&channel, beside.contains(&channel.id())))
             .collect();
-        let numbers = vec![0.0; channels.iter().map(|values| values.held.len()).sum()];
+        let in_lines = channels.iter().filter(|values| !values.beside);
+        let numbers = vec![0.0; in_lines.map(|values| values.held.len()).sum()];
         Self { channels, numbers }
     }
 
-    /// Returns the number of elements of all channels.
+    /// Returns the bytes of a channel; empty for a channel of other elements.
+    pub fn bytes(&mut self, id: ChannelId) -> &mut [u8] {
+        let found = self.channels.iter_mut().find(|values| values.id == id);
+        match found.map(|values| &mut values.held) {
+            Some(Held::U8(bytes)) => bytes,
+            _ => &mut [],
+        }
+    }
+
+    /// Returns the number of elements of a line.
     pub fn len(&self) -> usize {
         self.numbers.len()
     }
@@ -56,7 +69,7 @@ impl Seen {
         })?;
         let mut rest = &self.numbers[..];
         let mut place = 0;
-        for values in &mut self.channels {
+        for values in self.channels.iter_mut().filter(|values| !values.beside) {
             let (own, behind) = rest.split_at(values.held.len());
             rest = behind;
             if let Err(element) = values.held.take(own) {
@@ -85,7 +98,7 @@ impl Seen {
 
     /// Names channel and element of the value at a position.
     fn at(&self, mut place: usize) -> String {
-        for values in &self.channels {
+        for values in self.channels.iter().filter(|values| !values.beside) {
             if place < values.held.len() {
                 return values.element(place);
             }
@@ -96,10 +109,11 @@ impl Seen {
 }
 
 impl Values {
-    fn of(channel: &Channel<'_>) -> Self {
+    fn of(channel: &Channel<'_>, beside: bool) -> Self {
         let len = channel.len();
         Self {
             id: channel.id(),
+            beside,
             name: channel.name().to_owned(),
             elements: (channel.elements())
                 .map(|element| element.name.to_owned())
@@ -173,6 +187,7 @@ mod tests {
             name: name.into(),
             elements: elements.iter().map(ToString::to_string).collect(),
             held,
+            beside: false,
         }
     }
 

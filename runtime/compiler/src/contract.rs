@@ -293,6 +293,7 @@ impl Contract {
             elements: vec![],
             min: None,
             max: None,
+            rendering: None,
         };
         // Always there: a contract is checked when it is parsed.
         self.with(role).next().unwrap_or(&NONE)

@@ -3,12 +3,16 @@
 //! Invariants of every implementation: the same [`EpisodeSeed`] and actions give the same observations, bit for bit, on one machine;
 //! completions are latched (a sub-task that is undone later still counts) and chronological; an action that is refused changes nothing.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
 use mujoco_rs::wrappers::{MjData, MjModel};
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 pub use lads_proof::episode::Completion;
+
+use crate::frames::Rendering;
 
 /// Simulator state and viewpoint, for pictures.
 pub struct Stage<'e> {
@@ -19,10 +23,11 @@ pub struct Stage<'e> {
 }
 
 /// Viewpoint of a camera.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum View {
     /// A camera of the scene, by its name.
-    Camera(&'static str),
+    Camera(Cow<'static, str>),
     /// A camera outside the scene's description.
     Free {
         /// Point that the camera looks at, in metres in the world's frame.
@@ -124,6 +129,18 @@ pub trait Environment: Send {
 
     /// Simulator state and viewpoint for pictures; `None` in an environment without a simulator.
     fn stage(&mut self) -> Option<Stage<'_>> {
+        None
+    }
+
+    /// How its benchmark's images are drawn; `None` in an environment without any.
+    fn rendering(&self) -> Option<Rendering> {
+        None
+    }
+
+    /// The scene for drawing its states, with meshes whose details are smaller than this many metres put together
+    /// ([`crate::frames::thin`]), or whole where it is 0; `None` in an environment without a simulator.
+    fn scenery(&self, mesh_cell_m: f64) -> Option<Result<MjModel, String>> {
+        let _ = mesh_cell_m;
         None
     }
 

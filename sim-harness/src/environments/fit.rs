@@ -9,6 +9,7 @@ use lads_compiler::contract::{Channel, DType, Element};
 use thiserror::Error;
 
 use crate::environment::Environment;
+use crate::sight::{self, SightError};
 
 /// Relative difference up to which two control periods count as equal: four times the rounding of the contract's `f32`.
 const PERIOD_TOLERANCE: f64 = 2.4e-7;
@@ -36,12 +37,15 @@ pub enum Misfit {
     },
     /// The policy observes something other than one vector.
     #[error(
-        "the contract's observation channels are {contract}, the environment gives one vector of numbers"
+        "the contract's observation channels are {contract}, the environment gives one vector of numbers and its cameras' frames"
     )]
     Channels {
         /// Names of the contract's observation channels.
         contract: String,
     },
+    /// Images are of something that no camera of the environment shows.
+    #[error(transparent)]
+    Images(#[from] SightError),
     /// Observation or action have different lengths.
     #[error("the contract's {field} has {contract} elements, the environment's has {environment}")]
     Len {
@@ -101,14 +105,18 @@ pub fn check(
             environment: simulated,
         });
     }
-    let observation = contract.observation();
-    if contract.observations().count() > 1 || observation.dtype != DType::F32 {
+    sight::renderings(contract)?;
+    let mut vectors = contract.observations().filter(|it| !sight::is_image(it));
+    let (observation, more) = (vectors.next(), vectors.next());
+    if more.is_some() || observation.is_some_and(|channel| channel.dtype != DType::F32) {
         let names = contract.observations().map(|channel| channel.name.as_str());
         return Err(Misfit::Channels {
             contract: names.collect::<Vec<_>>().join(", "),
         });
     }
-    same_elements("observation", observation, environment.observation_names())?;
+    if let Some(observation) = observation {
+        same_elements("observation", observation, environment.observation_names())?;
+    }
     same_elements("action", contract.action(), environment.action_names())?;
     contract
         .instructions

@@ -19,6 +19,7 @@ use crate::plans::PlanBook;
 use crate::random::Stream;
 use crate::results::{self, Asked};
 use crate::rollout::{Actor, Driver, Episode, Observer, RolloutError, Task, Timing};
+use crate::sight::{Sight, SightError};
 use crate::spoken::WordBook;
 use crate::trace::Trace;
 
@@ -90,6 +91,9 @@ pub enum EvaluationError {
     /// The bundle's table of instructions cannot be evaluated, so its image cannot be compared with it.
     #[error(transparent)]
     Bundle(lads_compiler::CompileError),
+    /// The policy's cameras cannot be drawn.
+    #[error(transparent)]
+    Sight(SightError),
     /// An episode could not be finished.
     #[error("episode {episode} of instruction {instruction}: {source}")]
     Rollout {
@@ -238,7 +242,9 @@ impl Evaluation<'_> {
         let controller = memory
             .controller_with(&self.policy, self.isa)
             .map_err(EvaluationError::Memory)?;
-        let mut driver = Driver::new(controller, environment.as_mut());
+        let sight = Sight::of(self.contract, &self.policy, environment.as_ref());
+        let sight = sight.map_err(EvaluationError::Sight)?;
+        let mut driver = Driver::new(controller, environment.as_mut(), sight);
         if self.setup.traced > 0 {
             driver.record();
         }

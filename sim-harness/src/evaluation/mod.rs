@@ -4,5 +4,6 @@ pub mod evaluate;
 pub mod faults;
 pub mod results;
 pub mod rollout;
+pub mod sight;
 pub mod spoken;
 pub mod table;

@@ -6,8 +6,8 @@
 use std::time::{Duration, Instant};
 
 use lads_core::{
-    ChannelId, Controller, Data, Decision, FollowError, Instruction, InstructionError, Noise,
-    Selected, StepError,
+    ChannelId, Controller, DType, Data, Decision, FollowError, Instruction, InstructionError,
+    Noise, Selected, StepError,
 };
 use rustix::time::{ClockId, clock_gettime};
 use thiserror::Error;
@@ -18,6 +18,7 @@ pub use lads_proof::timing::Timing;
 use crate::environment::{ActionError, Environment, EpisodeSeed};
 use crate::faults::{Faults, Link};
 use crate::random::Stream;
+use crate::sight::{Sight, SightError};
 use crate::trace::Step;
 
 /// Why an episode could not be finished.
@@ -49,6 +50,14 @@ pub enum RolloutError {
         step: usize,
         /// The environment's reason.
         error: ActionError,
+    },
+    /// A camera of the policy has no frame.
+    #[error("control step {step} has no frame: {error}")]
+    Sight {
+        /// Control step, from 0.
+        step: usize,
+        /// The reason.
+        error: SightError,
     },
     /// The observer stopped the episode.
     #[error("stopped by its observer")]
@@ -161,8 +170,10 @@ fn cpu_since(earlier: Duration) -> Duration {
 pub struct Driver<'a, 'm, 'e> {
     controller: Controller<'a, 'm>,
     environment: &'e mut dyn Environment,
-    /// Channel that the observation goes to.
-    channel: ChannelId,
+    /// Channel that the vector of numbers goes to; `None` for a policy that has cameras alone.
+    channel: Option<ChannelId>,
+    /// Cameras of the policy.
+    sight: Sight,
     observation: Vec<f32>,
     action: Vec<f32>,
     executed: Vec<f32>,
@@ -178,19 +189,25 @@ pub struct Driver<'a, 'm, 'e> {
 }
 
 impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
-    /// Joins a controller and an environment whose fit was checked (see [`crate::fit`]).
-    pub fn new(controller: Controller<'a, 'm>, environment: &'e mut dyn Environment) -> Self {
+    /// Joins a controller and an environment whose fit was checked (see [`crate::fit`]), with the policy's cameras.
+    pub fn new(
+        controller: Controller<'a, 'm>,
+        environment: &'e mut dyn Environment,
+        sight: Sight,
+    ) -> Self {
         let contract = controller.policy().contract();
         let limits = contract.action_limits();
         let limits = limits.map(|limits| (f64::from(limits.min), f64::from(limits.max)));
         let limits = limits.collect();
-        let channel = contract.observation().id();
+        let mut seen = contract.observations();
+        let channel = seen.find(|channel| channel.dtype() == DType::F32);
         let (observation_len, action_len) =
             (environment.observation_len(), environment.action_len());
         Self {
             controller,
             environment,
-            channel,
+            channel: channel.map(|channel| channel.id()),
+            sight,
             observation: vec![0.0; observation_len],
             action: vec![0.0; action_len],
             executed: vec![0.0; action_len],
@@ -253,7 +270,8 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         let reset_cpu = cpu_time();
         self.environment.reset(task.seed, task.commanded);
         let mut link = Link::new(task.faults, task.seed);
-        self.sense(&mut link);
+        let sees = task.actor == Actor::Policy;
+        self.sense(&mut link, sees, 0)?;
         self.executed.fill(0.0);
         self.timing.simulator_cpu += cpu_since(reset_cpu);
 
@@ -284,8 +302,8 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
                 }
                 Some(stream) => self.uniform_step(step, stream)?,
             }
-            self.sense(&mut link);
             step += 1;
+            self.sense(&mut link, sees, step)?;
         }
         let success = self.succeeded(task);
         let control = self.observe(task, Phase::Ended { success });
@@ -337,6 +355,9 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         step: usize,
         commanded: Option<Commanded<'_>>,
     ) -> Result<(Option<Selected>, u64), RolloutError> {
+        let numbers = Data::F32(&self.observation);
+        let numbers = self.channel.map(|channel| (channel, numbers));
+        let seen: Vec<_> = numbers.into_iter().chain(self.sight.given()).collect();
         let before_cpu = cpu_time();
         let start = Instant::now();
         let given = commanded.and_then(|given| {
@@ -346,22 +367,20 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         let selected = match given {
             None => self
                 .controller
-                .step(&self.observation, &mut self.action)
+                .step_with(&seen, &mut self.action)
                 .map_err(|error| RolloutError::Step { step, error })
                 .map(|report| report.selected),
-            Some((index, period)) => {
-                let seen = [(self.channel, Data::F32(&self.observation))];
-                self.controller
-                    .follow(&seen, index, &mut self.action)
-                    .map_err(|error| RolloutError::Follow { step, error })
-                    .map(|()| {
-                        Some(Selected {
-                            index,
-                            margin: f32::INFINITY,
-                            fresh: step.is_multiple_of(period),
-                        })
+            Some((index, period)) => self
+                .controller
+                .follow(&seen, index, &mut self.action)
+                .map_err(|error| RolloutError::Follow { step, error })
+                .map(|()| {
+                    Some(Selected {
+                        index,
+                        margin: f32::INFINITY,
+                        fresh: step.is_multiple_of(period),
                     })
-            }
+                }),
         };
         let elapsed_ns = nanoseconds(start.elapsed());
         self.timing.controller_cpu += cpu_since(before_cpu);
@@ -374,10 +393,16 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         Ok((selected, elapsed_ns))
     }
 
-    /// Updates what the policy sees from the environment, through the link's faults.
-    fn sense(&mut self, link: &mut Link) {
+    /// Updates what the policy sees from the environment, through the link's faults; `step` is the step that sees
+    /// it, and frames are drawn only if it `sees`.
+    fn sense(&mut self, link: &mut Link, sees: bool, step: usize) -> Result<(), RolloutError> {
         let (observation, state) = (self.environment.observation(), self.environment.state());
         link.sense(observation, state, &mut self.observation);
+        if sees {
+            let looked = self.sight.look(state);
+            looked.map_err(|error| RolloutError::Sight { step, error })?;
+        }
+        Ok(())
     }
 
     /// Applies the executed action to the environment.
@@ -404,7 +429,9 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         };
         let margin = selected.map(|selected| selected.margin);
         recording.push(Step {
-            observation: self.observation.clone(),
+            observation: (self.channel)
+                .map(|_| self.observation.clone())
+                .unwrap_or_default(),
             action: self.action.clone(),
             executed: self.executed.clone(),
             plan: selected.map(|selected| selected.index),

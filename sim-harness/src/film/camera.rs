@@ -13,16 +13,33 @@ use mujoco_rs::wrappers::{MjData, MjModel};
 use super::FilmError;
 use crate::environment::{Environment, Stage, View};
 
-/// Edge of the shadow map in texels; 0 draws no shadows.
-const SHADOW_SIZE: i32 = 0;
-/// Number of samples per pixel.
-const SAMPLES: i32 = 4;
+/// Size, samples and shadows of a picture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Quality {
+    /// Width and height in pixels.
+    pub size: [u32; 2],
+    /// Samples per pixel.
+    pub samples: i32,
+    /// Edge of the shadow map in texels; 0 for no shadows.
+    pub shadow_size: i32,
+}
+
+impl Quality {
+    /// Returns the quality of films and windows.
+    fn film(size: [u32; 2]) -> Self {
+        Self {
+            size,
+            samples: 4,
+            shadow_size: 0,
+        }
+    }
+}
 
 /// Draws pictures of one size of the simulator's state.
 pub struct Camera {
     renderer: MjRenderer,
     model: MjModel,
-    size: [u32; 2],
+    quality: Quality,
 }
 
 /// Motions of a free camera.
@@ -43,29 +60,31 @@ impl Camera {
     pub fn new(environment: &mut dyn Environment, size: [u32; 2]) -> Result<Self, FilmError> {
         let stage = stage(environment)?;
         let model = MjModel::clone(stage.data.model());
-        let camera = camera(&model, stage.view)?;
-        Self::build(model, camera, size)
+        Self::of(model, &stage.view, Quality::film(size))
+    }
+
+    /// A camera in a scene of its own.
+    pub(crate) fn of(model: MjModel, view: &View, quality: Quality) -> Result<Self, FilmError> {
+        let camera = camera(&model, view)?;
+        Self::build(model, camera, quality)
     }
 
     /// Makes a camera that [`steer`](Self::steer) can move: a camera of the scene is replaced by a free one at its place after a reset.
     pub fn free(environment: &mut dyn Environment, size: [u32; 2]) -> Result<Self, FilmError> {
         let stage = stage(environment)?;
         let mut model = MjModel::clone(stage.data.model());
-        let mut camera = camera(&model, stage.view)?;
+        let mut camera = camera(&model, &stage.view)?;
         if let View::Camera(_) = stage.view {
             camera = freed(&camera, stage.data, &mut model);
         }
-        Self::build(model, camera, size)
+        Self::build(model, camera, Quality::film(size))
     }
 
-    fn build(
-        mut model: MjModel,
-        camera: MjvCamera,
-        [width, height]: [u32; 2],
-    ) -> Result<Self, FilmError> {
+    fn build(mut model: MjModel, camera: MjvCamera, quality: Quality) -> Result<Self, FilmError> {
         let visual = model.vis_mut();
-        visual.quality.shadowsize = SHADOW_SIZE;
-        visual.quality.offsamples = SAMPLES;
+        let [width, height] = quality.size;
+        visual.quality.shadowsize = quality.shadow_size;
+        visual.quality.offsamples = quality.samples;
         visual.global.offwidth = width as i32;
         visual.global.offheight = height as i32;
         let renderer = MjRenderer::builder()
@@ -77,19 +96,26 @@ impl Camera {
         Ok(Self {
             renderer,
             model,
-            size: [width, height],
+            quality,
         })
     }
 
     /// Sets the size of the following pictures.
     pub fn resize(&mut self, size: [u32; 2]) -> Result<(), FilmError> {
-        *self = Self::build(self.model.clone(), self.renderer.camera().clone(), size)?;
+        *self = Self::build(
+            self.model.clone(),
+            self.renderer.camera().clone(),
+            Quality {
+                size,
+                ..self.quality
+            },
+        )?;
         Ok(())
     }
 
     /// Width and height of the pictures in pixels.
     pub fn size(&self) -> [u32; 2] {
-        self.size
+        self.quality.size
     }
 
     /// Moves a free camera by a share of the picture's height, to the right and down.
@@ -154,12 +180,12 @@ fn stage(environment: &mut dyn Environment) -> Result<Stage<'_>, FilmError> {
     environment.stage().ok_or(FilmError::NoStage(id))
 }
 
-fn camera(model: &MjModel, view: View) -> Result<MjvCamera, FilmError> {
+fn camera(model: &MjModel, view: &View) -> Result<MjvCamera, FilmError> {
     match view {
         View::Camera(name) => model
             .name_to_id(MjtObjBase::mjOBJ_CAMERA, name)
             .map(MjvCamera::new_fixed)
-            .ok_or(FilmError::NoCamera(name)),
+            .ok_or_else(|| FilmError::NoCamera(name.to_string())),
         View::Free {
             look_at,
             distance,
@@ -167,10 +193,10 @@ fn camera(model: &MjModel, view: View) -> Result<MjvCamera, FilmError> {
             elevation,
         } => Ok(MjvCamera {
             type_: MjtCamera::mjCAMERA_FREE as i32,
-            lookat: look_at,
-            distance,
-            azimuth,
-            elevation,
+            lookat: *look_at,
+            distance: *distance,
+            azimuth: *azimuth,
+            elevation: *elevation,
             ..MjvCamera::default()
         }),
     }

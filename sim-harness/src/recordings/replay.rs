@@ -5,8 +5,8 @@
 //! refuses.
 
 use lads_core::{
-    Channel, Contract, Data, Decision, FollowError, Instruction, InstructionError, Isa, Noise,
-    Policy, StepError,
+    Channel, Contract, DType, Data, Decision, FollowError, Instruction, InstructionError, Isa,
+    Noise, Policy, StepError,
 };
 use lads_host::{Memory, MemoryError};
 use thiserror::Error;
@@ -27,6 +27,9 @@ pub enum ReplayError {
         /// The value in the policy.
         policy: String,
     },
+    /// A log has no frames.
+    #[error("the policy sees images, which a log does not hold")]
+    Images,
     /// The policy does not know a recorded instruction.
     #[error("the policy does not know the recorded instruction '{0}'")]
     Instruction(String),
@@ -168,6 +171,9 @@ fn fits(contract: &Contract<'_>, period: Option<usize>, log: &Log) -> Result<(),
         }
         Err(ReplayError::Sizes { what, log, policy })
     };
+    if contract.observations().any(|it| it.dtype() != DType::F32) {
+        return Err(ReplayError::Images);
+    }
     elements(
         "observation",
         &origin.observation_names,

@@ -61,6 +61,9 @@ pub struct Channel {
     /// Largest value of any element, for a channel without elements of its own.
     #[serde(default)]
     pub max: Option<f32>,
+    /// How a simulator draws the frames of a camera, in the simulator's own terms; never part of an image.
+    #[serde(default)]
+    pub rendering: Option<serde_json::Value>,
 }
 
 impl Channel {

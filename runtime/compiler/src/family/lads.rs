@@ -8,6 +8,8 @@
 //! t % H == 0   lookup: index             -> plan
 //! every t      act:    (s_t, plan)       -> a_t
 //! ```
+//!
+//! Where the contract says `features`, an encoder runs first in every step, and both levels read what it gives instead.
 
 use lads_image::records::Event;
 use serde::Deserialize;
@@ -24,6 +26,10 @@ pub struct Lads {
     pub codebook: Codebook,
     /// Rule by which plans are picked.
     pub decision: Decision,
+    /// Elements of what an encoder makes of the observations, such as camera frames, once in a control step for both levels; without it
+    /// they read the observations themselves.
+    #[serde(default)]
+    pub features: Option<usize>,
 }
 
 impl Kind for Lads {
@@ -41,6 +47,7 @@ impl Kind for Lads {
             ("codebook.size", self.codebook.size),
             ("codebook.dim", self.codebook.dim),
         ])?;
+        lengths([("features", self.features.unwrap_or(1))])?;
         self.decision.check()?;
         instructed(contract)
     }
@@ -49,7 +56,7 @@ impl Kind for Lads {
         let (start, step, record) = ("high_level/start", "high_level/step", "high_level/record");
         let (lookup, act) = ("codebook/lookup", "low_level/act");
         let encode = "trajectory_encoder/encode";
-        Blueprint::default()
+        self.observed()
             .kv("context", contract.network)
             .plain("logits")
             .wide(self.codebook.size, "family.codebook.size")
@@ -76,5 +83,21 @@ impl Kind for Lads {
             .call(Call::on(Event::Follow, lookup))
             .call(Call::on(Event::Follow, act))
             .call(Call::on(Event::Encode, encode))
+    }
+}
+
+impl Lads {
+    /// The encoder of observations, where there is one.
+    fn observed(&self) -> Blueprint {
+        let Some(width) = self.features else {
+            return Blueprint::default();
+        };
+        let (encoder, features) = ("observation_encoder/encode", "features");
+        Blueprint::default()
+            .handed(features)
+            .wide(width, "family.features")
+            .entry(Entry::new(encoder, &[features]).acts())
+            .call(Call::step(encoder))
+            .call(Call::on(Event::Follow, encoder))
     }
 }

@@ -88,6 +88,9 @@ pub enum Job {
     View(Rollouts),
     /// Run the episodes, and film one of the first instruction (needs the cargo feature `record`, and EGL, which needs no display)
     Record(Record),
+    /// Draw what the environment's camera sees in every state of a dataset, for training on images (needs the cargo feature `camera`, and
+    /// EGL); goes on where it was stopped
+    Frames(Frames),
 }
 
 /// Options that choose the policy and how its kernels run.
@@ -308,6 +311,22 @@ pub struct Record {
     pub episode: u32,
     #[command(flatten)]
     pub rollouts: Rollouts,
+}
+
+/// Options of `lads-run frames`.
+#[derive(Debug, Args)]
+pub struct Frames {
+    /// The dataset, made by lads-collect
+    pub data: PathBuf,
+    /// The frames, a safetensors file: a cache, which the dataset makes again
+    #[arg(short, long, value_name = "FILE")]
+    pub output: PathBuf,
+    /// How they are drawn, as JSON (its form: the `rendering` of a bundle's image channel); left out, as the environment's benchmark has it
+    #[arg(long, value_name = "FILE")]
+    pub rendering: Option<PathBuf>,
+    /// Threads; left out, one per core
+    #[arg(long)]
+    pub threads: Option<usize>,
 }
 
 /// What a job needs of its episodes, in a form common to all jobs.

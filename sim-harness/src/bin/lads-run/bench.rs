@@ -12,6 +12,7 @@ use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, Setup};
 use lads_sim::faults::Faults;
 use lads_sim::results::{self, Results};
 use lads_sim::rollout::Actor;
+use lads_sim::sight;
 use lads_sim::{assets, fit, plans, registry};
 
 use crate::arguments::Wanted;
@@ -58,6 +59,18 @@ pub fn with<R>(
             "{model}: {misfit}; use a bundle made for this environment"
         ))
     })?;
+    let images = contract.observations().any(sight::is_image);
+    if images {
+        // Its cameras, before the first episode.
+        let sight = sight::Sight::of(contract, &policy, environment.as_ref());
+        let model = wanted.policy.model.display();
+        sight.map_err(|error| refused(format!("{model}: {error}")))?;
+    }
+    if images && wanted.faults != Faults::default() {
+        return Err(refused(
+            "the policy sees images, which no fault delays or loses; leave the faults out",
+        ));
+    }
     heard.words.sentence = chosen.sentence(wanted, environment.as_ref())?;
     let assignments: Vec<_> = (0..)
         .zip(commanded)

@@ -10,6 +10,7 @@
 mod arguments;
 mod bench;
 mod end;
+mod frames;
 mod language;
 mod program;
 mod record;
@@ -69,6 +70,7 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
         Job::Tune(asked) => tune::run(asked, &stop),
         Job::Replay(replay) => recordings::replay(replay),
         Job::Encode(encode) => recordings::encode(encode),
+        Job::Frames(asked) => frames::run(asked, &stop),
         Job::Sweep(asked) => sweep::run(asked, &stop),
         Job::View(asked) => {
             let extra = Extra {

@@ -14,6 +14,7 @@ use std::sync::atomic::AtomicBool;
 
 use lads_sim::evaluate::Setup;
 use lads_sim::output;
+use lads_sim::sight::is_image;
 
 use crate::arguments::{Sweep as Asked, Wanted};
 use crate::bench;
@@ -110,6 +111,11 @@ pub fn run(asked: &Asked, stop: &AtomicBool) -> Result<ExitCode, End> {
         judged: true,
     };
     bench::with(&wanted, stop, |bench| {
+        if bench.evaluation.contract.observations().any(is_image) {
+            return Err(refused(
+                "the policy sees images, which no fault delays or loses; sweep one that observes numbers",
+            ));
+        }
         // Before the policy moves anything.
         print(&bench.heard.first)?;
         let sweep = sweep(|faults, what| {

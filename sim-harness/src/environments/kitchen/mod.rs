@@ -6,17 +6,18 @@
 
 pub mod spec;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use mujoco_rs::prelude::MjtObjBase;
-use mujoco_rs::wrappers::{MjData, MjModel};
+use mujoco_rs::wrappers::{MjData, MjModel, MjSpec};
 use thiserror::Error;
 
 use crate::assets::{MissingAssets, OtherMujoco, asset, check_mujoco, remedy};
 use crate::environment::{
     ActionError, Completion, Environment, EpisodeSeed, Stage, View, check_action,
 };
+use crate::frames::{Rendering, thin};
 use crate::random::Stream;
 pub use spec::Noise;
 use spec::{
@@ -34,7 +35,7 @@ pub const VERSION: &str = "1";
 const GRIPPER: &str = "end_effector";
 
 /// Viewpoint of FrankaKitchen-v1's own camera.
-const VIEW: View = View::Free {
+pub(crate) const VIEW: View = View::Free {
     look_at: [-0.2, 0.5, 2.0],
     distance: 2.2,
     azimuth: 70.0,
@@ -65,6 +66,7 @@ pub enum SceneError {
 /// The compiled scene. Loaded once (about a second), then shared by all threads.
 #[derive(Clone)]
 pub struct Scene {
+    path: PathBuf,
     model: Arc<MjModel>,
 }
 
@@ -88,12 +90,13 @@ impl Scene {
         let model = Arc::new(model);
         // Every worker needs a state of its own; without memory for one there is nothing to begin.
         MjData::try_new(Arc::clone(&model)).map_err(|error| refused(error.to_string()))?;
-        Ok(Self { model })
+        Ok(Self { path, model })
     }
 }
 
 /// Franka Kitchen with a simulator state of its own, one per worker.
 pub struct Kitchen {
+    scene: Scene,
     data: MjData<Arc<MjModel>>,
     /// Index of the site between the fingers.
     gripper: usize,
@@ -108,6 +111,7 @@ impl Kitchen {
     /// Makes an environment at the start of episode (0, 0, 0).
     pub fn new(scene: &Scene, noise: Noise) -> Self {
         let mut kitchen = Self {
+            scene: scene.clone(),
             data: MjData::new(Arc::clone(&scene.model)),
             // Past the end where the scene has none.
             gripper: scene
@@ -238,6 +242,15 @@ impl Environment for Kitchen {
             data: &mut self.data,
             view: VIEW,
         })
+    }
+
+    fn rendering(&self) -> Option<Rendering> {
+        Some(spec::rendering(VIEW))
+    }
+
+    fn scenery(&self, mesh_cell_m: f64) -> Option<Result<MjModel, String>> {
+        let scene = MjSpec::from_xml(&self.scene.path).map_err(|error| error.to_string());
+        Some(scene.and_then(|scene| thin::thinned(scene, &self.scene.model, mesh_cell_m)))
     }
 }
 

@@ -3,6 +3,9 @@
 //! Elements of an observation (30): arm joints 1-7 \[rad\], fingers \[m\], four knobs each followed by its burner, light switch and light,
 //! slide cabinet \[m\], left and right hinge cabinet, microwave \[rad\], kettle position \[m\] and quaternion (w, x, y, z).
 
+use crate::environment::View;
+use crate::frames::Rendering;
+
 /// Elements of an observation, equal to the model's generalised positions.
 pub const OBSERVATION_LEN: usize = 30;
 /// Elements of an action: seven arm joints, two fingers.
@@ -229,5 +232,19 @@ impl std::str::FromStr for Noise {
             .into_iter()
             .find(|noise| noise.name() == name)
             .ok_or_else(|| format!("unknown noise level \"{name}\": use none, v0 or v1"))
+    }
+}
+/// The paper's images: 4:3 pictures squeezed to 224x224; without shadows, which would take twenty times as long without a GPU.
+pub fn rendering(view: View) -> Rendering {
+    Rendering {
+        view,
+        size: [224, 224],
+        drawn: [224, 298],
+        samples: 4,
+        shadow_size: 0,
+        shadow_clip: 1.0,
+        reflections: false,
+        hidden: Vec::new(),
+        mesh_cell_m: 0.008,
     }
 }

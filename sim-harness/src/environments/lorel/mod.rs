@@ -11,7 +11,8 @@ pub mod collect;
 pub mod label;
 pub mod spec;
 
-use std::path::Path;
+use std::borrow::Cow;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 
 use mujoco_rs::prelude::{MjtObjBase, MjtState};
@@ -22,6 +23,7 @@ use crate::assets::{MissingAssets, OtherMujoco, asset, check_mujoco, remedy};
 use crate::environment::{
     ActionError, Completion, Environment, EpisodeSeed, Stage, View, check_action,
 };
+use crate::frames::{Rendering, thin};
 use crate::random::Stream;
 use spec::{
     ACTION_LEN, ACTION_NAMES, ACTION_SCALE, BLACK_MUG, COMPOSITE, CONTROL_PERIOD_S, DRAWER,
@@ -44,7 +46,7 @@ pub const POSTURES: usize = 256;
 /// Body that marks the gripper in pictures.
 const HAND: &str = "hand";
 /// Viewpoint of LOReL's images.
-const VIEW: View = View::Camera("cam0");
+pub(crate) const VIEW: View = View::Camera(Cow::Borrowed("cam0"));
 const SCENE: &str = include_str!("scene.xml");
 /// Folder of the scene's assets in the vendor folder, and one file of it.
 const ASSETS: &str = "assets/metaworld";
@@ -72,6 +74,8 @@ pub enum SceneError {
 /// The compiled scene and the settled postures, shared by all threads.
 #[derive(Clone)]
 pub struct Scene {
+    /// Folder of the meshes.
+    folder: PathBuf,
     model: Arc<MjModel>,
     postures: Arc<[OnceLock<Box<[f64]>>]>,
 }
@@ -82,20 +86,16 @@ impl Scene {
         check_mujoco()?;
         asset(vendor, ONE_ASSET)?;
         let refused = |reason: String| SceneError::Refused(reason);
-        let mut scene =
-            MjSpec::from_xml_string(SCENE).map_err(|error| refused(error.to_string()))?;
         let folder = vendor.join(ASSETS);
-        let folder = folder
-            .to_str()
-            .ok_or_else(|| refused(format!("{} is not UTF-8", folder.display())))?;
-        scene.set_modelfiledir(folder);
-        let model = scene
+        let model = specification(&folder)
+            .map_err(refused)?
             .compile()
             .map_err(|error| refused(error.to_string()))?;
         let model = Arc::new(model);
         // Every worker needs a state of its own; without memory for one there is nothing to begin.
         MjData::try_new(Arc::clone(&model)).map_err(|error| refused(error.to_string()))?;
         Ok(Self {
+            folder,
             model,
             postures: (0..=POSTURES).map(|_| OnceLock::new()).collect(),
         })
@@ -126,6 +126,14 @@ impl Scene {
             data.state(FULL_STATE)
         })
     }
+}
+
+/// The scene before it is compiled, with the meshes of a folder.
+fn specification(folder: &Path) -> Result<MjSpec, String> {
+    let mut scene = MjSpec::from_xml_string(SCENE).map_err(|error| error.to_string())?;
+    let named = folder.to_str();
+    scene.set_modelfiledir(named.ok_or_else(|| format!("{} is not UTF-8", folder.display()))?);
+    Ok(scene)
 }
 
 fn advance(data: &mut MjData<Arc<MjModel>>, physics_steps: usize) {
@@ -338,6 +346,16 @@ impl Environment for Lorel {
             data: &mut self.data,
             view: VIEW,
         })
+    }
+
+    fn rendering(&self) -> Option<Rendering> {
+        Some(spec::rendering(VIEW))
+    }
+
+    fn scenery(&self, mesh_cell_m: f64) -> Option<Result<MjModel, String>> {
+        let Scene { folder, model, .. } = &self.scene;
+        let scene = specification(folder);
+        Some(scene.and_then(|scene| thin::thinned(scene, model, mesh_cell_m)))
     }
 
     fn succeeded(&self, commanded: &[usize]) -> bool {

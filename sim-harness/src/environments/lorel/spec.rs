@@ -5,6 +5,9 @@
 
 use std::f64::consts::{FRAC_1_SQRT_2, PI};
 
+use crate::environment::View;
+use crate::frames::Rendering;
+
 /// Elements of an observation.
 pub const OBSERVATION_LEN: usize = 15;
 /// Elements of an action: three of the hand's displacement, one without effect, the gripper.
@@ -167,3 +170,19 @@ pub const SUB_TASK_NAMES: [&str; SUB_TASKS.len()] = {
     }
     names
 };
+
+/// The benchmark's images, 64x64 of its own camera, with what cannot be told apart at that size left out: the floor's mirror image, most of
+/// the shadow map, the parts of the arm that the camera does not see, and the fine detail of its meshes.
+pub fn rendering(view: View) -> Rendering {
+    Rendering {
+        view,
+        size: [64, 64],
+        drawn: [64, 64],
+        samples: 4,
+        shadow_size: 512,
+        shadow_clip: 0.3,
+        reflections: false,
+        hidden: ["base", "head"].map(str::to_owned).to_vec(),
+        mesh_cell_m: 0.012,
+    }
+}

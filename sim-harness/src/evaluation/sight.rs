@@ -1,0 +1,143 @@
+//! What cameras show a policy: after every control step, frames of the state that the environment is in.
+//!
+//! A channel of bytes is a camera's where its contract says how its frames are drawn ([`crate::frames::Rendering`]). A frame that could
+//! not be drawn is an error, never an old one. What can fail: a rendering of something else than the channel, no EGL, a build without
+//! cameras.
+
+use lads_compiler::Contract;
+use lads_compiler::contract::{Channel, DType};
+use lads_core::{ChannelId, Data, Policy};
+use thiserror::Error;
+
+use crate::environment::Environment;
+use crate::frames::Rendering;
+
+/// Why a policy sees nothing.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum SightError {
+    /// A channel's rendering cannot be read, or is of frames of another size.
+    #[error("channel `{channel}` of the contract: {wrong}")]
+    Channel {
+        /// Its name.
+        channel: String,
+        /// What is wrong with it.
+        wrong: String,
+    },
+    /// There is no renderer.
+    #[cfg(not(feature = "camera"))]
+    #[error(
+        "the policy sees images, and this program was built without cameras; build it with --features camera"
+    )]
+    NoCamera,
+    /// A frame cannot be drawn.
+    #[error("{0}")]
+    Draw(String),
+}
+
+/// How the frames of a contract's image channels are drawn, in the order of the channels; refuses what is no image.
+pub fn renderings(contract: &Contract) -> Result<Vec<(&Channel, Rendering)>, SightError> {
+    let images = contract.observations().filter(|channel| is_image(channel));
+    images
+        .map(|channel| {
+            let wrong = |wrong: String| SightError::Channel {
+                channel: channel.name.clone(),
+                wrong,
+            };
+            let said = channel.rendering.clone();
+            let said = said.ok_or_else(|| wrong("it does not say how it is rendered".into()))?;
+            let rendering: Rendering = serde_json::from_value(said)
+                .map_err(|error| wrong(format!("its rendering cannot be read: {error}")))?;
+            rendering.check().map_err(wrong)?;
+            let [rows, columns] = rendering.size.map(|side| side as usize);
+            if channel.dtype != DType::U8 || channel.shape != [rows, columns, 3] {
+                return Err(wrong(format!(
+                    "its shape is {:?}, its rendering is of {rows} by {columns} pixels of 3 bytes",
+                    channel.shape
+                )));
+            }
+            Ok((channel, rendering))
+        })
+        .collect()
+}
+
+/// Whether a channel is no vector of numbers.
+pub fn is_image(channel: &Channel) -> bool {
+    channel.dtype == DType::U8 || channel.rendering.is_some()
+}
+
+/// The cameras of a policy with what they show now.
+#[derive(Default)]
+pub struct Sight {
+    shown: Vec<(ChannelId, Vec<u8>)>,
+    #[cfg(feature = "camera")]
+    frames: Vec<crate::frames::Frames>,
+}
+
+impl Sight {
+    /// The cameras that a contract asks for, in the scene of `environment`; none for a policy without.
+    pub fn of(
+        contract: &Contract,
+        policy: &Policy<'_>,
+        environment: &dyn Environment,
+    ) -> Result<Self, SightError> {
+        let mut sight = Self::default();
+        for (channel, rendering) in renderings(contract)? {
+            let id = policy.contract().find(&channel.name).map(|own| own.id());
+            let id = id.ok_or_else(|| SightError::Channel {
+                channel: channel.name.clone(),
+                wrong: "the image has no such channel".into(),
+            })?;
+            sight.add(id, environment, &rendering)?;
+        }
+        Ok(sight)
+    }
+
+    #[cfg(feature = "camera")]
+    fn add(
+        &mut self,
+        id: ChannelId,
+        environment: &dyn Environment,
+        rendering: &Rendering,
+    ) -> Result<(), SightError> {
+        let frames = crate::frames::Frames::new(environment, rendering);
+        self.frames
+            .push(frames.map_err(|error| SightError::Draw(error.to_string()))?);
+        self.shown.push((id, vec![0; rendering.frame_len()]));
+        Ok(())
+    }
+
+    #[cfg(not(feature = "camera"))]
+    fn add(&mut self, _: ChannelId, _: &dyn Environment, _: &Rendering) -> Result<(), SightError> {
+        Err(SightError::NoCamera)
+    }
+
+    /// Looks at a state of the scene.
+    #[cfg(feature = "camera")]
+    pub fn look(&mut self, positions: &[f64]) -> Result<(), SightError> {
+        for ((_, shown), frames) in self.shown.iter_mut().zip(&mut self.frames) {
+            let frame = frames.draw(positions);
+            let frame = frame.map_err(|error| SightError::Draw(error.to_string()))?;
+            if frame.len() != shown.len() {
+                let wrong = format!(
+                    "a frame has {} bytes instead of {}",
+                    frame.len(),
+                    shown.len()
+                );
+                return Err(SightError::Draw(wrong));
+            }
+            shown.copy_from_slice(frame);
+        }
+        Ok(())
+    }
+
+    /// Looks at nothing: there is no camera.
+    #[cfg(not(feature = "camera"))]
+    pub fn look(&mut self, _: &[f64]) -> Result<(), SightError> {
+        Ok(())
+    }
+
+    /// What the cameras show.
+    pub fn given(&self) -> impl Iterator<Item = (ChannelId, Data<'_>)> {
+        self.shown.iter().map(|(id, shown)| (*id, Data::U8(shown)))
+    }
+}
