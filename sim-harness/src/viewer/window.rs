@@ -166,7 +166,7 @@ impl<'s> Screen<'s> {
                 self.show.ask(|request| {
                     request.single += u32::from(request.paused);
                     request.paused = true;
-                })
+                });
             }
             Key::Character("+" | "=") => self.show.ask(|request| request.pace.change(1)),
             Key::Character("-") => self.show.ask(|request| request.pace.change(-1)),
