@@ -194,9 +194,6 @@ pub fn of_bundle(bundle: &Bundle) -> Result<Value, CompileError> {
 }
 
 fn bundle_channel(channel: &lads_compiler::contract::Channel) -> Channel<'_> {
-    fn text(text: &Option<String>) -> &str {
-        text.as_deref().unwrap_or_default()
-    }
     let (min, max) = channel.limits();
     Channel {
         name: &channel.name,
@@ -214,11 +211,11 @@ fn bundle_channel(channel: &lads_compiler::contract::Channel) -> Channel<'_> {
                 unit: &element.unit,
                 min: element.min,
                 max: element.max,
-                joint: text(&element.joint),
-                interface: text(&element.interface),
+                joint: element.joint.as_deref().unwrap_or_default(),
+                interface: element.interface.as_deref().unwrap_or_default(),
                 scale: element.scale,
                 offset: element.offset,
-                physical_unit: text(&element.physical_unit),
+                physical_unit: element.physical_unit.as_deref().unwrap_or_default(),
             })
             .collect(),
     }
