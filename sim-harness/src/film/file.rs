@@ -144,7 +144,7 @@ impl Sink {
         }
     }
 
-    /// Adds a picture; `last` gives it [`LAST_S`].
+    /// Adds a picture; `last` gives it the display time of a last picture.
     pub fn add(&mut self, canvas: &Canvas, last: bool) -> Result<(), FilmError> {
         let seconds = if last { LAST_S } else { self.shown_s };
         match &mut self.kind {
