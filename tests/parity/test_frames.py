@@ -1,8 +1,8 @@
 """Frames of the harness against MuJoCo's own renderer in Python, on stored states of the LOReL table.
 
 With whole meshes the same libraries draw the same triangles: the mean absolute difference (MAD, of 8-bit channels) is below 0.1, which leaves
-room for two versions of Mesa. What ships draws the arm with fewer faces: its MAD to whole meshes is below 2 (measured 1.5), and to the scene's
-full quality (shadows of 4096, reflections) below 2.5.
+room for two versions of Mesa. What ships draws the arm with fewer faces: its MAD to whole meshes is below 2 (measured 1.0), and to the scene's
+full quality (shadows of 4096, reflections) below 2.5 (measured 1.2).
 
 Run with `python -m pytest tests/parity` after `cargo build -p lads-sim --features record`; skipped where mujoco, EGL or the programs are missing.
 """

@@ -107,6 +107,7 @@ impl Sight {
     }
 
     #[cfg(not(feature = "camera"))]
+    #[expect(clippy::unused_self, reason = "nothing can be added")]
     fn add(&mut self, _: ChannelId, _: &dyn Environment, _: &Rendering) -> Result<(), SightError> {
         Err(SightError::NoCamera)
     }
