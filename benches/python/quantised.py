@@ -7,7 +7,7 @@ with what its own tool, `quantize_dynamic` at its defaults, makes of each entry:
 step. In one more the low level keeps its floats. All run in this process, one thread, called from Python.
 
 First every contender is asked the reference's questions, open loop: how many decisions select PyTorch's index, and how far an action is off while the
-same plan is in force. Then the time: in each round every contender steps through the same recorded episode, hot and then at 50 Hz, in the next round
+same plan is in force. Bytes are those of lads' image, and of the weights of ONNX Runtime's sessions. Then the time: in each round every contender steps through the same recorded episode, hot and then at 50 Hz, in the next round
 in the opposite order. A ratio is taken between two medians of the same round; printed is the median of these, with quartiles.
 What can fail ends with Python's exception.
 """
@@ -195,7 +195,7 @@ def main():
                 rounds[pace, name].append(timed(contenders[name], known, seen, decided, period))
     print(f"ONNX Runtime {onnxruntime.__version__}, {asked.rounds} rounds of {len(seen)} steps; ratio: lads over the other, median (quartiles)")
     columns = [f"{pace}: {kind}" for pace in paces for kind in ("ordinary, us", "ratio", "decision, us")]
-    print("| | bytes of weights | same index | largest action difference | " + " | ".join(columns) + " |")
+    print("| | bytes | same index | largest action difference | " + " | ".join(columns) + " |")
     print("|" + "---|" * (4 + len(columns)))
     for name in contenders:
         share, decisions, largest = found[name]
