@@ -25,7 +25,7 @@ fn run_on_targets(bytes: &[u8]) -> String {
     fs::write(&source, text).expect("it can be written");
     let output = Command::new(project_path("runtime/ffi/examples/targets/run.sh"))
         .arg(&source)
-        .env("LADS_OPS", "lads")
+        .env("LADS_OPS", "lads,integer-weights,half-cache")
         .output()
         .expect("the script runs");
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
