@@ -212,7 +212,7 @@ fn inspect_lists_all_that_a_foreign_file_misses() {
     }
     let text = answer(&["inspect", &path], "");
     for part in [
-        "no policy yet",
+        "not a policy yet",
         "obs: float32 [batch, 5]",
         "operators that are missing (3)",
         "Mystery `first/Mystery` of a [1, 5]",

@@ -265,9 +265,9 @@ fn caches_have_the_rows_that_the_longest_context_needs() {
 #[test]
 fn work_is_stated_as_it_is_and_limited_by_the_caller() {
     let queue = shapes::queue();
-    // Three products of two elements and the four ops around them; a gathered row and its op; one more per op.
+    // Three products of two elements, copied into one row of six; a gathered row of two; one more for each of the seven ops.
     let work = queue.contract.worst_work;
-    assert_eq!(work, 6 + 6 + 1);
+    assert_eq!(work, 6 + 6 + 2 + 7);
     for stated in [0, work - 1, work + 1, u64::MAX] {
         let fault = queue.fault(|parts| parts.contract.worst_work = stated);
         assert_eq!(

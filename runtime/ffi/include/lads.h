@@ -256,7 +256,7 @@ typedef int32_t lads_status;
  * Largest stack, in bytes, that a call of the library takes: measured on x86-64 with all functions
  * of the archive.
  */
-#define LADS_STACK_BYTES 7896
+#define LADS_STACK_BYTES 9112
 
 /**
  * Number that stands for no channel, element or other index.

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use lads_compiler::{Bundle, Image, compile};
+use lads_compiler::{Bundle, Image, Options, compile, compile_with};
 use lads_ffi::LADS_STACK_BYTES;
 
 /// Functions that an archive may require from its environment: those that compilers call on their
@@ -20,6 +20,9 @@ const STRICT: [&str; 4] = ["-Wall", "-Wextra", "-Werror", "-pedantic"];
 /// Largest size, in bytes, of machine code and constants of a stripped program with the operations
 /// of one family of policies.
 const MOST_TEXT: usize = 200 * 1024;
+
+/// Largest size of the same program with the number formats of the shipped policies as tuned.
+const MOST_TEXT_TUNED: usize = 240 * 1024;
 
 /// Largest size, in bytes, of machine code and constants of a stripped program with all operations.
 /// The operations on images are 80 KB of it, most of that convolutions and pools for three
@@ -45,7 +48,7 @@ fn prefix() -> &'static Path {
     })
 }
 
-/// Returns the shipped policy's image, in a file.
+/// Returns the shipped policy's image, in a file, as it was tuned.
 fn kitchen() -> &'static Path {
     static IMAGE: OnceLock<PathBuf> = OnceLock::new();
     IMAGE.get_or_init(|| {
@@ -54,6 +57,15 @@ fn kitchen() -> &'static Path {
             .expect("it can be written");
         path
     })
+}
+
+/// Returns the shipped policy's image, in a file, with all numbers stored with 32 bits.
+fn exact_kitchen() -> PathBuf {
+    let bundle = Bundle::open(&crate_path("../../models/kitchen.onnx")).expect("it is sound");
+    let image = compile_with(&bundle, &Options::exact()).expect("it compiles");
+    let path = scratch("kitchen-exact.lads");
+    fs::write(&path, image.as_bytes()).expect("it can be written");
+    path
 }
 
 fn compiled(bundle: &str) -> Image {
@@ -230,23 +242,29 @@ fn with_operations(operations: &str, name: &str) -> PathBuf {
 
 #[test]
 fn an_archive_holds_what_its_policies_need_and_says_what_it_does_not() {
-    let program = with_operations("lads", "user_lads");
-    let printed = run(Command::new(&program).arg(kitchen()));
-    assert!(printed.contains("100 steps, 1 fallback"), "{printed}");
-    let text = text_of(&program);
-    assert!(
-        text <= MOST_TEXT,
-        "text has {text} bytes, at most {MOST_TEXT}"
-    );
-    let program = with_operations("layer-norm", "user_without");
-    let refused = Command::new(&program).arg(kitchen()).output();
-    let refused = refused.expect("it starts");
-    let why = String::from_utf8_lossy(&refused.stderr);
-    assert!(
-        !refused.status.success()
-            && why.contains("an operation that this library was built without"),
-        "{why}"
-    );
+    let exact = exact_kitchen();
+    let plain = with_operations("lads", "user_lads");
+    let tuned = with_operations("lads,integer-weights,half-cache", "user_tuned");
+    for (program, image, most) in [
+        (&plain, exact.as_path(), MOST_TEXT),
+        (&tuned, kitchen(), MOST_TEXT_TUNED),
+    ] {
+        let printed = run(Command::new(program).arg(image));
+        assert!(printed.contains("100 steps, 1 fallback"), "{printed}");
+        let text = text_of(program);
+        assert!(text <= most, "text has {text} bytes, at most {most}");
+    }
+    let without = with_operations("layer-norm", "user_without");
+    for (program, image) in [(&without, exact.as_path()), (&plain, kitchen())] {
+        let refused = Command::new(program).arg(image).output();
+        let refused = refused.expect("it starts");
+        let why = String::from_utf8_lossy(&refused.stderr);
+        assert!(
+            !refused.status.success()
+                && why.contains("an operation that this library was built without"),
+            "{why}"
+        );
+    }
 }
 
 #[test]

@@ -269,7 +269,7 @@ fn neighbours_are_read_and_have_to_agree() {
         beside: vec![&other.path("policy.onnx")],
         ..Request::default()
     });
-    assert!(form.expect("a form").contains("wrong with the files"));
+    assert!(form.expect("a form").contains("Problems of the files"));
     let bomb = Case::new(&mirror(2), robot);
     bomb.put("deploy.yaml", "[".repeat(10_000).as_bytes());
     let told = bomb.refused();

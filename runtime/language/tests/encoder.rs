@@ -93,7 +93,7 @@ fn empty_sentences_are_refused() {
     for text in ["", " \t\n", "\u{0}\u{200b}"] {
         let error = encoder.words(text).unwrap_err();
         assert!(matches!(error, LanguageError::Empty(_)), "{error}");
-        one_line(&error, &["empty", "say"]);
+        one_line(&error, &["empty", "give"]);
     }
 }
 
