@@ -22,7 +22,7 @@ const STRICT: [&str; 4] = ["-Wall", "-Wextra", "-Werror", "-pedantic"];
 const MOST_TEXT: usize = 200 * 1024;
 
 /// Largest size of the same program with the number formats of the shipped policies as tuned.
-const MOST_TEXT_TUNED: usize = 240 * 1024;
+const MOST_TEXT_TUNED: usize = 244 * 1024;
 
 /// Largest size, in bytes, of machine code and constants of a stripped program with all operations.
 /// The operations on images are 80 KB of it, most of that convolutions and pools for three
