@@ -1,6 +1,6 @@
 //! Frames of the simulation: the same state gives the same bytes, what is asked for is what is drawn, and a cache goes on where it stopped.
 //!
-//! What the reference renderer draws of the same states is compared in `tests/parity/test_frames.py`.
+//! What the reference renderer draws of the same states is compared in `tests/parity/test_rendering.py`.
 #![cfg(feature = "camera")]
 
 use std::path::Path;
