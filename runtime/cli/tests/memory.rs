@@ -45,7 +45,8 @@ fn the_small_kitchen_policy_fits_a_microcontroller() {
     for (name, limit) in [
         ("image_bytes", 512 * 1024),
         ("workspace_bytes", 64 * 1024),
-        ("stack_bytes", 8 * 1024),
+        // Of the widest vectors of x86-64; a Cortex-M takes 5,760 (docs/firmware.md).
+        ("stack_bytes", 10 * 1024),
     ] {
         let got = sizes[name].as_u64().expect("inspect tells it");
         assert!(got < limit, "{name} is {got}, the limit is {limit}");
