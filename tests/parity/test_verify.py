@@ -37,7 +37,7 @@ def lads_run():
 def verify(bundle, folder):
     """Runs `lads-run verify` -> exit code, certificate."""
     file = folder / "certificate.json"
-    command = [lads_run(), "verify", "--model", bundle, "--reference", REFERENCE, "--certificate", file, "--instruction", "kbls", "--episodes", "1"]
+    command = [lads_run(), "verify", "--model", bundle, "--reference", REFERENCE, "--certificate", file, "--instruction", "kbls", "--episodes", "1", "--exact"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode in (EQUIVALENT, DIFFERENT, INCONCLUSIVE), done.stderr
     return done.returncode, json.loads(file.read_text())

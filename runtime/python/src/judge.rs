@@ -277,6 +277,9 @@ fn replay(
                 plan: selected.map(|selected| selected.index),
                 logits: scores.to_vec(),
                 action: action.clone(),
+                margin: selected
+                    .map(|selected| selected.margin)
+                    .filter(|margin| decided && margin.is_finite()),
                 ..Reply::default()
             };
             controller.executed(done)?;

@@ -220,18 +220,18 @@ impl Rounding {
                 difference: seen.largest_logit_difference,
                 tolerance,
             })
-        } else if !margins.is_empty() && seen.clear_share < CLEAR_SHARE {
-            Some(Loss::Unclear {
-                share: seen.clear_share,
-                logit: seen.largest_logit_difference,
-                shown: too_many(margins.len() - clear, margins.len()),
-            })
         } else if encoded > 0 {
             Some(Loss::Encoded { changed: encoded })
         } else if seen.largest_action_difference > allowed.action {
             Some(Loss::Action {
                 difference: seen.largest_action_difference,
                 tolerance: allowed.action,
+            })
+        } else if !margins.is_empty() && seen.clear_share < CLEAR_SHARE {
+            Some(Loss::Unclear {
+                share: seen.clear_share,
+                logit: seen.largest_logit_difference,
+                shown: too_many(margins.len() - clear, margins.len()),
             })
         } else {
             None
