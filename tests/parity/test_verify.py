@@ -37,7 +37,7 @@ def lads_run():
 def verify(bundle, folder):
     """Runs `lads-run verify` -> exit code, certificate."""
     file = folder / "certificate.json"
-    command = [lads_run(), "verify", "--model", bundle, "--reference", REFERENCE, "--certificate", file, "--instruction", "kbls", "--episodes", "1", "--exact"]
+    command = [lads_run(), "verify", "--model", bundle, "--reference", REFERENCE, "--certificate", file, "--instruction", "kbls", "--episodes", "1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode in (EQUIVALENT, DIFFERENT, INCONCLUSIVE), done.stderr
     return done.returncode, json.loads(file.read_text())
@@ -147,6 +147,8 @@ def record_golden(model):
 def test_a_damaged_policy_is_different(damage, tmp_path):
     model = onnx.load(BUNDLE)
     damage(model)
+    # The formats were chosen for the policy that is whole.
+    model.metadata_props.remove(next(row for row in model.metadata_props if row.key == "lads.storage"))
     record_golden(model)
     path = tmp_path / "damaged.onnx"
     path.write_bytes(model.SerializeToString())

@@ -280,7 +280,6 @@ fn replay(
                 margin: selected
                     .map(|selected| selected.margin)
                     .filter(|margin| decided && margin.is_finite()),
-                ..Reply::default()
             };
             controller.executed(done)?;
             Ok(reply)
