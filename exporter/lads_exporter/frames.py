@@ -25,16 +25,22 @@ def read(path, dataset_sha256):
     """-> frames [T, r, c, 3] as an array over the file, how they were rendered."""
     try:
         with open(path, "rb") as file:
+            whole = file.seek(0, 2)
+            file.seek(0)
             (length,) = struct.unpack("<Q", file.read(8))
+            if length > whole - 8:
+                raise ValueError("a header beyond the end")
             header = json.loads(file.read(length))
             data = np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), np.uint8, offset=8 + length)
         metadata, shape = header["__metadata__"], header["frames"]["shape"]
         rendering = json.loads(metadata["rendering"])
-    except (OSError, ValueError, KeyError, struct.error, TypeError) as error:
+        fits = metadata["format"] == FORMAT and header["frames"]["dtype"] == "U8" and shape == [shape[0], *rendering["size"], 3]
+        whole, made_of = fits and len(data) == math.prod(shape), metadata["dataset_sha256"]
+    except (OSError, ValueError, LookupError, struct.error, TypeError) as error:
         raise UserError(f"{path}: no frames ({type(error).__name__}); make them with lads-run frames") from error
-    if metadata.get("format") != FORMAT or len(data) != np.prod(shape):
+    if not whole:
         raise UserError(f"{path}: not a whole {FORMAT} file; make it with lads-run frames")
-    if metadata["dataset_sha256"] != dataset_sha256:
+    if made_of != dataset_sha256:
         raise UserError(f"{path}: made of another dataset; make it anew with lads-run frames")
     return data.reshape(shape), rendering
 
@@ -45,22 +51,23 @@ def augmented(frames, owners, count, config):
     LISA's augmentation: colours jittered, then turned, shifted and scaled, black where nothing is. The colours' changes are linear here (a
     hue is a turn about the grey axis) and come in one order.
     """
-    x = frames.float()
-    draw = lambda low, high: torch.empty(count).uniform_(low, high)
-    bright, contrast, saturation = (draw(1 - config.jitter, 1 + config.jitter) for _ in range(3))
-    hue = draw(-config.jitter, config.jitter) * 2 * math.pi
-    grey = torch.tensor([RED, GREEN, BLUE])
-    x = x @ (bright[:, None, None] * _colours(saturation, hue, grey)).transpose(1, 2)[owners][:, None]
-    mean = (x @ grey).mean((1, 2))[:, None, None, None]
-    share = contrast[owners][:, None, None, None]
-    x = (mean + share * (x - mean)).clamp(0, 255)
-    angle, scale = draw(-config.turn_degrees, config.turn_degrees) * math.pi / 180, draw(1 - config.scale, 1 + config.scale)
-    cos, sin = angle.cos() / scale, angle.sin() / scale
-    shift = [2 * draw(-config.shift, config.shift) for _ in range(2)]
-    turns = torch.stack([torch.stack([cos, sin, shift[0]], 1), torch.stack([-sin, cos, shift[1]], 1)], 1)
-    x = x.permute(0, 3, 1, 2)
-    grid = F.affine_grid(turns[owners], x.shape, align_corners=False)
-    return F.grid_sample(x, grid, "nearest", "zeros", align_corners=False).permute(0, 2, 3, 1)
+    with frames.device:
+        x = frames.float()
+        draw = lambda low, high: torch.empty(count).uniform_(low, high)
+        bright, contrast, saturation = (draw(1 - config.jitter, 1 + config.jitter) for _ in range(3))
+        hue = draw(-config.jitter, config.jitter) * 2 * math.pi
+        grey = torch.tensor([RED, GREEN, BLUE])
+        x = x @ (bright[:, None, None] * _colours(saturation, hue, grey)).transpose(1, 2)[owners][:, None]
+        mean = (x @ grey).mean((1, 2))[:, None, None, None]
+        share = contrast[owners][:, None, None, None]
+        x = (mean + share * (x - mean)).clamp(0, 255)
+        angle, scale = draw(-config.turn_degrees, config.turn_degrees) * math.pi / 180, draw(1 - config.scale, 1 + config.scale)
+        cos, sin = angle.cos() / scale, angle.sin() / scale
+        shift = [2 * draw(-config.shift, config.shift) for _ in range(2)]
+        turns = torch.stack([torch.stack([cos, sin, shift[0]], 1), torch.stack([-sin, cos, shift[1]], 1)], 1)
+        x = x.permute(0, 3, 1, 2)
+        grid = F.affine_grid(turns[owners], x.shape, align_corners=False)
+        return F.grid_sample(x, grid, "nearest", "zeros", align_corners=False).permute(0, 2, 3, 1)
 
 
 def _colours(saturation, hue, grey):

@@ -72,6 +72,9 @@ def test_a_file_of_frames_reads_back(files):
 @pytest.mark.parametrize("spoil, wrong", [
     (lambda path, data: path.write_bytes(path.read_bytes()[:-1]), "not a whole"),
     (lambda path, data: path.write_bytes(b"no"), "no frames"),
+    (lambda path, data: path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(64)), "no frames"),
+    (lambda path, data: path.write_bytes(b"\xff" * 64), "no frames"),
+    (lambda path, data: path.write_bytes(path.read_bytes()[:-1]), "not a whole"),
     (lambda path, data: write_frames(path, data, dataset_sha256="00"), "another dataset"),
     (lambda path, data: write_frames(path, data, count=3), "3 frames for"),
     (lambda path, data: path.unlink(), "no frames"),

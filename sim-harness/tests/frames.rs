@@ -93,6 +93,8 @@ fn what_the_scene_does_not_have_is_named() {
     };
     let tail = refused(|it| it.hidden.push("tail".to_owned()));
     assert!(tail.contains("no body 'tail'"), "{tail}");
+    let null = refused(|it| it.hidden.push("a\0b".to_owned()));
+    assert!(null.contains("null character"), "{null}");
     let none = refused(|it| it.size = [0, 64]);
     assert!(none.contains("[0, 64]"), "{none}");
     let mut frames = Frames::new(&lorel, &rendering(&lorel)).unwrap();
@@ -129,6 +131,19 @@ fn a_cache_goes_on_where_it_stopped_and_is_the_same() {
     assert!(!path("again").exists());
     assert_eq!(make("again", 1, &go).unwrap().done, states.len());
     assert_eq!(std::fs::read(path("again")).unwrap(), whole);
+
+    // A file that lost its end, and one of somebody else that is shorter than a header.
+    std::fs::write(path("short"), &whole[..whole.len() - 1]).unwrap();
+    std::fs::write(path("mine.part"), b"notes").unwrap();
+    for name in ["short", "mine"] {
+        assert!(matches!(make(name, 1, &go), Err(CacheError::Other(_))));
+    }
+    assert_eq!(std::fs::read(path("mine.part")).unwrap(), b"notes");
+    // Bytes behind the end are cut off.
+    let longer = [whole.as_slice(), &[0; 30_000]].concat();
+    std::fs::write(path("longer.part"), longer).unwrap();
+    assert_eq!(make("longer", 1, &go).unwrap().done, states.len());
+    assert_eq!(std::fs::read(path("longer")).unwrap(), whole);
 
     let other = Rendering {
         samples: 0,

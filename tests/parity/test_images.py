@@ -96,6 +96,8 @@ def test_frames_beside_lines(policies, tmp_path):
     assert done.stdout == wanted
     refused(done, f"it has {STEPS} frames")
     refused(policy.run(*options[:2], input=lines), f"`{policy.cameras[1]}` needs one folder")
+    (tmp_path / policy.cameras[0] / "000.png").unlink()
+    refused(policy.run(*options, input=lines), f"{STEPS - 1} to {STEPS} frames")
     refused(policy.run("--images", tmp_path, input=lines), "several cameras", ", ".join(policy.cameras))
     refused(policy.run("--images", "raw", input=lines), "leave no place for other observations")
 

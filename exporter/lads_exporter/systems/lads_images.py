@@ -11,7 +11,7 @@ The paper has an encoder for each part; sharing a frozen one is a deviation that
 import torch
 import torch.nn.functional as F
 
-from ..frames import augmented
+from ..frames import BATCH, augmented
 from ..kinds import sighted
 from . import lads
 from .base import Exported
@@ -38,8 +38,9 @@ class Training(lads.Training):
         frames, rows, steps = self.corpus.seen(episodes)
         encoder = self.networks.frames
         if encoder.training:
-            frames = augmented(frames, rows, len(episodes), self.config.images)
-        features = encoder(frames)
+            features = encoder(augmented(frames, rows, len(episodes), self.config.images))
+        else:  # all that is held out, at once
+            features = torch.cat([encoder(part) for part in frames.split(BATCH)])
         shown = self.corpus.shown_states[episodes[rows], steps]
         self.state_loss = F.mse_loss(self.networks.state(features), shown)
         table = features.new_zeros(len(episodes), self.corpus.steps, features.shape[1])
@@ -55,6 +56,12 @@ class Training(lads.Training):
             parts["state"] = self.state_loss
             total = total + self.config.images.state_weight * self.state_loss
         return total, parts
+
+    def summary(self):
+        # A finished run that is resumed begins no stage.
+        self.networks.eval()
+        self.corpus.freeze(self.networks.frames)
+        return super().summary()
 
     def validate(self, stage):
         out = super().validate(stage)

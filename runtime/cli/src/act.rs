@@ -121,8 +121,10 @@ impl Pipe<'_, '_> {
                     break;
                 }
                 frame += 1;
-                let plan = self.step(&seen, &mut action);
-                let plan = plan.map_err(|wrong| self.refuse(number, &wrong))?;
+                let plan = self.step(&seen, &mut action).map_err(|wrong| {
+                    let remedy = "send frames that `lads inspect` describes";
+                    Refusal::new(format_args!("frame {frame}"), wrong, remedy)
+                })?;
                 line::format(line::Form::Csv, &action, plan, &mut answered);
                 if !send(&mut output, &answered)? {
                     break;
@@ -143,7 +145,7 @@ impl Pipe<'_, '_> {
             }
             if bytes.len() > most {
                 let wrong = format!("it is longer than {most} bytes");
-                return Err(self.refuse(number, &wrong));
+                return Err(Self::refuse(seen.len(), number, &wrong));
             }
             let asked = str::from_utf8(&bytes).map_err(|error| unreadable(&error))?;
             if asked.trim().is_empty() {
@@ -151,7 +153,7 @@ impl Pipe<'_, '_> {
                 continue;
             }
             let form = seen.read(asked);
-            let form = form.map_err(|wrong| self.refuse(number, &wrong))?;
+            let form = form.map_err(|wrong| Self::refuse(seen.len(), number, &wrong))?;
             if let Some(images) = &images {
                 if !images.show(frame, &mut input, &mut seen)? {
                     return Err(images.exhausted());
@@ -159,7 +161,7 @@ impl Pipe<'_, '_> {
                 frame += 1;
             }
             let plan = self.step(&seen, &mut action);
-            let plan = plan.map_err(|wrong| self.refuse(number, &wrong))?;
+            let plan = plan.map_err(|wrong| Self::refuse(seen.len(), number, &wrong))?;
             line::format(form, &action, plan, &mut answered);
             if !send(&mut output, &answered)? {
                 break;
@@ -181,11 +183,10 @@ impl Pipe<'_, '_> {
         Ok(selected.filter(|_| self.plans))
     }
 
-    fn refuse(&self, number: u64, wrong: &str) -> Refusal {
-        let channels = self.policy.contract().observations();
+    /// Refuses an input line, which takes `len` numbers.
+    fn refuse(len: usize, number: u64, wrong: &str) -> Refusal {
         let remedy = format!(
-            "send {} finite numbers inside the contract's limits, which `lads inspect` lists",
-            channels.map(|channel| channel.len()).sum::<usize>()
+            "send {len} finite numbers inside the contract's limits, which `lads inspect` lists"
         );
         Refusal::new(format_args!("input line {number}"), wrong, remedy)
     }

@@ -70,6 +70,17 @@ impl Images {
             let remedy = format!("give {OPTION} {}=FOLDER once", camera.name());
             return Err(Refusal::new(OPTION, wrong, remedy));
         }
+        let counts = |of: fn(usize, usize) -> usize| {
+            let counts = folders.iter().map(|folder| folder.files.len());
+            counts.reduce(of).unwrap_or_default()
+        };
+        let (fewest, most) = (counts(usize::min), counts(usize::max));
+        if fewest != most {
+            // A frame that is missing would pair all later ones with other moments.
+            let wrong = format!("the folders have {fewest} to {most} frames");
+            let remedy = "give one frame of each camera for every step";
+            return Err(Refusal::new(OPTION, wrong, remedy));
+        }
         Ok(Some(Self::Folders(folders)))
     }
 

@@ -141,9 +141,13 @@ fn exact(controller: &Controller) -> PyResult<Option<Arc<Checked>>> {
     let selects = view.index_count() > 0
         && settings.sample.is_none()
         && view.contract().decision() == Decision::Argmax;
-    let bundle = checked.opened().bundle();
-    let Some(bundle) = bundle.filter(|_| selects && !lads_host::is_exact(view)) else {
+    if !selects || lads_host::is_exact(view) {
         return Ok(None);
+    }
+    let Some(bundle) = checked.opened().bundle() else {
+        return Err(ProofError::new_err(
+            "the image has fewer bits than 32 and is judged beside its bundle with 32; open the bundle, which is compiled to the same image",
+        ));
     };
     let broken =
         |error: &dyn std::fmt::Display| ProofError::new_err(format!("with 32 bits: {error}"));

@@ -1,6 +1,8 @@
 """Faithful exports are EQUIVALENT to the policy in PyTorch, and every fault of an export is DIFFERENT."""
 
 import json
+import subprocess
+import sys
 
 import gymnasium
 import jsonschema
@@ -163,6 +165,22 @@ def test_a_policy_with_plans_is_compared_by_its_logits(tmp_path):
     found = verify(ByActions())
     assert found.data["policy"]["decisions"] == 0 and found.data["policy"]["differing_episodes"] == 0
     assert any("indices and their scores" in row for row in found.data["not_covered"])
+
+
+def test_fewer_bits_are_judged_beside_32(tmp_path):
+    """Tests that decisions with fewer bits are judged by their margins, and that an image whose bundle is not at hand is not judged."""
+    _, opened, model = exported("lads", tmp_path)
+    path, image = tmp_path / "lads.onnx", tmp_path / "lads.lads"
+    rounded = lads.open(path, weights="f16", force=True)
+    ids = [row.id for row in opened.contract.instructions[:2]]
+    verify = lambda policy: lads.verify(InOnnxRuntime(model), policy.controller(), environments.Servo, instructions=ids, episodes=2, traced=2)
+    found = verify(rounded).data
+    assert found["exact"]["differing_episodes"] == 0
+    assert found["rounding"]["decisions"] == 2 * 2 * 10 and found["rounding"]["smallest_margin"] > 0
+    assert found["rounding"]["largest_logit_difference"] > found["exact"]["largest_logit_difference"]
+    subprocess.run([sys.executable, "-m", "lads", "compile", path, "--weights", "f16", "--force", "-o", image], check=True)
+    with pytest.raises(lads.errors.ProofError, match="open the bundle"):
+        verify(lads.open(image))
 
 
 def test_too_few_episodes_are_inconclusive(tmp_path):

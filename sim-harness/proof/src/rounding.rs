@@ -1,11 +1,11 @@
 //! Is a policy whose numbers have fewer bits still the one with 32?
 //!
-//! Both answer the same questions, so that they differ by rounding alone: another checkpoint, other words or another normaliser are in both,
+//! Both answer the same questions, so that they differ by rounding alone: another checkpoint, other words or another normaliser of the bundle are in both,
 //! and it is the answers with 32 bits that a reference bounds ([`Answers`], logits by their values). Rounding is judged by what it decides. A logit
 //! that only helps to select the largest reaches the action through the index: every decision must select the same one, and nearly all must be clear by
 //! more than the logits are off, because the questions are a sample, and a decision that was a close call elsewhere may fall out otherwise. What is
-//! in the action must stay inside its tolerance, and a trajectory encoder must see the same plan in every segment: how near it was to another is
-//! not known. `tune` chooses formats by this rule, and a certificate judges an image by it. Nothing here can fail.
+//! in the action must stay inside its tolerance, and a trajectory encoder must see the same plan in every segment: how near it was to another
+//! does not count. `tune` chooses formats by this rule, and a certificate judges an image by it. Nothing here can fail.
 
 use std::fmt;
 
@@ -130,7 +130,7 @@ pub struct Rounding {
     pub smallest_margin: Option<f64>,
     /// Largest difference of a logit, up to a constant added to all of a decision's.
     pub largest_logit_difference: f64,
-    /// Share of the decisions with two logits or more whose margin is more than `margin_factor` times that difference.
+    /// Share of the decisions with two logits or more whose margin is more than `margin_factor` times that difference; 1 where there is none.
     pub clear_share: f64,
     /// The factor.
     pub margin_factor: f64,
@@ -160,6 +160,7 @@ impl Rounding {
             episodes: exact.len(),
             margin_factor: MARGIN_FACTOR,
             action_tolerance: allowed.action,
+            clear_share: 1.0,
             ..Self::default()
         };
         let mut margins = vec![];
@@ -203,7 +204,9 @@ impl Rounding {
         }
         let clear = MARGIN_FACTOR * seen.largest_logit_difference;
         let clear = margins.iter().filter(|&&margin| margin > clear).count();
-        seen.clear_share = clear as f64 / margins.len().max(1) as f64;
+        if !margins.is_empty() {
+            seen.clear_share = clear as f64 / margins.len() as f64;
+        }
         seen.smallest_margin = margins.iter().copied().reduce(f64::min);
         let too_far = allowed
             .logit
@@ -323,7 +326,7 @@ impl Asked {
     pub fn undecided(&self) -> Option<String> {
         let loss = self.loss().filter(|loss| !loss.is_shown())?;
         Some(format!(
-            "whether fewer bits make another policy of it: {loss}, which is not shown to be too few; a reference with more traced episodes would"
+            "whether fewer bits make another policy of it: {loss}, which is not shown to be too few; all instructions and traced episodes of the reference, or a reference with more of them, would"
         ))
     }
 

@@ -24,7 +24,7 @@ pub struct Stage<'e> {
 
 /// Viewpoint of a camera.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "lowercase", deny_unknown_fields)]
 pub enum View {
     /// A camera of the scene, by its name.
     Camera(Cow<'static, str>),

@@ -149,10 +149,12 @@ pub fn make(
     let part = PathBuf::from(format!("{}.part", path.display()));
     if path.exists() {
         let begun = begins_with(path, &head).map_err(io_error(path))?;
-        let whole = begun.then_some(Progress { done: all, all });
+        let found = std::fs::metadata(path).map_err(io_error(path))?.len();
+        let wanted = head.len() + all * rendering.frame_len();
+        let whole = (begun && found == wanted as u64).then_some(Progress { done: all, all });
         return whole.ok_or_else(|| CacheError::Other(path.to_path_buf()));
     }
-    let (mut file, mut done) = resume(&part, &head, rendering.frame_len())?;
+    let (mut file, mut done) = resume(&part, &head, rendering.frame_len(), all)?;
     progress(done);
     let next = AtomicUsize::new(done);
     let halted = AtomicBool::new(false);
@@ -161,6 +163,7 @@ pub fn make(
         for _ in 0..threads.max(1) {
             let (sender, next, halted) = (sender.clone(), &next, &halted);
             scope.spawn(move || {
+                let _halts = HaltsOnPanic(halted);
                 let mut frames = match Frames::new(open().as_ref(), rendering) {
                     Ok(frames) => frames,
                     Err(error) => {
@@ -207,6 +210,17 @@ pub fn make(
     Ok(Progress { done, all })
 }
 
+/// Halts the other threads if its own panics: a chunk that never comes would let the later ones pile up.
+struct HaltsOnPanic<'h>(&'h AtomicBool);
+
+impl Drop for HaltsOnPanic<'_> {
+    fn drop(&mut self) {
+        if thread::panicking() {
+            self.0.store(true, Ordering::Relaxed);
+        }
+    }
+}
+
 fn io_error(path: &Path) -> impl Fn(io::Error) -> CacheError {
     let path = path.to_path_buf();
     move |source| CacheError::Io {
@@ -248,11 +262,17 @@ fn begins_with(path: &Path, head: &[u8]) -> io::Result<bool> {
     Ok(begin == head)
 }
 
-/// Opens what was begun behind its last whole frame, and says how many there are; or begins it.
-fn resume(part: &Path, head: &[u8], frame_len: usize) -> Result<(File, usize), CacheError> {
+/// Opens an unfinished file behind its last whole frame, of `all` at most, and returns the number of frames in it; or begins the file.
+fn resume(
+    part: &Path,
+    head: &[u8],
+    frame_len: usize,
+    all: usize,
+) -> Result<(File, usize), CacheError> {
     let refused = io_error(part);
     let begun = std::fs::metadata(part).map_or(0, |found| found.len() as usize);
-    if begun >= head.len() && !begins_with(part, head).map_err(&refused)? {
+    let (own, _) = head.split_at(begun.min(head.len()));
+    if begun > 0 && !begins_with(part, own).map_err(&refused)? {
         return Err(CacheError::Other(part.to_path_buf()));
     }
     let mut file = OpenOptions::new()
@@ -261,7 +281,7 @@ fn resume(part: &Path, head: &[u8], frame_len: usize) -> Result<(File, usize), C
         .truncate(false)
         .open(part)
         .map_err(&refused)?;
-    let done = begun.saturating_sub(head.len()) / frame_len;
+    let done = (begun.saturating_sub(head.len()) / frame_len).min(all);
     if begun < head.len() {
         file.set_len(0).map_err(&refused)?;
         file.write_all(head).map_err(&refused)?;

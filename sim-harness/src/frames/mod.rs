@@ -69,6 +69,14 @@ impl Rendering {
                 self.drawn, self.size
             ));
         }
+        let camera = match &self.view {
+            View::Camera(name) => name.as_ref(),
+            View::Free { .. } => "",
+        };
+        let mut names = self.hidden.iter().map(String::as_str).chain([camera]);
+        if names.any(|name| name.contains('\0')) {
+            return Err("a name of `view` or `hidden` has a null character".to_owned());
+        }
         if self.samples > 64 || self.shadow_size > 16_384 {
             return Err("more than 64 samples or 16384 texels of shadow".to_owned());
         }

@@ -103,7 +103,16 @@ pub fn run(
         reference.contract.as_ref(),
         [&contract::of_image(&evaluation.policy), &bundled],
     );
-    let not_covered = unseen(evaluation, &asked.policy);
+    let mut not_covered = unseen(evaluation, &asked.policy);
+    if asked.rounding.is_some() {
+        let tuned = lads_compiler::compile(bundle).map_err(EvaluationError::Exact)?;
+        if tuned.as_bytes() != evaluation.policy.image() {
+            not_covered.push(
+                "weights of the image beyond what they decide: it is not what the bundle compiles to as it was tuned"
+                    .to_owned(),
+            );
+        }
+    }
     Ok(Certificate::new(
         setting,
         used,

@@ -88,6 +88,21 @@ fn close_calls_are_a_loss() {
     assert!((share - 0.5).abs() < 1e-9 && (logit - 0.004).abs() < 1e-6);
 }
 
+/// A loss that is shown is not hidden by a share that is not.
+#[test]
+fn an_action_counts_beside_an_unclear_decision() {
+    let mut close = exact();
+    close[0].replies[0].margin = Some(0.007);
+    let mut other = close.clone();
+    other[0].replies[0].logits = vec![-0.004, 2.004, 1.0];
+    other[0].replies[1].action = vec![0.6];
+    let judged = Rounding::judge(&close, &other, SELECTS);
+    assert!(
+        matches!(judged.loss, Some(Loss::Action { .. })),
+        "{judged:?}"
+    );
+}
+
 /// By 0.2 and clear by 0.5: the index is what it was; a draw would not be.
 #[test]
 fn values_of_logits_matter_where_they_do_more_than_select() {

@@ -18,7 +18,7 @@ mod with {
 
     use crate::arguments::Frames;
     use crate::end::{End, print, refused};
-    use crate::{progress_over, threads};
+    use crate::{INTERRUPTED, progress_over, threads};
 
     /// Draws them into a file, or goes on with it.
     pub fn run(asked: &Frames, stop: &AtomicBool) -> Result<ExitCode, End> {
@@ -46,10 +46,11 @@ mod with {
         let made = made.map_err(refused)?;
         let path = asked.output.display();
         if made.done < made.all {
-            return Err(refused(format!(
-                "stopped after {} of {} frames; the same command goes on",
+            eprintln!(
+                "interrupted: {} of {} frames are kept; the same command goes on",
                 made.done, made.all
-            )));
+            );
+            return Ok(ExitCode::from(INTERRUPTED));
         }
         print(&format!("{} frames in {path}\n", made.all))?;
         Ok(ExitCode::SUCCESS)

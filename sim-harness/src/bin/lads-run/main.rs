@@ -3,7 +3,8 @@
 //!
 //! Everything that can be wrong is looked at before the first episode: arguments, the place for the JSON, the bundle, its golden episode,
 //! the instruction, the assets, and whether contract and environment fit. Any of it ends with one line on stderr and exit code 2; an
-//! interrupt ends with exit code 130. Files are written only after the last episode, to a temporary file that is then renamed.
+//! interrupt ends with exit code 130. Files are written only after the last episode, to a temporary file that is then
+//! renamed; `frames` alone keeps what it has, and goes on with it.
 //! `verify` runs a reference's episodes, and its verdict is the exit code: 0 equivalent, 1 different, 3 inconclusive.
 #![forbid(unsafe_code)]
 
