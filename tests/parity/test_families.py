@@ -5,20 +5,18 @@ Skipped where the exporter's environment or cargo is missing.
 """
 
 import os
-import pathlib
 import re
 import shutil
 import subprocess
 import sys
 
 import pytest
+from programs import ROOT, SELECTION
 
 pytest.importorskip("onnxruntime")
 pytest.importorskip("lads_exporter.episode")
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
 # The Makefile's: with another one cargo would build its dependencies once more.
-SELECTION = ("--workspace", "--features", "lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language")
 KINDS = ("lads", "lang_dt", "lisa", "vae", "lcsd", "skilldiffuser", "history", "plain", "recurrent", "stacked", "camera", "images", "sighted")
 STEPS = 200
 

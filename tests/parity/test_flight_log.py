@@ -5,18 +5,14 @@ Run with `python -m pytest tests/parity` in the exporter's environment, after `c
 
 import collections
 import json
-import os
-import pathlib
 import subprocess
 
 import pytest
+from programs import ROOT, newest
 
 reader = pytest.importorskip("mcap.reader")
 jsonschema = pytest.importorskip("jsonschema")
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
-PROGRAM = TARGET / "debug/lads-run"
 # Of every control step.
 STEPS = ("/observation", "/action", "/plan", "/timing", "/gripper")
 
@@ -24,11 +20,9 @@ STEPS = ("/observation", "/action", "/plan", "/timing", "/gripper")
 @pytest.fixture(params=[("kitchen", "kbls"), ("lorel", "open drawer")], ids=lambda case: case[0])
 def flight(request, tmp_path):
     """Records a flight -> the results, the log."""
-    if not PROGRAM.is_file():
-        pytest.skip("lads-run is not built: run `cargo build -p lads-sim`")
     model, instruction = request.param
     log, results = tmp_path / "flight.mcap", tmp_path / "results.json"
-    command = [PROGRAM, "--model", ROOT / f"models/{model}.onnx", "--instruction", instruction, "--episodes", "2"]
+    command = [newest("lads-run"), "--model", ROOT / f"models/{model}.onnx", "--instruction", instruction, "--episodes", "2"]
     done = subprocess.run([*command, "--log", log, "--json", results], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return json.loads(results.read_text()), log

@@ -5,10 +5,7 @@ other at random and read each other's results, so that what the compiler fuses, 
 wrote down. The seeds are fixed. Skipped where ONNX Runtime or cargo is missing.
 """
 
-import os
-import pathlib
 import random
-import shutil
 import subprocess
 
 import pytest
@@ -17,10 +14,9 @@ np = pytest.importorskip("numpy")
 onnx = pytest.importorskip("onnx")
 ort = pytest.importorskip("onnxruntime")
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
+from programs import built  # noqa: E402
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
 # The Makefile's: with another one cargo would build its dependencies once more.
-SELECTION = ("--workspace", "--features", "lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language")
 GRAPHS, STEPS, OUTPUTS = 60, 4, 3
 TOLERANCE = 1e-4
 HEAD = 'environment = { id = "image-graph", version = "1" }\ncontrol_period_s = 0.02\n'
@@ -30,10 +26,7 @@ ELEMENTWISE = {"Relu": {}, "LeakyRelu": {"alpha": 0.2}, "Tanh": {}, "Sigmoid": {
 @pytest.fixture(scope="module")
 def lads():
     """-> the path of the command."""
-    if not shutil.which("cargo"):
-        pytest.skip("cargo is not installed")
-    subprocess.run(["cargo", "build", "--quiet", *SELECTION, "--bin", "lads"], cwd=ROOT, check=True)
-    return pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target")) / "debug/lads"
+    return built("lads")
 
 
 class Graph:

@@ -3,8 +3,6 @@
 Run with `python -m pytest tests/parity` after `cargo build -p lads-cli`; skipped where the program is missing.
 """
 
-import os
-import pathlib
 import subprocess
 
 import pytest
@@ -14,17 +12,9 @@ pytest.importorskip("onnxruntime")
 Image = pytest.importorskip("PIL.Image")
 
 from lads_exporter import bundle, contract as contracts, kinds, random_policy  # noqa: E402
+from programs import newest  # noqa: E402
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
 STEPS = 7
-
-
-def program():
-    builds = [path for path in (TARGET / profile / "lads" for profile in ("release", "debug")) if path.is_file()]
-    if not builds:
-        pytest.skip("lads is not built: run `cargo build -p lads-cli`")
-    return max(builds, key=lambda path: path.stat().st_mtime)
 
 
 class Policy:
@@ -41,7 +31,7 @@ class Policy:
         self.cameras = [row["name"] for row in contracts.of_role(self.contract, "observation") if row["dtype"] == "u8"]
 
     def run(self, *arguments, input=b""):
-        command = [program(), "act", "--model", self.path, *self.instruction, *arguments]
+        command = [newest("lads"), "act", "--model", self.path, *self.instruction, *arguments]
         return subprocess.run([str(part) for part in command], input=input, capture_output=True, timeout=120)
 
     def lines(self, without=()):

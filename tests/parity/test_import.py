@@ -9,9 +9,7 @@ values. 200 steps with resets. Skipped where ONNX Runtime or cargo is missing.
 writes all forms and what a person says of each, for the edits of `runtime/import/tests/hostile.rs`.
 """
 
-import os
 import pathlib
-import shutil
 import subprocess
 import sys
 
@@ -22,12 +20,11 @@ onnx = pytest.importorskip("onnx")
 ort = pytest.importorskip("onnxruntime")
 pytest.importorskip("torch")
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent))
 import forms  # noqa: E402
+from programs import built  # noqa: E402
 
 # The Makefile's: with another one cargo would build its dependencies once more.
-SELECTION = ("--workspace", "--features", "lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language")
 STEPS, RESETS = 200, (70, 140)
 # Inputs that say that an episode begins.
 BEGINS = ("is_init",)
@@ -36,10 +33,7 @@ BEGINS = ("is_init",)
 @pytest.fixture(scope="module")
 def lads():
     """Builds the command `lads` -> its path."""
-    if not shutil.which("cargo"):
-        pytest.skip("cargo is not installed")
-    subprocess.run(["cargo", "build", "--quiet", *SELECTION, "--bin", "lads"], cwd=ROOT, check=True)
-    return pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target")) / "debug/lads"
+    return built("lads")
 
 
 def inputs(form):

@@ -21,9 +21,8 @@ from gymnasium_robotics.utils import mujoco_utils  # noqa: E402
 
 pytest.importorskip("lads_exporter.official")
 from lads_exporter.official import AMPLITUDES, SUB_TASKS, Noise, joint_qpos, joint_qvel, positions  # noqa: E402
+from programs import newest  # noqa: E402
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
 TOLERANCE = 1e-9
 STEPS = 1000
 
@@ -32,10 +31,7 @@ def trace_binary():
     """Finds the harness's `kitchen-trace`: the newest build, or the one that KITCHEN_TRACE names."""
     if "KITCHEN_TRACE" in os.environ:
         return pathlib.Path(os.environ["KITCHEN_TRACE"])
-    builds = [p for p in (TARGET / profile / "kitchen-trace" for profile in ("release", "debug")) if p.is_file()]
-    if not builds:
-        pytest.skip("kitchen-trace is not built: run `cargo build -p lads-sim`")
-    return max(builds, key=lambda path: path.stat().st_mtime)
+    return newest("kitchen-trace")
 
 
 class Harness:

@@ -5,7 +5,6 @@ The encoder is exported once for all tests here. Skipped where the exporter's en
 
 import json
 import os
-import pathlib
 import re
 import shutil
 import subprocess
@@ -15,12 +14,10 @@ import pytest
 language = pytest.importorskip("lads_exporter.language")
 import onnx  # noqa: E402
 from lads_exporter import acceptance, config, language_graph  # noqa: E402
+from programs import ROOT, SELECTION, newest  # noqa: E402
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
 REFUSED = 2
 # The Makefile's: with another one cargo would build tract once more.
-SELECTION = ("--workspace", "--features", "lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language")
 SENTENCES = (
     "pull the drawer out",
     "Please, open the DRAWER  a little - and then turn the tap to the left!",
@@ -67,9 +64,7 @@ def test_embeddings_are_the_exporters(cache):
 
 def lads_run(cache, model, *arguments):
     """Runs lads-run on the shipped bundle with its calibration, where the cache has that -> exit code, stdout, stderr."""
-    program = TARGET / "debug/lads-run"
-    if not program.is_file():
-        pytest.skip("lads-run is not built: run `make test-exporter`")
+    program = newest("lads-run")
     calibrated = cache / f"{model}.onnx"
     job = [arguments[0]] if arguments and arguments[0] == "replay" else []
     command = [program, *job, "--model", calibrated if calibrated.is_file() else ROOT / f"models/{model}.onnx", *arguments[len(job) :]]

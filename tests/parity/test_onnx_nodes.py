@@ -5,7 +5,6 @@ The cases come from the `onnx` package. Each is written as one model with its da
 """
 
 import os
-import pathlib
 import re
 import subprocess
 import types
@@ -16,10 +15,9 @@ import pytest
 np = pytest.importorskip("numpy")
 onnx = pytest.importorskip("onnx")
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
+from programs import ROOT, SELECTION  # noqa: E402
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
 # The Makefile's: with another one cargo would build tract once more.
-SELECTION = ("--workspace", "--features", "lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language")
 # The newest operator set that the compiler reads.
 OPSET = 28
 

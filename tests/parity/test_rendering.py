@@ -19,9 +19,8 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 np = pytest.importorskip("numpy")
 mujoco = pytest.importorskip("mujoco")
 from safetensors.numpy import load_file  # noqa: E402
+from programs import ROOT, newest  # noqa: E402
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
 SCENE = ROOT / "sim-harness/src/environments/lorel/scene.xml"
 ASSETS = pathlib.Path(os.environ.get("LADS_VENDOR", ROOT / "vendor")) / "assets/metaworld"
 SHIPS = {
@@ -38,15 +37,8 @@ SHIPS = {
 EVERY = 9  # of the states
 
 
-def program(name):
-    builds = [path for path in (TARGET / profile / name for profile in ("release", "debug")) if path.is_file()]
-    if not builds:
-        pytest.skip(f"{name} is not built: run `cargo build -p lads-sim --features record`")
-    return max(builds, key=lambda path: path.stat().st_mtime)
-
-
 def run(name, *arguments):
-    done = subprocess.run([program(name), *map(str, arguments)], capture_output=True, text=True, timeout=300)
+    done = subprocess.run([newest(name), *map(str, arguments)], capture_output=True, text=True, timeout=300)
     if "built without cameras" in done.stderr or "pictures need OpenGL" in done.stderr:
         pytest.skip(done.stderr)
     assert done.returncode == 0, done.stderr
@@ -114,8 +106,8 @@ def test_what_is_wrong_is_said_in_one_line(data, tmp_path):
     for text, wrong in (("{}", "missing field"), (json.dumps(SHIPS | {"size": [65, 64]}), "smaller"), (json.dumps(SHIPS | {"fog": 1}), "fog")):
         rendering = tmp_path / "rendering.json"
         rendering.write_text(text)
-        command = [program("lads-run"), "frames", data, "-o", tmp_path / "x.frames", "--rendering", rendering]
+        command = [newest("lads-run"), "frames", data, "-o", tmp_path / "x.frames", "--rendering", rendering]
         done = subprocess.run(command, capture_output=True, text=True, timeout=300)
         assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and wrong in done.stderr, done.stderr
-    done = subprocess.run([program("lads-run"), "frames", SCENE, "-o", tmp_path / "x.frames"], capture_output=True, text=True, timeout=300)
+    done = subprocess.run([newest("lads-run"), "frames", SCENE, "-o", tmp_path / "x.frames"], capture_output=True, text=True, timeout=300)
     assert done.returncode == 2 and "no safetensors file" in done.stderr

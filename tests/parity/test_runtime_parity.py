@@ -5,8 +5,6 @@ Run with `python -m pytest tests/parity` in the exporter's environment, after `c
 
 import base64
 import json
-import os
-import pathlib
 import subprocess
 
 import pytest
@@ -16,24 +14,16 @@ onnx = pytest.importorskip("onnx")
 twin = pytest.importorskip("lads_exporter.twin")
 from lads_exporter import contract as contracts  # noqa: E402
 from safetensors.numpy import load  # noqa: E402
+from programs import ROOT, newest  # noqa: E402
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
 BUNDLES = sorted((ROOT / "models").glob("*.onnx")) + [ROOT / "runtime/compiler/tests/data/tiny.onnx"]
 TOLERANCE = 1e-4
-
-
-def lads():
-    builds = [p for p in (TARGET / profile / "lads" for profile in ("release", "debug")) if p.is_file()]
-    if not builds:
-        pytest.skip("lads is not built: run `cargo build -p lads-cli`")
-    return max(builds, key=lambda path: path.stat().st_mtime)
 
 
 def act(bundle, instruction, observations):
     """Runs the runtime -> plans [T], actions [T, A]."""
     lines = "".join(json.dumps([float(x) for x in row]) + "\n" for row in observations)
-    command = [lads(), "act", "--model", bundle, "--instruction", instruction, "--plans"]
+    command = [newest("lads"), "act", "--model", bundle, "--instruction", instruction, "--plans"]
     done = subprocess.run(command, input=lines, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     rows = [json.loads(line) for line in done.stdout.splitlines()]

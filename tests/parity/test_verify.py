@@ -8,8 +8,6 @@ Run with `python -m pytest tests/parity` in the exporter's environment, after `c
 
 import base64
 import json
-import os
-import pathlib
 import subprocess
 
 import pytest
@@ -19,25 +17,17 @@ onnx = pytest.importorskip("onnx")
 exporter = pytest.importorskip("lads_exporter.bundle")
 from onnx import helper, numpy_helper  # noqa: E402
 from safetensors.numpy import load, save  # noqa: E402
+from programs import ROOT, newest  # noqa: E402
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
 BUNDLE, REFERENCE = ROOT / "models/kitchen.onnx", ROOT / "models/kitchen.reference.json"
 EQUIVALENT, DIFFERENT, INCONCLUSIVE = 0, 1, 3
 JOINT = 3
 
 
-def lads_run():
-    builds = [p for p in (TARGET / profile / "lads-run" for profile in ("release", "debug")) if p.is_file()]
-    if not builds:
-        pytest.skip("lads-run is not built: run `cargo build -p lads-sim`")
-    return max(builds, key=lambda path: path.stat().st_mtime)
-
-
 def verify(bundle, folder):
     """Runs `lads-run verify` -> exit code, certificate."""
     file = folder / "certificate.json"
-    command = [lads_run(), "verify", "--model", bundle, "--reference", REFERENCE, "--certificate", file, "--instruction", "kbls", "--episodes", "1"]
+    command = [newest("lads-run"), "verify", "--model", bundle, "--reference", REFERENCE, "--certificate", file, "--instruction", "kbls", "--episodes", "1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode in (EQUIVALENT, DIFFERENT, INCONCLUSIVE), done.stderr
     return done.returncode, json.loads(file.read_text())
