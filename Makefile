@@ -73,6 +73,8 @@ lint: setup
 	cargo fmt --all --check
 	cargo clippy $(ALL) --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc $(ALL) --no-deps --quiet
+	# The fuzzers' own workspace has its own lock.
+	cargo metadata --locked --quiet --format-version 1 --manifest-path tests/fuzz/Cargo.toml >/dev/null
 	# What `make run` builds, without the features of the tests.
 	cargo clippy --quiet $(RUNTIME) -p lads-sim -- -D warnings
 
