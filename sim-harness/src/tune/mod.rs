@@ -100,12 +100,12 @@ impl Tuning<'_> {
         })
     }
 
-    /// Returns the allowed differences. A draw depends on the values of the logits, so these have to be nearer than a certificate
-    /// wants them: its episodes are others.
+    /// Returns the allowed differences: half of a certificate's, whose episodes are others, and which compares with the reference, from which 32 bits
+    /// are some way off themselves. Logits count by their values only where a draw depends on them.
     fn allowed(&self, exact: &Image) -> Allowed {
         let draws = view(exact).contract().decision() != Decision::Argmax;
         Allowed {
-            action: f64::from(self.bundle.golden().tolerance).min(ACTION_TOLERANCE),
+            action: f64::from(self.bundle.golden().tolerance).min(ACTION_TOLERANCE) / 2.0,
             logit: draws.then_some(LOGIT_TOLERANCE / 2.0),
         }
     }
