@@ -67,6 +67,16 @@ class Alignment:
 
 
 @dataclass(frozen=True)
+class Stage:
+    steps: int
+    batch: int  # trajectories; transitions in the low-level stage
+    learning_rate: float
+    warmup: int
+    final: float  # the cosine ends at this fraction of the learning rate; 1 keeps it constant
+    weight_decay: float
+
+
+@dataclass(frozen=True)
 class Images:
     """What a policy sees with a camera, in place of the state; the paper's is LISA's."""
 
@@ -74,14 +84,16 @@ class Images:
     widths: list  # channels of the convolutions
     hidden: list  # units of the dense layers behind them
     features: int  # what they come to
-    state_weight: float  # of the loss by which the features tell the state in the first stage; 0 is the paper's
+    state_weight: float  # of the loss by which the features tell the state in the stage plans; 0 is the paper's
     jitter: float  # of brightness, contrast, saturation and hue, drawn for each trajectory
     turn_degrees: float
     shift: float  # share of the frame's sides
     scale: float
+    frames: Stage  # the encoder alone, by the states that single frames show; without steps it learns in the stage plans, end to end as the paper's
 
 
-NO_IMAGES = {"channel": "", "widths": [], "hidden": [], "features": 0, "state_weight": 0.0, "jitter": 0.0, "turn_degrees": 0.0, "shift": 0.0, "scale": 0.0}
+NO_STAGE = {"steps": 0, "batch": 0, "learning_rate": 0.0, "warmup": 0, "final": 0.0, "weight_decay": 0.0}
+NO_IMAGES = {"channel": "", "widths": [], "hidden": [], "features": 0, "state_weight": 0.0, "jitter": 0.0, "turn_degrees": 0.0, "shift": 0.0, "scale": 0.0, "frames": NO_STAGE}
 
 
 @dataclass(frozen=True)
@@ -99,16 +111,6 @@ class Data:
     ending_rate: float  # share of the high level's trajectories that get an instruction with another ending; 0 is the paper's
     ending_variants: int  # other endings per beginning
     ending_margin: float  # with k of n phrases kept, steps before (k - margin) / n of the trajectory count
-
-
-@dataclass(frozen=True)
-class Stage:
-    steps: int
-    batch: int  # trajectories; transitions in the low-level stage
-    learning_rate: float
-    warmup: int
-    final: float  # the cosine ends at this fraction of the learning rate; 1 keeps it constant
-    weight_decay: float
 
 
 @dataclass(frozen=True)

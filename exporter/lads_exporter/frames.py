@@ -61,6 +61,8 @@ def augmented(frames, owners, count, config):
         mean = (x @ grey).mean((1, 2))[:, None, None, None]
         share = contrast[owners][:, None, None, None]
         x = (mean + share * (x - mean)).clamp(0, 255)
+        if not (config.turn_degrees or config.shift or config.scale):
+            return x
         angle, scale = draw(-config.turn_degrees, config.turn_degrees) * math.pi / 180, draw(1 - config.scale, 1 + config.scale)
         cos, sin = angle.cos() / scale, angle.sin() / scale
         shift = [2 * draw(-config.shift, config.shift) for _ in range(2)]
@@ -96,8 +98,12 @@ class FrameCorpus(Corpus):
         """The frames of episodes -> frames [N, r, c, 3], rows [N] of `episodes`, steps [N]."""
         valid = torch.arange(self.steps) < self.lengths[episodes][:, None]
         rows, steps = valid.nonzero(as_tuple=True)
-        places = self.places[episodes[rows].to(self.device), steps.to(self.device)].cpu().numpy()
-        return torch.from_numpy(self.frames[places]).to(self.device), rows, steps
+        return self.frames_at(episodes[rows], steps), rows, steps
+
+    def frames_at(self, episodes, steps):
+        """The frames [N, r, c, 3] at episodes [N] and steps [N]."""
+        places = self.places[episodes.to(self.device), steps.to(self.device)].cpu().numpy()
+        return torch.from_numpy(self.frames[places]).to(self.device)
 
     @torch.no_grad()
     def freeze(self, encode):

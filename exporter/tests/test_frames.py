@@ -15,7 +15,7 @@ from lads_exporter import bundle, config, contract as contracts, dataset, frames
 from lads_exporter.config import UserError
 from lads_exporter.dataset import sha256
 
-SEEN = {"channel": "camera", "widths": [4, 8], "hidden": [16], "features": 8, "state_weight": 1.0, "jitter": 0.02, "turn_degrees": 5.0, "shift": 0.05, "scale": 0.05}
+SEEN = {"channel": "camera", "widths": [4, 8], "hidden": [16], "features": 8, "state_weight": 1.0, "jitter": 0.02, "turn_degrees": 5.0, "shift": 0.05, "scale": 0.05, "frames": config.NO_STAGE}
 RENDERING = {"size": [12, 16], "view": {"camera": "front"}}
 
 
@@ -39,9 +39,12 @@ def dataset_rows(data):
     return load_file(data)["observations"]
 
 
-def setting(**training):
+APART = {"steps": 12, "batch": 16, "learning_rate": 1e-3, "warmup": 2, "final": 0.1, "weight_decay": 0.0}
+
+
+def setting(apart=False, **training):
     table, *beside = copy.deepcopy(setting_for("staged", **training).tables)
-    table["images"] = SEEN
+    table["images"] = SEEN | ({"frames": APART} if apart else {})
     table["encoder"] |= {"kmeans_step": 5, "observed": 0}
     table["data"]["renoise"] = False
     for stage in ("plans", "low_level", "high_level"):
@@ -55,8 +58,8 @@ def files(tmp_path):
     return data, write_frames(tmp_path / "tiny.frames", data)
 
 
-def trainer_for(folder, files):
-    made = setting()
+def trainer_for(folder, files, apart=False):
+    made = setting(apart)
     data = dataset.load(files[0], made, files[1])
     made = dataclasses.replace(made, rendering=data.rendering)
     encoded = language.encode(made.config.language, [row["text"] for row in made.instructions])
@@ -173,3 +176,25 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, files):
     assert again.run(resume=True, quiet=True)
     for (name, one), two in zip(whole.networks.state_dict().items(), again.networks.state_dict().values(), strict=True):
         assert torch.equal(one, two), name
+
+
+def test_an_encoder_that_learns_by_itself_stays_as_it_is_afterwards(tmp_path, files):
+    """And the state that it tells comes nearer to the one that the frames show."""
+    trainer, _, _ = trainer_for(tmp_path / "run", files, apart=True)
+    kept = {}
+    begin = trainer.system.begin
+
+    def beginning(stage):
+        kept[stage] = copy.deepcopy(trainer.networks.frames.state_dict())
+        begin(stage)
+
+    trainer.system.begin = beginning
+    before = trainer.system.validate("frames")["val_state"]
+    assert trainer.run(quiet=True)
+    assert list(kept) == ["frames", "plans", "low_level", "high_level"]
+    moved = lambda a, b: any(not torch.equal(a[name], b[name]) for name in a)
+    assert moved(kept["frames"], kept["plans"])
+    assert not moved(kept["plans"], trainer.networks.frames.state_dict())
+    told = [row for row in trainer.curves if row["stage"] == "frames"][-1]
+    assert float(told["val_state"]) < before
+    assert training.load_run(tmp_path / "run")[1].config.images.frames.steps == APART["steps"]

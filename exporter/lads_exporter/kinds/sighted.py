@@ -12,7 +12,7 @@ from . import common, images, lads
 
 ENTRY, FEATURES = "observation_encoder/encode", "features"
 SIZE = (12, 16)  # rows and columns of the random policy's camera
-SEEN = config.Images("camera", [4, 8], [24], 16, 0.0, 0.0, 0.0, 0.0, 0.0)
+SEEN = config.Images("camera", [4, 8], [24], 16, 0.0, 0.0, 0.0, 0.0, 0.0, config.Stage(**config.NO_STAGE))
 
 
 class FrameEncoder(nn.Module):
