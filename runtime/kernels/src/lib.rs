@@ -35,6 +35,7 @@
 mod attention;
 mod cache;
 mod conv;
+mod conv_integers;
 mod depthwise;
 mod dispatch;
 mod elementwise;
@@ -57,6 +58,9 @@ mod subnormal;
 pub use attention::{Attention, attention_scratch_len};
 pub use cache::{Append, Cache, CacheFormat, CacheMut, keys_len};
 pub use conv::{Conv, Sweep, conv_pack, conv_packed_len};
+pub use conv_integers::{
+    ImageIntegers, IntegerConv, conv_integers_len, conv_integers_pack, conv_scale,
+};
 pub use depthwise::{Depthwise, depthwise_pack, depthwise_packed_len};
 pub use dispatch::Isa;
 pub use elementwise::{Unary, UnaryKind, assign};

@@ -10,8 +10,8 @@ use std::sync::Arc;
 use bytemuck::NoUninit;
 use lads_image::op::{WeightFormat, WeightSpan};
 use lads_kernels::{
-    PANEL, conv_pack, conv_packed_len, depthwise_pack, depthwise_packed_len, pack, packed_len,
-    stored,
+    PANEL, conv_integers_len, conv_integers_pack, conv_pack, conv_packed_len, conv_scale,
+    depthwise_pack, depthwise_packed_len, pack, packed_len, stored,
 };
 
 use crate::storage::Storage;
@@ -28,6 +28,9 @@ enum Form {
     Scales(WeightFormat),
     /// Weights of a convolution, with this number of groups of outputs.
     Windows(usize),
+    /// Integer weights of a convolution, with this number of groups of outputs, and of inputs in a
+    /// run.
+    Integers(WeightFormat, [usize; 2]),
     /// Weights of a depthwise convolution.
     Channels,
 }
@@ -39,6 +42,15 @@ pub(crate) struct Packed {
     pub w: WeightSpan,
     /// Scales of the columns, for integer formats only.
     pub scales: Option<WeightSpan>,
+}
+
+/// A matrix of a convolution in integers.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Integers {
+    /// The panels of each group of outputs in turn, all of the same length.
+    pub w: WeightSpan,
+    /// Scales and bias of each group of outputs in turn.
+    pub columns: WeightSpan,
 }
 
 /// The weights of an image.
@@ -82,7 +94,7 @@ impl<'s> Weights<'s> {
         };
         // One step for inputs of any size would be too coarse for the small ones.
         let asked = self.storage.of(self.entry, node);
-        let format = if asked.is_scaled() && is_uneven(data, n) {
+        let format = if asked.is_scaled() && is_uneven(squares(data, n)) {
             WeightFormat::F32
         } else {
             asked
@@ -121,13 +133,10 @@ impl<'s> Weights<'s> {
         self.once(tensor, Form::Packed(format), |this| {
             let mut panels = vec![T::default(); packed_len(format, [k, n])];
             pack(format, data, [k, n], &mut panels);
-            let words: Vec<f32> = bytemuck::cast_slice(&panels)
-                .as_chunks::<4>()
-                .0
-                .iter()
-                .map(|&word| f32::from_bits(u32::from_le_bytes(word)))
-                .collect();
-            this.store_blocks(&words, packed_len(format, [k, PANEL]) * size_of::<T>() / 4)
+            this.store_blocks(
+                &words(&panels),
+                packed_len(format, [k, PANEL]) * size_of::<T>() / 4,
+            )
         })
     }
 
@@ -164,15 +173,84 @@ impl<'s> Weights<'s> {
             let len = conv_packed_len([k, n]);
             let mut panels = vec![0.0; groups * len];
             for (i, panels) in panels.chunks_mut(len).enumerate() {
-                let own: Vec<f32> = data
-                    .chunks(all)
-                    .flat_map(|row| &row[i * n..][..n])
-                    .copied()
-                    .collect();
-                conv_pack(&own, [k, n], panels);
+                conv_pack(&group(data, all, [i, n]), [k, n], panels);
             }
             this.store(&panels)
         })
+    }
+
+    /// Returns the format of the weights of a convolution of `channels` input channels that was made
+    /// from `node`: an integer format or 32-bit floats.
+    pub fn format_of_windows(
+        &self,
+        tensor: &Tensor,
+        channels: usize,
+        node: &str,
+    ) -> Result<WeightFormat, String> {
+        let data = tensor.as_f32().ok_or("reads integers as numbers")?;
+        let &[_, n] = &tensor.shape[..] else {
+            return Err("has weights that are not a matrix".into());
+        };
+        let mut inputs = vec![0.0; channels];
+        for (l, squares) in squares(data, n).into_iter().enumerate() {
+            inputs[l % channels] += squares;
+        }
+        let asked = self.storage.of(self.entry, node);
+        // All channels of an image have one step.
+        Ok(if asked.is_scaled() && !is_uneven(inputs) {
+            asked
+        } else {
+            WeightFormat::F32
+        })
+    }
+
+    /// Stores the `[k, n]` matrix of a convolution, and its bias, for the kernel `IntegerConv`, whose
+    /// pixels read runs of `len` inputs.
+    pub fn integers(
+        &mut self,
+        [tensor, bias]: [&Arc<Tensor>; 2],
+        format: WeightFormat,
+        [groups, len]: [usize; 2],
+    ) -> Result<Integers, String> {
+        let numbers = |tensor: &'_ Arc<Tensor>| tensor.as_f32().map(<[f32]>::to_vec);
+        let (Some(data), Some(bias)) = (numbers(tensor), numbers(bias)) else {
+            return Err("reads integers as numbers".into());
+        };
+        let &[k, all] = &tensor.shape[..] else {
+            return Err("has weights that are not a matrix".into());
+        };
+        let n = all / groups;
+        let scales: Vec<f32> = (0..all)
+            .map(|j| conv_scale(format, data.iter().skip(j).step_by(all).copied(), len))
+            .collect();
+        let of_groups = scales.chunks(n).zip(bias.chunks(n));
+        let columns: Vec<f32> = of_groups
+            .flat_map(|(scales, bias)| [scales, bias].concat())
+            .collect();
+        // The columns come first: they are read once per panel.
+        let columns = self.store(&columns)?;
+        let runs = [k / len, len];
+        let w = self.once(tensor, Form::Integers(format, [groups, len]), |this| {
+            let words = if format == WeightFormat::Int8 {
+                words(&quantised(
+                    &data,
+                    &scales,
+                    [groups, n],
+                    runs,
+                    stored::to_int8,
+                )?)
+            } else {
+                words(&quantised(
+                    &data,
+                    &scales,
+                    [groups, n],
+                    runs,
+                    stored::to_int16,
+                )?)
+            };
+            this.store(&words)
+        })?;
+        Ok(Integers { w, columns })
     }
 
     /// Stores the `[kernel, c]` matrix of a convolution for the kernel `Depthwise`.
@@ -252,12 +330,58 @@ impl<'s> Weights<'s> {
     }
 }
 
-/// Returns whether a `[k, n]` matrix weights its inputs very differently, like a first layer whose
-/// inputs are sensors, each in its own unit: some input has four times the root mean square of the
-/// median one.
-fn is_uneven(data: &[f32], n: usize) -> bool {
-    let squares = |row: &[f32]| row.iter().map(|w| w * w).sum::<f32>();
-    let mut inputs: Vec<f32> = data.chunks(n.max(1)).map(squares).collect();
+/// Returns numbers of fewer bits as words.
+fn words<T: NoUninit>(numbers: &[T]) -> Vec<f32> {
+    bytemuck::cast_slice(numbers)
+        .as_chunks::<4>()
+        .0
+        .iter()
+        .map(|&word| f32::from_bits(u32::from_le_bytes(word)))
+        .collect()
+}
+
+/// Returns the `n` columns of group `i` of a matrix with `all` columns.
+fn group(data: &[f32], all: usize, [i, n]: [usize; 2]) -> Vec<f32> {
+    data.chunks(all)
+        .flat_map(|row| &row[i * n..][..n])
+        .copied()
+        .collect()
+}
+
+/// Quantises the matrix of a convolution, whose columns have `scales`, and packs it group by group.
+fn quantised<T: Copy + Default>(
+    data: &[f32],
+    scales: &[f32],
+    [groups, n]: [usize; 2],
+    runs: [usize; 2],
+    to: fn(f32, f32) -> T,
+) -> Result<Vec<T>, String> {
+    if data.iter().any(|w| !w.is_finite()) {
+        return Err("has weights that are not finite".into());
+    }
+    let len = conv_integers_len(runs, n);
+    let mut panels = vec![T::default(); groups * len];
+    for (i, panels) in panels.chunks_mut(len).enumerate() {
+        let scales = scales[i * n..][..n].iter().cycle();
+        let own: Vec<T> = group(data, groups * n, [i, n])
+            .into_iter()
+            .zip(scales)
+            .map(|(w, &scale)| to(w, scale))
+            .collect();
+        conv_integers_pack(&own, runs, n, panels);
+    }
+    Ok(panels)
+}
+
+/// Returns the sum of the squared weights of each input of a `[k, n]` matrix.
+fn squares(data: &[f32], n: usize) -> Vec<f32> {
+    let squares = |row: &[f32]| row.iter().map(|w| w * w).sum();
+    data.chunks(n.max(1)).map(squares).collect()
+}
+
+/// Returns whether a layer weights its inputs very differently, like a first layer whose inputs are
+/// sensors, each in its own unit: some input has four times the root mean square of the median one.
+fn is_uneven(mut inputs: Vec<f32>) -> bool {
     inputs.sort_by(f32::total_cmp);
     let median = inputs.get(inputs.len() / 2).copied().unwrap_or(0.0);
     inputs
