@@ -4,7 +4,8 @@
     python benches/python/images.py target/release/images BUNDLE.onnx... [FORMAT...]
 
 Formats are those of weights, such as int16, beside 32-bit floats. In each round every contender gets a block of steps, and a ratio is taken between two medians of the same round; printed are the medians
-of all blocks' medians and of the ratios, with quartiles. The library's own step includes the checks of the frame.
+of all blocks' medians and of the ratios, with quartiles. Times are those in which the thread ran, so that a busy machine changes them
+little. The library's own step includes the checks of the frame.
 """
 
 import subprocess
@@ -48,9 +49,9 @@ def main(worker, *arguments):
         def peer(count):
             took = []
             for _ in range(count):
-                start = time.perf_counter()
+                start = time.thread_time()
                 run()
-                took.append(1e3 * (time.perf_counter() - start))
+                took.append(1e3 * (time.thread_time() - start))
             return np.array(took)
 
         contenders = {"ONNX Runtime": peer} | {name: lambda count, name=name: ask(name, count) for name in names}
