@@ -9,6 +9,7 @@
 
 mod cached;
 mod compute;
+mod convolutions;
 mod images;
 mod view;
 mod weights;
@@ -195,7 +196,7 @@ struct Lowering<'a, 's> {
     /// Borders that the images have.
     borders: HashMap<Id, [usize; 4]>,
     /// Images that were converted to integers.
-    integers: HashMap<Id, images::Integers>,
+    integers: HashMap<Id, convolutions::Integers>,
     input_ports: Vec<(String, Place)>,
     output_ports: Vec<(String, Place)>,
     /// Dense layers and convolutions, in their order.

@@ -1,11 +1,10 @@
-//! Convolutions with integer weights: the image becomes integers too, once for all pixels that read it.
+//! Convolutions with integer weights, over an image of integers that `image_integers` made, once for all that read it.
 //!
 //! ```text
-//! largest = the largest magnitude of the image;  scale = largest / 16383;  q = x / scale, to the nearest
 //! for each panel of 16 outputs:                  [run][pair of inputs][16][2], one after the other in memory
 //!     for each output pixel:
 //!         for each 32 pairs of inputs, in the order of kernel rows, columns and channels:
-//!             integers[0..16] = sum over pairs of  q[2l] * panel[l][0..16][0] + q[2l + 1] * panel[l][0..16][1]
+//!             integers[0..16] = sum over pairs of  x[2l] * panel[l][0..16][0] + x[2l + 1] * panel[l][0..16][1]
 //!             sum[0..16] += integers
 //!         y[pixel][panel] = activation(sum * (scale * scale of the output) + bias + y)
 //! ```
@@ -16,23 +15,16 @@
 //! Nothing overflows: [`conv_scale`] gives an output a scale with which the magnitudes of its weights in each 32 pairs sum to no more
 //! than 131032, and `131032 * 16383 < 2^31`. For weights as random as a network's that is no bound, for equal ones it takes
 //! three bits. Weights that were not made so wrap around, alike everywhere.
-//!
-//! An input differs by half a unit, 2^-15 of the largest magnitude in its image. If the image contains infinity or NaN, every
-//! output is NaN; an image whose magnitudes are all below 2^-100 is read as zero.
 
 use core::hint::black_box;
 
 use crate::conv::{NEAR, Runs, Sweep, store};
 use crate::dispatch::{Isa, Kernel};
-use crate::elementwise::assign;
 use crate::integers::Integer;
 use crate::lanes::{Block, LANES};
-use crate::linear::{Activation, block};
+use crate::linear::{Activation, INTEGERS, block};
 use crate::simd::{Simd, prefetch_ahead};
 use crate::stored::{Panels, WeightFormat, int8_scale, int16_scale};
-
-/// Largest magnitude of an input as an integer.
-const LARGEST: f32 = 16383.0;
 
 /// Pairs of inputs whose products are added before they become floats.
 const GROUP: usize = 32;
@@ -112,154 +104,6 @@ pub fn conv_scale(
     int16_scale(weights).max(most / GROUP_SUM)
 }
 
-/// Conversion of an image to integers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ImageIntegers {
-    /// Number of rows and columns.
-    pub size: [usize; 2],
-    /// Number of channels.
-    pub c: usize,
-    /// Strides of the image, in elements: from a row to the next, then from a pixel to the next.
-    pub x_strides: [usize; 2],
-}
-
-impl ImageIntegers {
-    /// Writes the integers of the image `x`, row after row, and zeros behind them, to `y`, and returns
-    /// the value of an input per unit of its integer. If a view is too short, `y` is unchanged and
-    /// the result NaN.
-    pub fn run(&self, isa: Isa, x: &[f32], y: &mut [i16]) -> f32 {
-        let one = Sweep {
-            out: self.size,
-            kernel: [1; 2],
-            stride: [1; 2],
-            dilation: [1; 2],
-            x_strides: self.x_strides,
-            y_strides: [0; 2],
-        };
-        let there = one.reach(self.c).is_some_and(|reach| reach <= x.len());
-        let [rows, cols] = self.size;
-        let len = (rows.checked_mul(cols)).and_then(|pixels| pixels.checked_mul(self.c));
-        let mut scale = f32::NAN;
-        if there && len.is_some_and(|len| 0 < len && len <= y.len()) {
-            isa.run(Converted {
-                lines: Lines::of(self),
-                x,
-                y,
-                scale: &mut scale,
-            });
-        }
-        scale
-    }
-}
-
-/// Numbers that lie one after the other: two nested counts, their distances, and the length of a
-/// line.
-#[derive(Clone, Copy)]
-struct Lines {
-    times: [usize; 2],
-    apart: [usize; 2],
-    len: usize,
-}
-
-impl Lines {
-    fn of(image: &ImageIntegers) -> Self {
-        let ([rows, cols], [down, along]) = (image.size, image.x_strides);
-        let (times, len) = if cols > 1 && along != image.c {
-            ([rows, cols], image.c)
-        } else if rows > 1 && down != cols * image.c {
-            ([rows, 1], cols * image.c)
-        } else {
-            ([1, 1], rows * cols * image.c)
-        };
-        Self {
-            times,
-            apart: [down, along],
-            len,
-        }
-    }
-
-    /// Returns line `[row, column]` of `x`.
-    #[inline(always)]
-    fn get(self, x: &[f32], [row, col]: [usize; 2]) -> &[f32] {
-        let first = row * self.apart[0] + col * self.apart[1];
-        x.get(first..first + self.len).unwrap_or(&[])
-    }
-}
-
-/// Operands of a running conversion; `x` and `y` are long enough.
-struct Converted<'a> {
-    lines: Lines,
-    x: &'a [f32],
-    y: &'a mut [i16],
-    scale: &'a mut f32,
-}
-
-impl Kernel for Converted<'_> {
-    #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
-        const INFINITE: u32 = f32::INFINITY.to_bits();
-        /// Bits of 2^-100, below which magnitudes are read as zero.
-        const SMALLEST: u32 = (127 - 100) << 23;
-        // All ones, for masks: a selection may be compiled to a branch.
-        let all = |condition: bool| u32::from(condition).wrapping_neg();
-        let [rows, cols] = self.lines.times;
-        let mut largest = [simd.zeros(); 4];
-        for row in 0..rows {
-            for col in 0..cols {
-                let (fours, rest) = self.lines.get(self.x, [row, col]).as_chunks::<LANES>();
-                let (fours, blocks) = fours.as_chunks::<4>();
-                for four in fours {
-                    for (largest, x) in largest.iter_mut().zip(four) {
-                        *largest = simd.larger(*largest, simd.load(x));
-                    }
-                }
-                let [first, ..] = &mut largest;
-                for x in blocks {
-                    *first = simd.larger(*first, simd.load(x));
-                }
-                if !rest.is_empty() {
-                    let mut last = [0.0; LANES];
-                    assign(&mut last, rest);
-                    *first = simd.larger(*first, simd.load(&last));
-                }
-            }
-        }
-        let [a, b, c, d] = largest.map(|largest| simd.largest(largest));
-        let largest = a.max(b).max(c.max(d));
-        let (usable, finite) = (all(largest >= SMALLEST), all(largest < INFINITE));
-        let magnitude = f32::from_bits(largest);
-        let inverse = f32::from_bits((LARGEST / magnitude).to_bits() & usable & finite);
-        // Ones all through are not a number.
-        let scale = (magnitude / LARGEST).to_bits() & usable;
-        *self.scale = f32::from_bits(scale | !finite);
-        let inverse = simd.splat(inverse);
-        let mut y = self.y;
-        for row in 0..rows {
-            for col in 0..cols {
-                let line = self.lines.get(self.x, [row, col]);
-                let Some((to, others)) = y.split_at_mut_checked(line.len()) else {
-                    return;
-                };
-                y = others;
-                let (blocks, rest) = line.as_chunks::<LANES>();
-                let (to, to_rest) = to.as_chunks_mut::<LANES>();
-                for (to, x) in to.iter_mut().zip(blocks) {
-                    *to = simd.whole(simd.mul(simd.load(x), inverse));
-                }
-                if !rest.is_empty() {
-                    let mut last = [0.0; LANES];
-                    assign(&mut last, rest);
-                    let last = simd.whole(simd.mul(simd.load(&last), inverse));
-                    for (to, x) in to_rest.iter_mut().zip(last) {
-                        *to = x;
-                    }
-                }
-            }
-        }
-        y.fill(0);
-    }
-}
-
 /// Convolution of an image of integers.
 #[derive(Debug, Clone, Copy)]
 pub struct IntegerConv<'w> {
@@ -295,7 +139,7 @@ impl IntegerConv<'_> {
             .zip(self.n.checked_next_multiple_of(LANES))
             .and_then(|(pairs, n)| pairs.checked_mul(n)?.checked_mul(2));
         let pairs = pairs.unwrap_or(0);
-        if !there || pairs == 0 {
+        if !INTEGERS || !there || pairs == 0 {
             return;
         }
         match self.w {

@@ -40,6 +40,7 @@ mod depthwise;
 mod dispatch;
 mod elementwise;
 mod floats;
+mod image_integers;
 mod integers;
 mod lanes;
 mod linear;
@@ -58,12 +59,11 @@ mod subnormal;
 pub use attention::{Attention, attention_scratch_len};
 pub use cache::{Append, Cache, CacheFormat, CacheMut, keys_len};
 pub use conv::{Conv, Sweep, conv_pack, conv_packed_len};
-pub use conv_integers::{
-    ImageIntegers, IntegerConv, conv_integers_len, conv_integers_pack, conv_scale,
-};
+pub use conv_integers::{IntegerConv, conv_integers_len, conv_integers_pack, conv_scale};
 pub use depthwise::{Depthwise, depthwise_pack, depthwise_packed_len};
 pub use dispatch::Isa;
 pub use elementwise::{Unary, UnaryKind, assign};
+pub use image_integers::ImageIntegers;
 pub use linear::{Activation, Linear, PANEL, pack, packed_len, packed_rows};
 pub use matmul::MatMul;
 pub use norm::{LayerNorm, softmax};

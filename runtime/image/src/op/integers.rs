@@ -37,7 +37,9 @@ impl Operation for ImageIntegers {
         let integers = u64::from(rows)
             .saturating_mul(cols.into())
             .saturating_mul(self.c.into());
-        require(u64::from(self.y.len) == integers / 2 + 2, Fault::Shape)
+        // The scale, and a whole word for the one more.
+        let words = (integers / 2).saturating_add(2);
+        require(u64::from(self.y.len) == words, Fault::Shape)
     }
 
     #[inline]
