@@ -1,10 +1,11 @@
 """Measures control steps of policies that see images beside ONNX Runtime on the same graph: one thread, hot, in turns.
 
     cargo build --release -p lads-benches --bin images
-    python benches/python/images.py target/release/images BUNDLE.onnx...
+    python benches/python/images.py target/release/images BUNDLE.onnx... [FORMAT...]
 
-In each round every contender gets a block of steps, and a ratio is taken between two medians of the same round; printed are the medians
-of all blocks' medians and of the ratios, with quartiles. The library's own step includes the checks of the frame.
+Formats are those of weights, such as int16, beside 32-bit floats. In each round every contender gets a block of steps, and a ratio is taken between two medians of the same round; printed are the medians
+of all blocks' medians and of the ratios, with quartiles. Times are those in which the thread ran, so that a busy machine changes them
+little. The library's own step includes the checks of the frame.
 """
 
 import subprocess
@@ -29,9 +30,10 @@ def session(path):
     return lambda: found.run(None, feed)
 
 
-def main(worker, paths):
-    for path in paths:
-        process = subprocess.Popen([worker, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+def main(worker, *arguments):
+    formats = [argument for argument in arguments if not argument.endswith(".onnx")]
+    for path in (argument for argument in arguments if argument.endswith(".onnx")):
+        process = subprocess.Popen([worker, path, *formats], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         names = []
         while name := process.stdout.readline().strip():
             names.append(name)
@@ -47,9 +49,9 @@ def main(worker, paths):
         def peer(count):
             took = []
             for _ in range(count):
-                start = time.perf_counter()
+                start = time.thread_time()
                 run()
-                took.append(1e3 * (time.perf_counter() - start))
+                took.append(1e3 * (time.thread_time() - start))
             return np.array(took)
 
         contenders = {"ONNX Runtime": peer} | {name: lambda count, name=name: ask(name, count) for name in names}
@@ -68,8 +70,8 @@ def main(worker, paths):
         print(path)
         for name in contenders:
             low, middle, high = np.percentile(ratios[name], [25, 50, 75])
-            print(f"  {name:12}  {np.median(medians[name]):8.3f} ms, least {least[name]:8.3f} ms, {middle:.2f}x ({low:.2f} to {high:.2f}), of the least {least[name] / least['ONNX Runtime']:.2f}x")
+            print(f"  {name:14}  {np.median(medians[name]):8.3f} ms, least {least[name]:8.3f} ms, {middle:.2f}x ({low:.2f} to {high:.2f}), of the least {least[name] / least['ONNX Runtime']:.2f}x")
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1], sys.argv[2:]))
+    sys.exit(main(*sys.argv[1:]))

@@ -2,7 +2,7 @@
 
 A node of ONNX's conformance tests stands alone; here convolutions, pools, changes of size and what networks put between them follow each
 other at random and read each other's results, so that what the compiler fuses, turns, pads and adds in place meets in ways that nobody
-wrote down. The seeds are fixed. Skipped where ONNX Runtime or cargo is missing.
+wrote down; with weights of 32 bits, and as integers. The seeds are fixed. Skipped where ONNX Runtime or cargo is missing.
 """
 
 import random
@@ -19,6 +19,8 @@ from programs import built  # noqa: E402
 # The Makefile's: with another one cargo would build its dependencies once more.
 GRAPHS, STEPS, OUTPUTS = 60, 4, 3
 TOLERANCE = 1e-4
+# Of weights as integers, thrice what these graphs show.
+INTEGERS = {"int16": 1e-3, "int8": 2e-2}
 HEAD = 'environment = { id = "image-graph", version = "1" }\ncontrol_period_s = 0.02\n'
 ELEMENTWISE = {"Relu": {}, "LeakyRelu": {"alpha": 0.2}, "Tanh": {}, "Sigmoid": {}, "Elu": {}, "Softplus": {}}
 
@@ -184,10 +186,20 @@ def test_random_graphs_of_images(lads, tmp_path):
             wrong.append(f"{seed}: {imported.stderr}")
             continue
         text = "".join(",".join(repr(float(value)) for value in row) + "\n" for row in rows)
-        acted = subprocess.run([lads, "act", "--model", bundle], input=text, capture_output=True, text=True)
-        got = np.array([[float(value) for value in line.split(",")] for line in acted.stdout.splitlines()])
-        if got.shape != expected.shape or np.abs(got - expected).max() > TOLERANCE * max(1, np.abs(expected).max()):
-            wrong.append(f"{seed}: {got.tolist()} instead of {expected.tolist()} {acted.stderr}")
+        policies = {bundle: TOLERANCE}
+        for weights, tolerance in INTEGERS.items():
+            image = tmp_path / f"{seed}.{weights}.lads"
+            how = ["--weights", weights, "--tolerance", str(tolerance * max(1, np.abs(expected).max()))]
+            compiled = subprocess.run([lads, "compile", bundle, *how, "-o", image], capture_output=True, text=True)
+            if compiled.returncode != 0:
+                wrong.append(f"{seed}, {weights}: {compiled.stderr}")
+            else:
+                policies[image] = tolerance
+        for policy, tolerance in policies.items():
+            acted = subprocess.run([lads, "act", "--model", policy], input=text, capture_output=True, text=True)
+            got = np.array([[float(value) for value in line.split(",")] for line in acted.stdout.splitlines()])
+            if got.shape != expected.shape or np.abs(got - expected).max() > tolerance * max(1, np.abs(expected).max()):
+                wrong.append(f"{policy.name}: {got.tolist()} instead of {expected.tolist()} {acted.stderr}")
     assert not wrong, "\n".join(wrong)
     # The seeds reach all of them.
     wanted = {"Conv", "MaxPool", "AveragePool", "Resize", "GlobalAveragePool", "BatchNormalization", "Pad", "Slice", "Concat", "Transpose", "Add", "Sub", "Mul", "Div", "Clip", *ELEMENTWISE}

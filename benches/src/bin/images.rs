@@ -1,18 +1,21 @@
 //! Runs a policy that sees images, hot, for `python/images.py`, which lets it take turns with ONNX Runtime.
 //!
-//! Prints a line for each instruction set that this CPU offers. Then each line of its input, an instruction set and a number, is that many
-//! control steps of the golden episode, answered by a line of their nanoseconds. What can fail ends with one line on stderr and exit code 2.
+//! usage: images BUNDLE.onnx [FORMAT...], formats of weights, of which 32-bit floats are the first in any case.
+//!
+//! Prints a line for each instruction set that this CPU offers and each format. Then each line of its input, one of these and a number, is
+//! that many control steps of the golden episode, answered by a line of their nanoseconds, in which the thread ran. A format with which the golden episode is not
+//! replayed is measured too, and said on stderr. What can fail ends with one line on stderr and exit code 2.
 #![forbid(unsafe_code)]
 
 use std::error::Error;
 use std::io::{BufRead, Write};
 use std::path::Path;
 use std::process::ExitCode;
-use std::time::Instant;
 
-use lads_compiler::{Bundle, compile};
+use lads_compiler::{Bundle, Options, Storage, WeightFormat, compile_with, named};
 use lads_core::{Isa, Policy};
 use lads_host::Memory;
+use rustix::time::{ClockId, clock_gettime};
 
 fn main() -> ExitCode {
     match run() {
@@ -25,47 +28,71 @@ fn main() -> ExitCode {
 }
 
 fn run() -> Result<(), Box<dyn Error>> {
-    let path = std::env::args().nth(1).ok_or("name a bundle (.onnx)")?;
-    let image = compile(&Bundle::open(Path::new(&path))?)?;
-    let policy = Policy::new_checked(image.as_bytes())?;
-    let golden = policy.golden().ok_or("the bundle has no golden episode")?;
-    let isas: Vec<Isa> = Isa::all().collect();
-    let mut memories = isas
+    let mut args = std::env::args().skip(1);
+    let bundle = Bundle::open(Path::new(&args.next().ok_or("name a bundle (.onnx)")?))?;
+    let mut images = vec![];
+    for name in std::iter::once("f32".to_owned()).chain(args) {
+        let weights = named(&name, WeightFormat::ALL, WeightFormat::name)?;
+        let options = Options {
+            storage: Some(Storage::of_weights(weights)),
+            force: true,
+            ..Options::default()
+        };
+        images.push((name, compile_with(&bundle, &options)?));
+    }
+    let mut policies = vec![];
+    for (name, image) in &images {
+        policies.push((name, Policy::new_checked(image.as_bytes())?));
+    }
+    let contenders: Vec<_> = (policies.iter())
+        .flat_map(|policy| Isa::all().map(move |isa| (policy, isa)))
+        .collect();
+    let mut memories = contenders
         .iter()
-        .map(|_| Memory::of(&policy))
+        .map(|((_, policy), _)| Memory::of(policy))
         .collect::<Result<Vec<_>, _>>()?;
     let mut controllers = vec![];
-    for (memory, &isa) in memories.iter_mut().zip(&isas) {
-        let mut controller = memory.controller_with(&policy, isa)?;
-        controller.self_test()?;
+    for (memory, ((format, policy), isa)) in memories.iter_mut().zip(&contenders) {
+        let name = if *format == "f32" {
+            isa.name().to_owned()
+        } else {
+            format!("{} {format}", isa.name())
+        };
+        let mut controller = memory.controller_with(policy, *isa)?;
+        if let Err(error) = controller.self_test() {
+            eprintln!("{name}: {error}");
+        }
         controller.reset();
-        controllers.push(controller);
+        controllers.push((name, policy, controller));
     }
     let mut out = std::io::stdout().lock();
-    for isa in &isas {
-        writeln!(out, "{}", isa.name())?;
+    for (name, ..) in &controllers {
+        writeln!(out, "{name}")?;
     }
     writeln!(out)?;
     out.flush()?;
-    let mut action = vec![0.0; policy.contract().action_len()];
     for line in std::io::stdin().lock().lines() {
         let line = line?;
-        let (name, count) = line
-            .split_once(' ')
-            .ok_or("an instruction set and a number")?;
-        let at = isas.iter().position(|isa| isa.name() == name);
-        let controller = controllers
-            .get_mut(at.ok_or("an instruction set that is not there")?)
-            .ok_or("no controller")?;
+        let (name, count) = line.rsplit_once(' ').ok_or("a contender and a number")?;
+        let found = controllers.iter_mut().find(|(known, ..)| known == name);
+        let (_, policy, controller) = found.ok_or("a contender that is not there")?;
+        let golden = policy.golden().ok_or("the bundle has no golden episode")?;
+        let mut action = vec![0.0; policy.contract().action_len()];
         let mut took = vec![];
         for i in 0..count.parse()? {
             let step = golden.step(i % golden.len()).ok_or("no step")?;
-            let start = Instant::now();
+            let start = ran_ns();
             controller.step_with(step.observations(), &mut action)?;
-            took.push(start.elapsed().as_nanos().to_string());
+            took.push((ran_ns() - start).to_string());
         }
         writeln!(out, "{}", took.join(" "))?;
         out.flush()?;
     }
     Ok(())
+}
+
+/// Returns for how many nanoseconds this thread has run, without the time in which it waited for others.
+fn ran_ns() -> i64 {
+    let time = clock_gettime(ClockId::ThreadCPUTime);
+    1_000_000_000 * time.tv_sec + time.tv_nsec
 }

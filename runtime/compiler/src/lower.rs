@@ -9,6 +9,7 @@
 
 mod cached;
 mod compute;
+mod convolutions;
 mod images;
 mod view;
 mod weights;
@@ -194,9 +195,11 @@ struct Lowering<'a, 's> {
     wanted: HashMap<Id, [usize; 4]>,
     /// Borders that the images have.
     borders: HashMap<Id, [usize; 4]>,
+    /// Images that were converted to integers.
+    integers: HashMap<Id, convolutions::Integers>,
     input_ports: Vec<(String, Place)>,
     output_ports: Vec<(String, Place)>,
-    /// Dense layers, in their order.
+    /// Dense layers and convolutions, in their order.
     layers: Vec<LayerReport>,
 }
 
@@ -224,6 +227,7 @@ impl<'a, 's> Lowering<'a, 's> {
             placed: HashMap::new(),
             wanted: HashMap::new(),
             borders: HashMap::new(),
+            integers: HashMap::new(),
             input_ports: vec![],
             output_ports: vec![],
             layers: vec![],

@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use lads_image::op::WeightFormat;
 
-/// One dense layer of a program.
+/// One dense layer or convolution of a program.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LayerReport {
     /// Name of the ONNX node that the layer was made from, or of that node's first output.
@@ -33,7 +33,8 @@ pub struct ProgramReport {
     pub arena_len: usize,
     /// Lower bound of the arena: the largest sum of values that live at the same time.
     pub arena_lower_bound: usize,
-    /// Dense layers of the program, in their order.
+    /// Dense layers and convolutions of the program, in their order; depthwise ones always have
+    /// 32-bit floats.
     pub layers: Vec<LayerReport>,
 }
 

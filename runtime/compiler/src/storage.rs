@@ -26,12 +26,13 @@ const VERSION: u32 = 1;
 /// Number of a `ModelProto`'s field that holds its metadata.
 const METADATA_FIELD: u64 = 14;
 
-/// Storage formats of the weights of dense layers and of the KV caches of an image; all other
-/// numbers are 32-bit floats.
+/// Storage formats of the weights of dense layers and convolutions and of the KV caches of an image;
+/// all other numbers are 32-bit floats. Convolutions take the integer formats and keep 32 bits in
+/// others; depthwise ones keep them always.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(into = "Names", try_from = "Names")]
 pub struct Storage {
-    /// Format of the weights of all dense layers that `parts` does not name.
+    /// Format of the weights of all dense layers and convolutions that `parts` does not name.
     pub weights: WeightFormat,
     /// Exceptions for parts: by the name of an entry graph, for example `low_level/act`, or of one
     /// ONNX node in it, which takes precedence.

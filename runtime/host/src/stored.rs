@@ -5,7 +5,7 @@ use lads_image::Tables;
 use lads_image::op::{CacheFormat, Op, WeightFormat};
 
 /// Names the formats that a policy's programs read, for example `f16 and f32 weights, f16 cache`; a
-/// policy without dense layers or without a cache names none of them.
+/// policy without dense layers and convolutions or without a cache names none of them.
 pub fn stored(policy: &Policy<'_>) -> String {
     let (weights, caches) = formats(policy);
     let all = [
@@ -36,7 +36,12 @@ fn formats(policy: &Policy<'_>) -> (Vec<WeightFormat>, Vec<CacheFormat>) {
         })
         .collect();
     let weights = WeightFormat::ALL.into_iter().filter(|&format| {
-        let stores = |op: &Op| matches!(op, Op::Linear(op) if op.format == format);
+        let stores = |op: &Op| match op {
+            Op::Linear(op) => op.format == format,
+            Op::IntegerConv(op) => op.format == format,
+            Op::Conv(_) | Op::Depthwise(_) => format == WeightFormat::F32,
+            _ => false,
+        };
         ops.iter().any(stores)
     });
     let caches = CacheFormat::ALL.into_iter().filter(|&format| {

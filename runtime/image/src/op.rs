@@ -25,6 +25,7 @@ mod copy;
 mod depthwise;
 mod gather_row;
 mod index;
+mod integers;
 mod layer_norm;
 mod linear;
 mod matmul;
@@ -50,6 +51,7 @@ pub use copy::Copy;
 pub use depthwise::Depthwise;
 pub use gather_row::GatherRow;
 pub use index::{FromIndex, ToIndex};
+pub use integers::{ImageIntegers, IntegerConv};
 pub use layer_norm::LayerNorm;
 pub use linear::{Activation, Linear, WeightFormat};
 pub use matmul::MatMul;
@@ -267,6 +269,8 @@ ops! {
     Border = 18 if "conv",
     Pool = 19 if "pool",
     Resize = 20 if "resize",
+    ImageIntegers = 21 if "conv",
+    IntegerConv = 22 if "conv",
 }
 
 #[cfg(test)]

@@ -25,7 +25,7 @@ use crate::simd::{Simd, prefetch_ahead};
 
 /// Number of words of weights that are used for one tile of pixels before the next: a third of a
 /// first-level cache.
-const NEAR: usize = 4096;
+pub(crate) const NEAR: usize = 4096;
 
 /// Returns the number of elements of a `[k, n]` matrix in panels of sixteen outputs, `k` counting
 /// kernel rows, columns and input channels.
@@ -90,6 +90,14 @@ impl Sweep {
             reach = reach.checked_add(last)?;
         }
         Some(reach)
+    }
+
+    /// Returns how many runs of inputs, one after the other in memory, an output pixel reads, and the
+    /// number of inputs of each, for pixels of `c` channels: the rows of the kernel if their pixels
+    /// follow one another, else each of its pixels.
+    pub fn runs(&self, c: usize) -> [usize; 2] {
+        let runs = Runs::of(self, c);
+        [runs.times[0].saturating_mul(runs.times[1]), runs.len]
     }
 
     /// Returns the distance in input elements from one element of the kernel to the next, down and
@@ -182,28 +190,28 @@ struct Pixels<'a> {
 
 /// Runs of inputs that one output pixel reads: two nested counts, their distances, and the length
 /// of a run.
-struct Runs {
-    times: [usize; 2],
-    apart: [usize; 2],
-    len: usize,
+pub(crate) struct Runs {
+    pub times: [usize; 2],
+    pub apart: [usize; 2],
+    pub len: usize,
 }
 
 impl Runs {
     #[inline(always)]
-    fn of(conv: &Conv) -> Self {
-        let [rows, cols] = conv.sweep.kernel;
-        let apart = conv.sweep.apart();
-        if apart[1] == conv.c || cols == 1 {
+    pub fn of(sweep: &Sweep, c: usize) -> Self {
+        let [rows, cols] = sweep.kernel;
+        let apart = sweep.apart();
+        if apart[1] == c || cols == 1 {
             Self {
                 times: [rows, 1],
                 apart,
-                len: cols * conv.c,
+                len: cols.saturating_mul(c),
             }
         } else {
             Self {
                 times: [rows, cols],
                 apart,
-                len: conv.c,
+                len: c,
             }
         }
     }
@@ -219,7 +227,7 @@ impl Kernel for Pixels<'_> {
     #[inline(always)]
     fn run<S: Simd>(mut self, simd: S) {
         let conv = self.conv;
-        let runs = Runs::of(conv);
+        let runs = Runs::of(&conv.sweep, conv.c);
         let pixels = conv.sweep.out[0] * conv.sweep.out[1];
         let panels = conv.n.div_ceil(LANES);
         let near = (NEAR / (self.k * LANES).max(1)).min(panels);
@@ -291,35 +299,45 @@ impl Pixels<'_> {
                     .y
                     .get_mut(at.saturating_add(first)..)
                     .unwrap_or(&mut []);
-                self.conv
-                    .finish(simd, simd.add(simd.load(sum), bias), y, width);
+                let v = simd.add(simd.load(sum), bias);
+                let Conv {
+                    activation,
+                    accumulate,
+                    ..
+                } = *self.conv;
+                store(simd, (activation, accumulate), v, y, width);
             }
         }
     }
 }
 
-impl Conv<'_> {
-    /// Applies accumulation and activation to the first `width` of sixteen outputs and stores them.
-    #[inline(always)]
-    fn finish<S: Simd>(&self, simd: S, mut v: S::V, y: &mut [f32], width: usize) {
-        if width == LANES
-            && let Some(y) = y.first_chunk_mut()
-        {
-            if self.accumulate {
-                v = simd.add(v, simd.load(y));
-            }
-            simd.store(self.activation.apply(simd, v), y);
-            return;
+/// Adds what is there if asked to, applies the activation to the first `width` of sixteen outputs,
+/// and stores them.
+#[inline(always)]
+pub(crate) fn store<S: Simd>(
+    simd: S,
+    (activation, accumulate): (Activation, bool),
+    mut v: S::V,
+    y: &mut [f32],
+    width: usize,
+) {
+    if width == LANES
+        && let Some(y) = y.first_chunk_mut()
+    {
+        if accumulate {
+            v = simd.add(v, simd.load(y));
         }
-        let mut spare = [0.0; LANES];
-        let y = y.get_mut(..width).unwrap_or(&mut []);
-        if self.accumulate {
-            assign(&mut spare, y);
-            v = simd.add(v, simd.load(&spare));
-        }
-        simd.store(self.activation.apply(simd, v), &mut spare);
-        assign(y, &spare);
+        simd.store(activation.apply(simd, v), y);
+        return;
     }
+    let mut spare = [0.0; LANES];
+    let y = y.get_mut(..width).unwrap_or(&mut []);
+    if accumulate {
+        assign(&mut spare, y);
+        v = simd.add(v, simd.load(&spare));
+    }
+    simd.store(activation.apply(simd, v), &mut spare);
+    assign(y, &spare);
 }
 
 /// Computes the sums of `P` pixels with `B` panels of `k` weights each, starting at panel `first`.

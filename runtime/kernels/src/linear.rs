@@ -72,7 +72,7 @@ pub fn pack<T: Copy + Default>(format: WeightFormat, w: &[T], [k, n]: [usize; 2]
 
 /// True if this build has the kernels of integer weights; without them such a layer computes
 /// nothing.
-const INTEGERS: bool = cfg!(feature = "integer-weights");
+pub(crate) const INTEGERS: bool = cfg!(feature = "integer-weights");
 
 /// True if this build has the kernels of 16-bit floats; without them such a layer computes nothing.
 const HALVES: bool = cfg!(feature = "half-weights");

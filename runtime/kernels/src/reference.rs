@@ -12,7 +12,7 @@ use crate::{
     Activation, Attention, Axis, BinaryKind, Cache, MatMul, ReduceKind, StridedCopy, UnaryKind,
 };
 
-pub use images::{conv, depthwise, pool, resize};
+pub use images::{conv, depthwise, integer_conv, pool, resize};
 
 /// Applies a non-linearity to `x`.
 pub fn activation(activation: Activation, x: f64) -> f64 {

@@ -37,6 +37,9 @@ pub(crate) trait Simd: Copy {
     const PIXELS: usize;
     /// Number of panels of sixteen outputs that share the pixels that are read, one or two.
     const PANELS: usize;
+    /// Number of panels and of pixels whose sums of integers stay in registers, beside the operands:
+    /// one, two or four panels, three or six pixels.
+    const INTEGER_TILE: [usize; 2];
 
     /// Returns the same number in every lane.
     fn splat(self, x: f32) -> Self::V;
@@ -167,6 +170,7 @@ impl Simd for Portable {
     const CHAINS: usize = 1;
     const PIXELS: usize = 3;
     const PANELS: usize = 1;
+    const INTEGER_TILE: [usize; 2] = [1, 3];
 
     #[inline(always)]
     fn splat(self, x: f32) -> Block {

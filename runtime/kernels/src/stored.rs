@@ -9,6 +9,9 @@
 //! | `Bf16` | 16 | half a unit of 8 bits (relative 2^-8) | none |
 //! | `Int8` | 8, and one `f32` scale per output | half of the scale: the output's largest weight / 254 | the largest of 256 inputs / 16382 |
 //!
+//! Convolutions have `F32`, `Int16` and `Int8` weights, and all inputs of an image one step: the
+//! errors are in `image_integers` and `conv_integers`.
+//!
 //! Conversions round to the nearest, ties to even, and are exact the other way, so every
 //! instruction set decodes the same bits. Encoding is done offline and can fail: [`to_f16`] returns
 //! `None` for numbers that are too large.

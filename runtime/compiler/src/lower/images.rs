@@ -1,21 +1,19 @@
-//! Lowers convolutions, pools and resizes, and places images with their borders.
+//! Places images with their borders, and lowers pools and resizes.
 //!
 //! A convolution reads an image whose border is stored. The op that computes an image leaves room
 //! for the border that its readers need and fills that first, so that the image is written once,
 //! inside its border; any other image is copied into one with a border.
 
-use lads_image::op::{
-    Activation, Border, Conv, Depthwise, Pair, Picture, Pool, PoolKind, Resize, WeightSpan, Window,
-};
+use lads_image::op::{Border, Pair, Picture, Pool, PoolKind, Resize, WeightSpan, Window};
 
 use super::Lowering;
-use super::compute::{Done, activation_of, product};
+use super::compute::{Done, product};
 use super::view::View;
-use crate::graph::{ConvOp, Id, Op, Windows};
+use crate::graph::{Id, Op, Windows};
 use crate::tensor::{MAX_ELEMENTS, elements};
 
 /// Returns the batch, rows, columns and channels of images or sequences.
-fn four(shape: &[usize]) -> Result<[usize; 4], String> {
+pub(super) fn four(shape: &[usize]) -> Result<[usize; 4], String> {
     match *shape {
         [n, rows, cols, c] => Ok([n, rows, cols, c]),
         [n, cols, c] => Ok([n, 1, cols, c]),
@@ -23,7 +21,7 @@ fn four(shape: &[usize]) -> Result<[usize; 4], String> {
     }
 }
 
-fn pair([rows, cols]: [usize; 2]) -> Result<Pair, String> {
+pub(super) fn pair([rows, cols]: [usize; 2]) -> Result<Pair, String> {
     let number =
         |n: usize| u16::try_from(n).map_err(|_| format!("has a side of {n}, beyond {}", u16::MAX));
     Ok(Pair {
@@ -33,16 +31,16 @@ fn pair([rows, cols]: [usize; 2]) -> Result<Pair, String> {
 }
 
 /// Returns the smallest border that covers both.
-fn larger(a: [usize; 4], b: [usize; 4]) -> [usize; 4] {
+pub(super) fn larger(a: [usize; 4], b: [usize; 4]) -> [usize; 4] {
     std::array::from_fn(|i| a[i].max(b[i]))
 }
 
 /// Images in memory: their view, and the distances between images, rows and pixels.
-struct Images {
-    view: View,
-    each: usize,
-    row: usize,
-    pixel: usize,
+pub(super) struct Images {
+    pub view: View,
+    pub each: usize,
+    pub row: usize,
+    pub pixel: usize,
 }
 
 impl Lowering<'_, '_> {
@@ -74,7 +72,7 @@ impl Lowering<'_, '_> {
     }
 
     /// Returns the padding that a convolution actually reads.
-    fn reached(&self, windows: &Windows, x: Id) -> [usize; 4] {
+    pub(super) fn reached(&self, windows: &Windows, x: Id) -> [usize; 4] {
         let shape = self
             .shape(x)
             .and_then(|shape| four(&shape))
@@ -83,7 +81,7 @@ impl Lowering<'_, '_> {
     }
 
     /// Allocates a new image with the border that its readers need.
-    fn image(&mut self, id: Id, shape: &[usize]) -> Result<View, String> {
+    pub(super) fn image(&mut self, id: Id, shape: &[usize]) -> Result<View, String> {
         let border = self.wanted.get(&id).copied().unwrap_or_default();
         if border == [0; 4] || self.placed.contains_key(&id) {
             return Ok(self.allocate(id, shape));
@@ -150,7 +148,7 @@ impl Lowering<'_, '_> {
     }
 
     /// Returns the images that a convolution reads, starting at the first pixel of their border.
-    fn with_border(
+    pub(super) fn with_border(
         &mut self,
         id: Id,
         pads: [usize; 4],
@@ -185,7 +183,7 @@ impl Lowering<'_, '_> {
     }
 
     /// Returns one of the images, `[rows, columns]` of it, some of its channels.
-    fn picture(
+    pub(super) fn picture(
         &self,
         images: &Images,
         i: usize,
@@ -203,85 +201,9 @@ impl Lowering<'_, '_> {
         }
     }
 
-    pub(super) fn conv(&mut self, id: Id, x: &[Id], conv: ConvOp) -> Done {
-        let (from, shape) = (self.shape(x[0])?, self.shape(id)?);
-        let ([n, .., channels], [.., outputs]) = (four(&from)?, four(&shape)?);
-        let matrix = self
-            .g
-            .constant(x[1])
-            .cloned()
-            .ok_or("reads weights that are not constant")?;
-        let bias = self.plain(x[2])?;
-        let value = if conv.fill {
-            Some(self.plain(x[3])?)
-        } else {
-            None
-        };
-        let pads = self.reached(&conv.windows, x[0]);
-        let input = self.with_border(x[0], pads, value)?;
-        let y = match x.last() {
-            Some(&to) if conv.residual => self.sum(id, x[0], to)?,
-            _ => self.image(id, &shape)?,
-        };
-        self.set(id, y.clone());
-        let output = Images::of(y);
-        let windows = conv.windows;
-        let window = window(&windows)?;
-        let covered: [usize; 2] = std::array::from_fn(|i| {
-            (windows.out[i] - 1) * windows.stride[i]
-                + (windows.kernel[i] - 1) * windows.dilation[i]
-                + 1
-        });
-        let activation = match (conv.bound, conv.activation) {
-            (Some(bound), _) => Activation::Clipped(f32::from_bits(bound)),
-            (None, Some(unary)) => activation_of(unary),
-            (None, None) => Activation::None,
-        };
-        if conv.groups == channels && outputs == channels && !conv.residual && channels > 1 {
-            let w = self.weights.channels(&matrix)?;
-            for i in 0..n {
-                let op = Depthwise {
-                    x: self.picture(&input, i, covered, [0, channels]),
-                    y: self.picture(&output, i, windows.out, [0, channels]),
-                    window,
-                    c: channels as u32,
-                    w,
-                    bias,
-                    activation,
-                };
-                self.ops.push(op.into());
-            }
-            return Ok(());
-        }
-        let whole = self.weights.windows(&matrix, conv.groups)?;
-        let (c, own) = (channels / conv.groups, outputs / conv.groups);
-        let each = whole.len / conv.groups as u32;
-        for (i, group) in (0..n).flat_map(|i| (0..conv.groups).map(move |group| (i, group))) {
-            let op = Conv {
-                x: self.picture(&input, i, covered, [group * c, c]),
-                y: self.picture(&output, i, windows.out, [group * own, own]),
-                window,
-                c: c as u32,
-                n: own as u32,
-                w: WeightSpan {
-                    offset: whole.offset + group as u32 * each,
-                    len: each,
-                },
-                bias: WeightSpan {
-                    offset: bias.offset + (group * own) as u32,
-                    len: own as u32,
-                },
-                activation,
-                accumulate: conv.residual,
-            };
-            self.ops.push(op.into());
-        }
-        Ok(())
-    }
-
     /// Returns the place that a convolution is added to: the residual itself if it has no other
     /// reader, else a copy.
-    fn sum(&mut self, id: Id, x: Id, residual: Id) -> Result<View, String> {
+    pub(super) fn sum(&mut self, id: Id, x: Id, residual: Id) -> Result<View, String> {
         let shape = self.shape(id)?;
         let there = self.borders.get(&residual).copied().unwrap_or_default();
         let wanted = self.wanted.get(&id).copied().unwrap_or_default();
@@ -351,7 +273,7 @@ impl Lowering<'_, '_> {
 
 impl Images {
     /// Reads the images of a view `[N, rows, columns, C]` or `[N, columns, C]`.
-    fn of(view: View) -> Self {
+    pub fn of(view: View) -> Self {
         let (each, row, pixel) = match view.strides[..] {
             [each, row, pixel, _] => (each, row, pixel),
             [each, pixel, _] => (each, 0, pixel),
@@ -366,7 +288,7 @@ impl Images {
     }
 }
 
-fn window(windows: &Windows) -> Result<Window, String> {
+pub(super) fn window(windows: &Windows) -> Result<Window, String> {
     Ok(Window {
         out: pair(windows.out)?,
         kernel: pair(windows.kernel)?,

@@ -3,16 +3,15 @@
 //! Packed matrices are compared panel by panel, so that a matrix is stored once even if another
 //! program needs only some of its columns: the columns' panels are consecutive inside it.
 
+mod windows;
+
 use std::collections::HashMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 
 use bytemuck::NoUninit;
 use lads_image::op::{WeightFormat, WeightSpan};
-use lads_kernels::{
-    PANEL, conv_pack, conv_packed_len, depthwise_pack, depthwise_packed_len, pack, packed_len,
-    stored,
-};
+use lads_kernels::{PANEL, pack, packed_len, stored};
 
 use crate::storage::Storage;
 use crate::tensor::Tensor;
@@ -28,6 +27,9 @@ enum Form {
     Scales(WeightFormat),
     /// Weights of a convolution, with this number of groups of outputs.
     Windows(usize),
+    /// Integer weights of a convolution, with this number of groups of outputs, and of inputs in a
+    /// run.
+    Integers(WeightFormat, [usize; 2]),
     /// Weights of a depthwise convolution.
     Channels,
 }
@@ -82,7 +84,7 @@ impl<'s> Weights<'s> {
         };
         // One step for inputs of any size would be too coarse for the small ones.
         let asked = self.storage.of(self.entry, node);
-        let format = if asked.is_scaled() && is_uneven(data, n) {
+        let format = if asked.is_scaled() && is_uneven(squares(data, n)) {
             WeightFormat::F32
         } else {
             asked
@@ -121,13 +123,10 @@ impl<'s> Weights<'s> {
         self.once(tensor, Form::Packed(format), |this| {
             let mut panels = vec![T::default(); packed_len(format, [k, n])];
             pack(format, data, [k, n], &mut panels);
-            let words: Vec<f32> = bytemuck::cast_slice(&panels)
-                .as_chunks::<4>()
-                .0
-                .iter()
-                .map(|&word| f32::from_bits(u32::from_le_bytes(word)))
-                .collect();
-            this.store_blocks(&words, packed_len(format, [k, PANEL]) * size_of::<T>() / 4)
+            this.store_blocks(
+                &words(&panels),
+                packed_len(format, [k, PANEL]) * size_of::<T>() / 4,
+            )
         })
     }
 
@@ -150,42 +149,6 @@ impl<'s> Weights<'s> {
         let scales = self.once(tensor, Form::Scales(format), |this| this.store(scales))?;
         let w = self.panels(tensor, format, [k, n], &integers)?;
         Ok((w, Some(scales)))
-    }
-
-    /// Stores the `[k, n]` matrix of a convolution for the kernel `Conv`: the panels of each group
-    /// of outputs in turn, all of the same length.
-    pub fn windows(&mut self, tensor: &Arc<Tensor>, groups: usize) -> Result<WeightSpan, String> {
-        let data = tensor.as_f32().ok_or("reads integers as numbers")?;
-        let &[k, all] = &tensor.shape[..] else {
-            return Err("has weights that are not a matrix".into());
-        };
-        self.once(tensor, Form::Windows(groups), |this| {
-            let n = all / groups;
-            let len = conv_packed_len([k, n]);
-            let mut panels = vec![0.0; groups * len];
-            for (i, panels) in panels.chunks_mut(len).enumerate() {
-                let own: Vec<f32> = data
-                    .chunks(all)
-                    .flat_map(|row| &row[i * n..][..n])
-                    .copied()
-                    .collect();
-                conv_pack(&own, [k, n], panels);
-            }
-            this.store(&panels)
-        })
-    }
-
-    /// Stores the `[kernel, c]` matrix of a convolution for the kernel `Depthwise`.
-    pub fn channels(&mut self, tensor: &Arc<Tensor>) -> Result<WeightSpan, String> {
-        let data = tensor.as_f32().ok_or("reads integers as numbers")?;
-        let &[kernel, c] = &tensor.shape[..] else {
-            return Err("has weights that are not a matrix".into());
-        };
-        self.once(tensor, Form::Channels, |this| {
-            let mut packed = vec![0.0; depthwise_packed_len([kernel, c])];
-            depthwise_pack(data, [kernel, c], &mut packed);
-            this.store(&packed)
-        })
     }
 
     fn once(
@@ -252,12 +215,25 @@ impl<'s> Weights<'s> {
     }
 }
 
-/// Returns whether a `[k, n]` matrix weights its inputs very differently, like a first layer whose
-/// inputs are sensors, each in its own unit: some input has four times the root mean square of the
-/// median one.
-fn is_uneven(data: &[f32], n: usize) -> bool {
-    let squares = |row: &[f32]| row.iter().map(|w| w * w).sum::<f32>();
-    let mut inputs: Vec<f32> = data.chunks(n.max(1)).map(squares).collect();
+/// Returns numbers of fewer bits as words.
+fn words<T: NoUninit>(numbers: &[T]) -> Vec<f32> {
+    bytemuck::cast_slice(numbers)
+        .as_chunks::<4>()
+        .0
+        .iter()
+        .map(|&word| f32::from_bits(u32::from_le_bytes(word)))
+        .collect()
+}
+
+/// Returns the sum of the squared weights of each input of a `[k, n]` matrix.
+fn squares(data: &[f32], n: usize) -> Vec<f32> {
+    let squares = |row: &[f32]| row.iter().map(|w| w * w).sum();
+    data.chunks(n.max(1)).map(squares).collect()
+}
+
+/// Returns whether a layer weights its inputs very differently, like a first layer whose inputs are
+/// sensors, each in its own unit: some input has four times the root mean square of the median one.
+fn is_uneven(mut inputs: Vec<f32>) -> bool {
     inputs.sort_by(f32::total_cmp);
     let median = inputs.get(inputs.len() / 2).copied().unwrap_or(0.0);
     inputs
@@ -322,6 +298,32 @@ mod tests {
                 wanted
             };
             assert_eq!(format(wanted, &uneven), expected);
+        }
+    }
+    #[test]
+    fn convolutions_take_integers_unless_their_channels_differ() {
+        // Three channels, of which the last weighs most; a kernel of two pixels, of which one does.
+        let matrix = |channels: [f32; 3], pixels: [f32; 2]| {
+            let inputs = pixels
+                .iter()
+                .flat_map(|p| channels.iter().map(move |c| p * c));
+            let data = inputs.flat_map(|w| [w, -w]).collect();
+            Tensor::f32(&[6, 2], data)
+        };
+        for wanted in WeightFormat::ALL {
+            let storage = Storage::of_weights(wanted);
+            let weights = Weights::new(&storage);
+            let format = |channels, pixels| {
+                let found = weights.format_of_windows(&matrix(channels, pixels), 3, "conv");
+                found.unwrap()
+            };
+            let stored = if wanted.is_scaled() {
+                wanted
+            } else {
+                WeightFormat::F32
+            };
+            assert_eq!(format([0.1, -0.3, 0.2], [9.0, 0.1]), stored);
+            assert_eq!(format([0.1, -0.1, 0.9], [1.0, 1.0]), WeightFormat::F32);
         }
     }
 }

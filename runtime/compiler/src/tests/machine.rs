@@ -278,6 +278,9 @@ impl<'w> Machine<'w> {
                 );
                 self.put(op.y.at, &y);
             }
+            Op::ImageIntegers(_) | Op::IntegerConv(_) => {
+                panic!("programs of these tests have 32-bit floats")
+            }
             Op::Border(op) => {
                 let ([top, left], [rows, cols]) = (pair(op.before), pair(op.inside));
                 let [_, right] = pair(op.after);

@@ -53,7 +53,7 @@ impl Field for Activation {
 }
 
 /// Returns whether this build has the kernels of a format.
-const fn is_built(format: WeightFormat) -> bool {
+pub(super) const fn is_built(format: WeightFormat) -> bool {
     match format {
         WeightFormat::F32 => true,
         WeightFormat::F16 | WeightFormat::Bf16 => cfg!(feature = "half-weights"),

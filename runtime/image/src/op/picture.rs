@@ -143,12 +143,17 @@ impl Window {
     }
 
     pub(super) fn sweep(self, x: Picture, y: Picture) -> kernels::Sweep {
+        self.sweep_with(x.strides(), y)
+    }
+
+    /// Returns the sweep over an input with these strides.
+    pub(super) fn sweep_with(self, x_strides: [usize; 2], y: Picture) -> kernels::Sweep {
         kernels::Sweep {
             out: self.out.sizes(),
             kernel: self.kernel.sizes(),
             stride: self.stride.sizes(),
             dilation: self.dilation.sizes(),
-            x_strides: x.strides(),
+            x_strides,
             y_strides: y.strides(),
         }
     }

@@ -1,9 +1,10 @@
 //! Sound ops on images: with a border between rows, and as one of two groups of channels.
 
 use lads_image::op::{
-    Activation, Border, Conv, Depthwise, Op, Pair, Picture, Pool, PoolKind, Resize, Window,
+    Activation, Border, Conv, Depthwise, ImageIntegers, IntegerConv, Op, Pair, Picture, Pool,
+    PoolKind, Resize, WeightFormat, Window,
 };
-use lads_kernels::{conv_packed_len, depthwise_packed_len};
+use lads_kernels::{conv_integers_len, conv_packed_len, depthwise_packed_len};
 
 use super::samples::{span, weight};
 
@@ -46,6 +47,31 @@ pub fn images() -> Vec<Op> {
         bias: weight(200, 3),
         activation: Activation::LeakyRelu(0.1),
     };
+    let integers = ImageIntegers {
+        x,
+        size: Pair { rows: 4, cols: 5 },
+        c: 3,
+        y: span(200, 32),
+    };
+    // One of two groups of channels of four rows of five pixels; each pixel is a run of three.
+    let integer_conv = |format: WeightFormat, accumulate| {
+        let words = conv_integers_len([2, 3], 3) * format.bytes() / 4;
+        IntegerConv {
+            x: span(100, 1 + 4 * 5 * 6 / 2 + 1),
+            first: 3,
+            row: 30,
+            pixel: 6,
+            y,
+            window,
+            c: 3,
+            n: 3,
+            format,
+            w: weight(4, words as u32),
+            columns: weight(200, 6),
+            activation: Activation::Relu,
+            accumulate,
+        }
+    };
     let border = |value, after: u16| Border {
         y: span(30, 4 * (3 + u32::from(after)) * 2),
         inside: Pair { rows: 2, cols: 2 },
@@ -78,6 +104,9 @@ pub fn images() -> Vec<Op> {
         cols: weight(20, 9),
     };
     vec![
+        integers.into(),
+        integer_conv(WeightFormat::Int16, false).into(),
+        integer_conv(WeightFormat::Int8, true).into(),
         conv(false).into(),
         conv(true).into(),
         depthwise.into(),

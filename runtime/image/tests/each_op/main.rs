@@ -7,7 +7,8 @@ use std::collections::BTreeSet;
 
 use lads_image::codec::Field;
 use lads_image::op::{
-    Attention, INT_SLOTS, IntSlot, MatMul, OP_WORDS, Op, Operand, Space, Span, WeightSpan,
+    Attention, INT_SLOTS, IntSlot, IntegerConv, MatMul, OP_WORDS, Op, Operand, Space, Span,
+    WeightSpan,
 };
 use lads_image::{Access, AccessKind, Checker, Fault, Isa, Machine, Program, Spaces, Work};
 use samples::{attention, samples, span, weight};
@@ -72,11 +73,13 @@ fn outside_the_arena(op: &mut Op) -> Vec<(&mut u32, u32, usize)> {
         Op::GatherRow(op) => operand(&mut op.table).into_iter().collect(),
         Op::Conv(op) => vec![weights(&mut op.w), weights(&mut op.bias)],
         Op::Depthwise(op) => vec![weights(&mut op.w), weights(&mut op.bias)],
+        Op::IntegerConv(op) => vec![weights(&mut op.w), weights(&mut op.columns)],
         Op::Border(op) => op.value.as_mut().into_iter().map(weights).collect(),
         Op::Resize(op) => vec![weights(&mut op.rows), weights(&mut op.cols)],
         Op::Softmax(_)
         | Op::ArgMin(_)
         | Op::ArgMax(_)
+        | Op::ImageIntegers(_)
         | Op::Pool(_)
         | Op::ToIndex(_)
         | Op::FromIndex(_) => vec![],
@@ -97,14 +100,17 @@ fn every_operation_is_read_as_it_was_written() {
     for op in samples() {
         let words = op.encode();
         assert_eq!(Op::decode(&words), Some(op));
-        // Words after an op are zero. Attention fills all of them.
+        // Words after an op are zero. The largest ones fill all of them.
         let mut more = words;
         more[OP_WORDS - 1] = 1;
-        if !matches!(op, Op::Attention(_)) {
+        if !matches!(op, Op::Attention(_) | Op::IntegerConv(_)) {
             assert_eq!(Op::decode(&more), None, "{op:?}");
         }
     }
-    assert_eq!(Attention::WORDS + 1, OP_WORDS);
+    assert_eq!(
+        [Attention::WORDS + 1, IntegerConv::WORDS + 1],
+        [OP_WORDS; 2]
+    );
 }
 
 #[test]
@@ -259,7 +265,10 @@ fn accesses_are_what_a_run_does() {
                 continue;
             }
             if written.contains(&i) {
-                assert!(first[i].is_finite() && first[i] != 1e6, "{op:?} at {i}");
+                // Pairs of integers may look like anything.
+                let is_float = !matches!(op, Op::ImageIntegers(_));
+                assert!(!is_float || first[i].is_finite(), "{op:?} at {i}");
+                assert!(first[i] != 1e6, "{op:?} at {i}");
                 assert_eq!(first[i].to_bits(), second[i].to_bits(), "{op:?} at {i}");
             } else {
                 assert_eq!(first[i].to_bits(), quiet[i].to_bits(), "{op:?} at {i}");
@@ -308,6 +317,8 @@ fn work_counts_what_is_multiplied_and_read() {
             Op::MatMul(_) => assert_eq!(work.multiply_adds, 24),
             Op::Conv(op) => assert_eq!(work, of(108, u64::from(op.w.len + 3), 0)),
             Op::Depthwise(op) => assert_eq!(work, of(36, u64::from(op.w.len + 3), 0)),
+            Op::ImageIntegers(_) => assert_eq!(work, of(60, 0, 0)),
+            Op::IntegerConv(op) => assert_eq!(work, of(108, u64::from(op.w.len + 6), 0)),
             Op::Border(op) => {
                 let inside = u64::from(op.inside.rows) * u64::from(op.inside.cols);
                 let filled = u64::from(op.y.len) - inside * u64::from(op.c);

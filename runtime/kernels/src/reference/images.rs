@@ -31,6 +31,36 @@ pub fn conv(
     }
 }
 
+/// Computes a convolution of integers with `w` as `[kernel rows, kernel columns, c, n]`, accumulated
+/// if `residual` is set; `scale` is the value of a unit of `x`, `scales` those of the outputs' weights.
+pub fn integer_conv(
+    sweep: &Sweep,
+    (w, scales, bias): (&[i16], &[f32], &[f32]),
+    (a, residual): (Activation, bool),
+    (x, scale): (&[i16], f32),
+    y: &mut [f32],
+) {
+    let n = bias.len();
+    let [kh, kw] = sweep.kernel;
+    let c = w.len() / (kh * kw * n);
+    for (row, col) in (0..sweep.out[0]).flat_map(|row| (0..sweep.out[1]).map(move |col| (row, col)))
+    {
+        for j in 0..n {
+            let mut sum = 0;
+            for (ky, kx) in (0..kh).flat_map(|ky| (0..kw).map(move |kx| (ky, kx))) {
+                for i in 0..c {
+                    let x = x[place(sweep, [row, col], [ky, kx]) + i];
+                    sum += i64::from(x) * i64::from(w[((ky * kw + kx) * c + i) * n + j]);
+                }
+            }
+            let at = row * sweep.y_strides[0] + col * sweep.y_strides[1] + j;
+            let before = if residual { f64::from(y[at]) } else { 0.0 };
+            let sum = sum as f64 * f64::from(scale) * f64::from(scales[j]);
+            y[at] = activation(a, sum + f64::from(bias[j]) + before) as f32;
+        }
+    }
+}
+
 /// Computes a depthwise convolution with `w` as `[kernel rows, kernel columns, c]`.
 pub fn depthwise(
     sweep: &Sweep,

@@ -62,6 +62,7 @@ impl<const DOT: bool> Simd for Neon<DOT> {
     const CHAINS: usize = 1;
     const PIXELS: usize = 6;
     const PANELS: usize = 1;
+    const INTEGER_TILE: [usize; 2] = [1, 3];
 
     #[inline(always)]
     fn splat(self, x: f32) -> Self::V {
