@@ -37,7 +37,8 @@ def _camera(encoder, channel, size):
     size = tuple(size)
     if encoder.startswith(RANDOM):
         count = _random(encoder)
-        steps = (images.Conv(count, 4, 2, (1, 1, 1, 1)), images.Conv(count, 3, 2, (0, 0, 1, 1), norm=1e-3, activation="Relu6"), images.Pool("AveragePool", 2))
+        conv = lambda kernel, pads: images.Conv(count, kernel, 2, pads, norm=1e-3, activation="Relu6")
+        steps = (conv(4, (1, 1, 1, 1)), conv(3, (0, 0, 1, 1)), images.Pool("AveragePool", 2))
         return images.Camera(channel, size, steps)
     if size != (SIDE, SIDE):
         raise UserError(f"encoder = {encoder!r} reads frames of {SIDE}x{SIDE} pixels, these have {size[0]}x{size[1]}; render them in that size")

@@ -21,6 +21,7 @@ class FeatureCorpus(Corpus):
         self.joints, self.clean, self.noise = own(self.observations), own(self.states), own(self.noise)
         self.places = self._padded(torch.from_numpy(dataset.frame_rows)[:, None] + 1, dataset)[..., 0] - 1  # -1 beyond an episode's end
         training = np.concatenate([dataset.frame_rows[dataset.rows(e)] for e in self.train.tolist()])
+        self.encoder_sha256 = dataset.features.encoder
         self.features = torch.from_numpy(dataset.features.rows).to(device)
         mean, std = statistics(dataset.features.rows, training, seen.std_floor)
         self.mean, self.std = torch.cat([own(self.mean), mean]), torch.cat([own(self.std), std])
