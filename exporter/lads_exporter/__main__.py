@@ -74,7 +74,7 @@ def _features(arguments):
     from . import config, features
 
     output.check_apart([arguments.data], [arguments.output])
-    setting = config.load(arguments.config)
+    setting = config.load(arguments.config, *arguments.system)
     if not setting.config.pretrained.encoder:
         raise UserError(f"{setting.config.name} has no frozen encoder: no [pretrained] in {arguments.config}")
     features.make(setting, arguments.data, arguments.output, arguments.lads_run, arguments.threads)
@@ -224,6 +224,7 @@ def _parser():
 
     seen = commands.add_parser("features", help="what a frozen encoder makes of every state of a dataset, drawn by lads-run; goes on where it was stopped")
     seen.add_argument("--config", required=True, help="a setting with [pretrained], such as exporter/configs/kitchen-image.toml")
+    seen.add_argument("--system", action="append", default=[], metavar="FILE", help="values over those of --config, as train has it")
     seen.add_argument("--data", required=True, help="the dataset")
     seen.add_argument("-o", "--output", required=True, help="the file to write; what is done so far lies beside it, in FILE.parts")
     seen.add_argument("--lads-run", default="target/release/lads-run", help="the program that draws, built with --features camera (target/release/lads-run)")
