@@ -121,6 +121,13 @@ mod tests {
     }
 
     #[test]
+    fn a_policy_may_see_the_first_elements_only() {
+        let mut seen = [0.0; 2];
+        Link::new(Faults::default(), SEED).sense(&[1.0, 2.0, 3.0], &[0.5; 3], &mut seen);
+        assert_eq!(seen, [1.0, 2.0]);
+    }
+
+    #[test]
     fn a_delay_shows_the_first_observation_until_the_next_arrives() {
         let faults = Faults {
             delay_steps: 2,
