@@ -121,7 +121,7 @@ def make(setting, data, path, lads_run, threads=0, quiet=False):
 
 
 def _metadata(setting, dataset, rendering, encoder_sha256):
-    """What a file of features says of itself, so that parts of different things do not come together."""
+    """Makes the metadata of a file of features and of its parts, so that those of different things do not come together."""
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -149,7 +149,7 @@ def _whole(parts, path):
 
 
 def _draw(states, setting, folder, lads_run, threads):
-    """Draws frames of some states -> frames [n, r, c, 3], how they were rendered. The files in between are removed."""
+    """Draws some states by lads-run -> frames [n, r, c, 3], how they were rendered; the files in between are removed."""
     with tempfile.TemporaryDirectory(dir=folder) as room:
         data, drawn = Path(room) / "states.safetensors", Path(room) / "frames"
         metadata = {"format": datasets.FORMAT, "version": datasets.VERSION, "environment": setting.environment["id"]}

@@ -3,6 +3,7 @@ networks do."""
 
 import copy
 import dataclasses
+import json
 import stat
 import sys
 from pathlib import Path
@@ -15,7 +16,7 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 from test_training import setting_for
 
-from lads_exporter import bundle, config, contract as contracts, dataset, feature_corpus, features, language, systems, training, twin
+from lads_exporter import __main__ as command, bundle, config, contract as contracts, dataset, feature_corpus, features, language, systems, training, twin
 from lads_exporter.config import UserError
 
 SIZE, F, JOINTS = [16, 20], 48, 2
@@ -169,6 +170,22 @@ def test_features_and_setting_go_together(files):
 def test_settings_that_do_not_fit_are_refused(over, wrong):
     with pytest.raises(UserError, match=wrong):
         setting(**over)
+
+
+def run(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["lads_exporter", *map(str, arguments)])
+    return command.main()
+
+
+def test_the_command_makes_them_and_refuses_a_setting_without_an_encoder(tmp_path, files, program, monkeypatch, capsys):
+    over = tmp_path / "over.toml"
+    row = lambda table: "\n".join(f"{key} = {json.dumps(value)}" for key, value in table.items())
+    over.write_text(f"[encoder]\nobserved = {JOINTS}\n[pretrained]\n{row(SEEN)}\n[history]\n{row(HISTORY)}\n[training]\nschedule = 'staged'\n")
+    path = tmp_path / "by-command.features"
+    asked = ["features", "--config", "configs/tiny.toml", "--data", files[0], "-o", path, "--lads-run", program]
+    assert run(monkeypatch, *asked) == 2 and "has no frozen encoder" in capsys.readouterr().err and not path.exists()
+    assert run(monkeypatch, *asked, "--system", over) == 0
+    assert contents(path) == contents(files[1])
 
 
 def test_a_program_that_fails_is_named_with_what_it_says(tmp_path, files, program):

@@ -78,7 +78,7 @@ def _encode(graph, networks):
 
 
 def graph(networks, setting, encoded):
-    """All entries but the trajectory encoder, which reads features that nobody outside has."""
+    """Builds all entries but the trajectory encoder, which reads features that nobody outside has."""
     made = graphs.Graph()
     graphs.known_instructions(made, networks.high_level, encoded)
     _encode(made, networks)
