@@ -20,7 +20,7 @@ PUBLISHED := -p lads-kernels -p lads-image -p lads-core -p lads-compiler -p lads
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report record viewer say language verify tune mutate frames test test-torch test-full setup lint test-rust test-runtime test-exporter test-python test-targets wheel sanitize fuzz package msrv deny unused book lock collect train export table reference install bench clean help
+.PHONY: run report record viewer say language verify tune mutate frames features test test-torch test-full setup lint test-rust test-runtime test-exporter test-python test-targets wheel sanitize fuzz package msrv deny unused book lock collect train export table reference install bench clean help
 
 # Says before a build that takes long what it takes, where nothing of it is there yet: $(call first-build,a crate of it,what,minutes)
 first-build = @ls target/release/deps/lib$(1)-*.rlib >/dev/null 2>&1 || echo "The first build of $(2) takes some $(3) minutes of one core; later ones take seconds."
@@ -196,10 +196,16 @@ collect: setup
 frames: setup
 	cargo run --release -p lads-sim --features camera --bin lads-run -- frames $(DATA) -o $(DATA:.safetensors=.frames)
 
+## features: what the frozen encoder of exporter/configs/$(ENV).toml (ENV=kitchen-image) makes of every state of $(DATA); 70 ms each on one core, and
+##           the same command goes on where it was stopped. Then: make train ENV=kitchen-image DATA=... FEATURES=...
+features: setup $(VENV)/stamp
+	cargo build --release -p lads-sim --features camera --bin lads-run
+	$(PY) -m lads_exporter features --config exporter/configs/$(ENV).toml --data $(DATA) -o $(DATA:.safetensors=.features)
+
 ## train: the shipped policy from data/ENV.safetensors into runs/ENV; one thread, because sums depend on their number.
 ##        A smaller one for microcontrollers: make train export ENV=kitchen-small DATA=data/kitchen.safetensors
 train: $(VENV)/stamp
-	$(PY) -m lads_exporter train --config exporter/configs/$(ENV).toml --data $(DATA) $(if $(FRAMES),--frames $(FRAMES)) --out runs/$(ENV) --threads 1
+	$(PY) -m lads_exporter train --config exporter/configs/$(ENV).toml --data $(DATA) $(if $(FRAMES),--frames $(FRAMES)) $(if $(FEATURES),--features $(FEATURES)) --out runs/$(ENV) --threads 1
 
 ## export: runs/ENV into models/ENV.onnx
 export: $(VENV)/stamp

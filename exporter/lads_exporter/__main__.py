@@ -54,12 +54,12 @@ def _device(name):
 def _train(arguments):
     import torch
 
-    from . import config, dataset, training
+    from . import config, dataset, features, training
 
     if arguments.threads:
         torch.set_num_threads(arguments.threads)
     setting = config.load(arguments.config, *arguments.system)
-    data = dataset.load(arguments.data, setting, arguments.frames)
+    data = features.attach(dataset.load(arguments.data, setting, arguments.frames), setting, arguments.features)
     setting = dataclasses.replace(setting, rendering=data.rendering)
     device = _device(arguments.device)
     trainer = training.Trainer(setting, data, _encode(setting), arguments.out, device, arguments.seed)
@@ -68,6 +68,17 @@ def _train(arguments):
         return 130
     print(f"{arguments.out}: trained; next: python -m lads_exporter export --run {arguments.out} -o models/{setting.config.name}.onnx")
     return 0
+
+
+def _features(arguments):
+    from . import config, features
+
+    output.check_apart([arguments.data], [arguments.output])
+    setting = config.load(arguments.config, *arguments.system)
+    if not setting.config.pretrained.encoder:
+        raise UserError(f"{setting.config.name} has no frozen encoder: no [pretrained] in {arguments.config}")
+    features.make(setting, arguments.data, arguments.output, arguments.lads_run, arguments.threads)
+    print(f"{arguments.output}: whole; next: python -m lads_exporter train --config {arguments.config} --data {arguments.data} --features {arguments.output}")
 
 
 def _check_card(arguments, more):
@@ -116,7 +127,8 @@ def _export(arguments):
         "seed": identity["seed"],
         "steps": {name: system.Training.settings(setting.config, name).steps for name in names},
     }
-    candidates = ((instruction, observations.numpy()) for instruction, observations in saved["golden"])
+    arrays = lambda seen: {name: rows.numpy() for name, rows in seen.items()} if isinstance(seen, dict) else seen.numpy()
+    candidates = ((instruction, arrays(seen)) for instruction, seen in saved["golden"])
     model = bundle.assemble(networks, setting, encoded, provenance, candidates)
     calibrated = acceptance.beside(arguments.output)
     if calibrated:
@@ -192,7 +204,7 @@ def _parser():
     random = commands.add_parser("random", help="a bundle with random weights, for tests")
     network = random.add_mutually_exclusive_group(required=True)
     network.add_argument("--config", help="a LADS policy of this configuration")
-    network.add_argument("--kind", help="a small policy of this kind: lads, lang_dt, lisa, vae, lcsd, skilldiffuser, history, plain, recurrent, stacked, camera, images, sighted; or with an encoder of the field's sizes: lorel-encoder, lite0, resnet18")
+    network.add_argument("--kind", help="a small policy of this kind: lads, lang_dt, lisa, vae, lcsd, skilldiffuser, history, plain, recurrent, stacked, camera, images, sighted, sighted_history; or with an encoder of the field's sizes: lorel-encoder, lite0, resnet18")
     random.add_argument("-o", "--output", required=True)
     random.add_argument("--seed", type=int, default=0)
     random.set_defaults(run_command=_random)
@@ -210,11 +222,21 @@ def _parser():
     growth.add_argument("--seed", type=int, default=0)
     growth.set_defaults(run_command=_growth)
 
+    seen = commands.add_parser("features", help="what a frozen encoder makes of every state of a dataset, drawn by lads-run; goes on where it was stopped")
+    seen.add_argument("--config", required=True, help="a setting with [pretrained], such as exporter/configs/kitchen-image.toml")
+    seen.add_argument("--system", action="append", default=[], metavar="FILE", help="values over those of --config, as train has it")
+    seen.add_argument("--data", required=True, help="the dataset")
+    seen.add_argument("-o", "--output", required=True, help="the file to write; what is done so far lies beside it, in FILE.parts")
+    seen.add_argument("--lads-run", default="target/release/lads-run", help="the program that draws, built with --features camera (target/release/lads-run)")
+    seen.add_argument("--threads", type=int, default=0, help="threads that draw; 0 is one per core")
+    seen.set_defaults(run_command=_features)
+
     train = commands.add_parser("train", help="train a policy from a dataset")
     train.add_argument("--config", required=True, help="one TOML file per setting, in exporter/configs")
     train.add_argument("--system", action="append", default=[], metavar="FILE", help="values of a system over those of --config, such as configs/kitchen/lisa.toml")
     train.add_argument("--data", required=True, help=".safetensors of lads-collect, or D4RL kitchen .hdf5")
     train.add_argument("--frames", metavar="FILE", help="frames of the dataset, made by lads-run frames, for a setting with a camera")
+    train.add_argument("--features", metavar="FILE", help="features of the dataset's frames, made by the command features, for a setting with a frozen encoder")
     train.add_argument("--out", required=True, help="folder of the run: checkpoint, curves, summary")
     train.add_argument("--resume", action="store_true", help="continue from the run's checkpoint")
     train.add_argument("--device", choices=("cpu", "cuda"), default="cpu")

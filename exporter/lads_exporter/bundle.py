@@ -53,7 +53,8 @@ def contract(setting, encoded, provenance, exported):
     """Makes the contract of a trained policy."""
     config, environment = setting.config, setting.environment
     high = config.high_level
-    image = contracts.frames(config.images.channel, setting.rendering) if config.images.channel else None
+    camera = config.images.channel or config.pretrained.channel
+    image = contracts.frames(camera, setting.rendering) if camera else None
     return describe(
         exported.family,
         environment,
@@ -62,7 +63,7 @@ def contract(setting, encoded, provenance, exported):
         {"setting": config.name, **provenance},
         layer=config.language.layer,
         pooling="mean" if config.language.pool else "none",
-        channels=contracts.channels(environment, [encoded.max_words, encoded.dim], exported.noise, exported.segment, image),
+        channels=contracts.channels(environment, [encoded.max_words, encoded.dim], exported.noise, exported.segment, image, config.pretrained.joints),
         context={"words": encoded.max_words, "steps": high.context_steps, "beyond": config.beyond_context},
         network={"layers": high.layers, "heads": high.heads, "head_dim": high.hidden // high.heads},
     )

@@ -97,6 +97,34 @@ NO_IMAGES = {"channel": "", "widths": [], "hidden": [], "features": 0, "state_we
 
 
 @dataclass(frozen=True)
+class Pretrained:
+    """Features of a frozen encoder that a policy sees beside the first elements of the state; `encoders` lists the encoders."""
+
+    channel: str  # name of the camera's channel
+    encoder: str  # "" for a policy without
+    features: int  # what the encoder gives
+    joints: int  # the first so many elements of the state are observed beside them
+    std_floor: float  # features are z-scored with max(std, std_floor times the median std)
+    clip: float  # and clipped to so many standard deviations
+
+
+NO_PRETRAINED = {"channel": "", "encoder": "", "features": 0, "joints": 0, "std_floor": 0.0, "clip": 0.0}
+
+
+@dataclass(frozen=True)
+class History:
+    """A causal transformer as low level, over the plan, a window of earlier steps and those of the plan."""
+
+    window: int  # W, earlier steps; 0 for a policy whose low level is an MLP
+    layers: int
+    heads: int
+    dropout: float
+
+
+NO_HISTORY = {"window": 0, "layers": 0, "heads": 0, "dropout": 0.0}
+
+
+@dataclass(frozen=True)
 class Data:
     std_floor: float  # observations are z-scored with max(std, std_floor)
     validation_every: int  # every n-th episode is held out
@@ -206,6 +234,8 @@ class Config:
     alignment: Alignment
     data: Data
     images: Images
+    pretrained: Pretrained
+    history: History
     training: Training
     system: object  # one of SYSTEMS
 
@@ -286,8 +316,9 @@ class Setting:
 
     @property
     def observation_len(self):
-        """Elements of what the networks observe: the state, or the features of a frame."""
-        return self.config.images.features or self.state_len
+        """Elements of what the networks observe: the state, or the features of a frame, with a frozen encoder's the joints first."""
+        seen = self.config.pretrained
+        return seen.joints + seen.features if seen.encoder else self.config.images.features or self.state_len
 
     @property
     def action_len(self):
@@ -296,7 +327,7 @@ class Setting:
 
 def from_tables(table, environment, instructions, where):
     """Checks the three tables of a setting against each other."""
-    config = _build(Config, {"system": LADS, "images": NO_IMAGES} | table, str(where))
+    config = _build(Config, {"system": LADS, "images": NO_IMAGES, "pretrained": NO_PRETRAINED, "history": NO_HISTORY} | table, str(where))
     for name, value, allowed in (
         ("decision", config.decision, ("argmax", "sample")),
         ("beyond_context", config.beyond_context, ("restart", "refuse")),
@@ -308,9 +339,10 @@ def from_tables(table, environment, instructions, where):
     ):
         if value not in allowed:
             raise UserError(f"{where}: {name} = {value!r}: must be one of {', '.join(allowed)}")
-    plain = config.system.kind == "lads" and not config.system.regressed and config.training.schedule == "staged" and not config.data.renoise
-    if config.images.channel and not plain:
+    plain = config.system.kind == "lads" and not config.system.regressed and config.training.schedule == "staged"
+    if config.images.channel and (not plain or config.data.renoise):
         raise UserError(f"{where}: [images] goes with system lads, not regressed, schedule staged, and without renoise only")
+    _frozen(config, plain, len(environment.get("observation", [])), where)
     if config.high_level.hidden % config.high_level.heads:
         raise UserError("high_level.hidden must be a multiple of high_level.heads")
     steps, period = config.high_level.context_steps, config.period
@@ -335,6 +367,31 @@ def from_tables(table, environment, instructions, where):
         if name not in known:
             raise UserError(f"data.weights names {name!r}, which is not an instruction id of {config.instructions}")
     return Setting(config, environment, rows, [table, environment, instructions])
+
+
+def _frozen(config, plain, state_len, where):
+    """Checks [pretrained] and [history], which go together: all problems at once."""
+    seen, history = config.pretrained, config.history
+    if not seen.encoder and not history.window:
+        return
+    problems = []
+    if not seen.encoder or not history.window:
+        problems.append("[pretrained] and [history] go together")
+    if not plain or config.images.channel:
+        problems.append("they go with system lads, not regressed, schedule staged, and without [images]")
+    for name, value in (("pretrained.features", seen.features), ("history.window", history.window), ("history.layers", history.layers), ("history.heads", history.heads)):
+        if value < 1:
+            problems.append(f"{name} = {value} must be positive")
+    if not seen.channel:
+        problems.append("pretrained.channel names no camera")
+    if not 1 <= seen.joints <= state_len:
+        problems.append(f"pretrained.joints = {seen.joints} must be 1 to {state_len}, the elements of the state")
+    if seen.std_floor <= 0 or seen.clip <= 0:
+        problems.append("pretrained.std_floor and pretrained.clip must be positive")
+    if config.low_level.hidden % max(1, history.heads):
+        problems.append("low_level.hidden must be a multiple of history.heads")
+    if problems:
+        raise UserError(f"{where}: {'; '.join(problems)}")
 
 
 def layered(table, over):

@@ -56,15 +56,17 @@ def element(row):
     return {key: row[key] for key in keep if key in row}
 
 
-def channels(environment, words=None, noise=None, segment=None, image=None):
+def channels(environment, words=None, noise=None, segment=None, image=None, joints=0):
     """Lists the channels of a policy on one observation vector.
 
     words: [L, E] of an instruction; noise: the shape of one draw; segment: the steps that a trajectory encoder reads.
-    image: the channel of a camera, which is observed in place of the vector.
+    image: the channel of a camera, which is observed in place of the vector, or beside its first `joints` elements.
     """
     observation, action = ([element(row) for row in environment[key]] for key in (OBSERVATION, ACTION))
     reference = environment.get("reference", "not stated")
-    found = [image or vector(OBSERVATION, "observation", observation, quaternion_order=environment["quaternion_order"])]
+    own = observation[:joints] if image else observation
+    found = [image] if image else []
+    found += [vector(OBSERVATION, "observation", own, quaternion_order=environment["quaternion_order"])] if own else []
     if words:
         found.append(array(WORDS, "instruction", words))
     if noise:

@@ -85,6 +85,10 @@ class Corpus:
         states = self.states[episodes, steps]
         return states + self.noise * (2 * torch.rand_like(states) - 1)
 
+    def windowed(self, at):
+        """Returns what the trajectory encoder and the low level see at (episodes, steps)."""
+        return self.observations[at], self.shown(*at)
+
     def draw(self, batch, generator):
         """Draws `batch` training episodes by weight."""
         weights = self.weights[self.train]
@@ -129,7 +133,7 @@ class Corpus:
         lengths = (self.lengths[episodes] - starts).clamp(max=self.horizon).to(self.device)
         at = episodes.to(self.device)[:, None], steps
         actions, executed, rows = self.actions[at], self.executed[at], rows.to(self.device)
-        own, shown = (self.observations[at], self.shown(*at)) if seen is None else 2 * (seen[rows[:, None], steps],)
+        own, shown = self.windowed(at) if seen is None else 2 * (seen[rows[:, None], steps],)
         return Segments(own, actions, executed, lengths, rows, steps[:, 0], places.to(self.device), shown)
 
     def every_window(self, episodes):

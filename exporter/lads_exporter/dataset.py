@@ -35,6 +35,7 @@ class Dataset:
     frames: np.ndarray | None = None  # [T', r, c, 3] what a camera sees, where the setting has one
     frame_rows: np.ndarray | None = None  # [T] the row of `frames` for each step
     rendering: dict | None = None  # how they were drawn
+    features: object | None = None  # `features.Features`: what a frozen encoder made of them, in place of `frames`
     texts: list | None = None  # the file's own instructions, where it has others than the setting; `instruction` points here
 
     def __len__(self):

@@ -243,10 +243,17 @@ def high_level_step(graph, policy, normalizer, first, out="logits", previous="ac
 
 
 def observed_token(entry, observation, policy, normalizer, time, level="high_level"):
-    """Makes the token of an observation in raw units."""
-    centred = entry.centred(observation, normalizer, "observation_centred")
-    folded = fold_std(policy.embed_observation.weight, normalizer)
-    return token(entry, centred, policy.embed_observation, time, "observation", folded, level)
+    """Makes the token of an observation in raw units, or of one that is normalised already (no `normalizer`)."""
+    observation, weight = raw(entry, observation, policy.embed_observation, normalizer)
+    return token(entry, observation, policy.embed_observation, time, "observation", weight, level)
+
+
+def raw(entry, observation, module, normalizer):
+    """Returns the observation, centred, and the weights of the linear layer that reads it, divided by the standard deviation; both as they
+    are where there is no normaliser."""
+    if normalizer is None:
+        return observation, module.weight
+    return entry.centred(observation, normalizer, "observation_centred"), fold_std(module.weight, normalizer)
 
 
 def token(entry, x, module, time, name, weight=None, level="high_level"):

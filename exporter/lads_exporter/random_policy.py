@@ -40,7 +40,7 @@ def randomize(lads, setting, seed):
     with torch.no_grad():
         lads.high_level.embed_timestep.weight.copy_(0.3 * draw(lads.high_level.embed_timestep.weight))
         lads.high_level.head.weight.mul_(2)
-        for norm in lads.low_level.norms:
+        for norm in getattr(lads.low_level, "norms", ()):  # only the MLP has batch norms
             norm.running_mean.copy_(0.2 * draw(norm.running_mean))
             norm.running_var.copy_(0.5 + torch.rand(norm.running_var.shape, generator=generator))
         if setting.rendering is None:  # features are not normalised

@@ -24,7 +24,10 @@ from tqdm import tqdm
 from . import __version__, config as configuration, language, systems
 from .output import write_atomically
 from .config import UserError
+from .contract import OBSERVATION
 from .corpus import Corpus
+from .feature_corpus import FeatureCorpus
+from .features import golden_episodes
 from .frames import FrameCorpus
 from .hindsight import relabel
 
@@ -104,13 +107,16 @@ class Trainer:
         }
         if dataset.rendering is not None:
             self.identity["rendering"] = dataset.rendering
+        if dataset.features is not None:
+            self.identity["encoder_sha256"] = dataset.features.encoder
         torch.manual_seed(self.seed_of("", "weights", 0))
         self.networks = systems.of(self.config).Networks(setting, encoded).to(device)
         data = self.config.data
         if data.hindsight > 0:
             dataset = relabel(dataset, setting, data.hindsight, data.hindsight_latest, data.hindsight_most, self.seed_of("", "hindsight", 0))
         own = encoded if dataset.texts is None else language.encode(self.config.language, dataset.texts)
-        self.corpus = (Corpus if dataset.frames is None else FrameCorpus)(dataset, setting, own, device)
+        kind = FeatureCorpus if dataset.features is not None else FrameCorpus if dataset.frames is not None else Corpus
+        self.corpus = kind(dataset, setting, own, device)
         self.networks.normalizer.mean.copy_(self.corpus.mean)
         self.networks.normalizer.std.copy_(self.corpus.std)
         self.system = systems.of(self.config).Training(self.networks, self.corpus, setting, self.seed_of)
@@ -246,7 +252,14 @@ class Trainer:
 
 
 def golden_candidates(dataset, episodes, setting, most=24):
-    """Yields held-out episodes one of which will be the bundle's golden episode: (instruction index, observations [T, O])."""
+    """Lists held-out episodes one of which will be the bundle's golden episode: (instruction index, observations [T, O]), or {channel: [T, ...]}
+    in place of the observations where there are several."""
+    if dataset.features is not None:
+        seen, drawn = setting.config.pretrained, dataset.features.frames
+        frames = lambda rows: torch.from_numpy(np.stack([drawn[row] for row in range(rows.start, rows.stop)]))
+        joints = lambda rows: torch.from_numpy(dataset.observations[rows, : seen.joints].copy())
+        chosen = golden_episodes(dataset, setting)
+        return [(int(dataset.instruction[e]), {seen.channel: frames(rows), OBSERVATION: joints(rows)}) for e, rows in chosen]
     index = dataset.instruction
     if dataset.texts is not None:  # those whose label is an instruction of the bundle
         known = [row["text"] for row in setting.instructions]

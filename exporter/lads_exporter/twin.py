@@ -324,7 +324,12 @@ def _skilldiffuser(twin):
 
 
 def _history(twin):
-    twin.run("high_level/step")
+    if "features" in twin.family:
+        twin.run("observation_encoder/encode")
+    if twin.family.get("actions"):
+        _first_or_later(twin)
+    else:
+        twin.run("high_level/step")
     if twin.decides:
         twin.select()
         twin.clear("low_level")

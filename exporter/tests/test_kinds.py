@@ -68,6 +68,14 @@ def on(made, normed):
     return plans, made.policy.low_level(normed, made.policy.codebook.codes[plans])
 
 
+def sighted_history(made):
+    seen = made.policy.observed(made.observations, torch.from_numpy(made.channels["camera"]))
+    plans = made.plans(made.policy.high_level([made.words], seen[None], made.actions[None])[0])
+    low = made.policy.acting_low_level()
+    chunk = lambda start, end: low(plans[start], seen[:end], min(start, low.window), made.previous[:end], end - start)
+    return plans, torch.cat([chunk(*ends) for ends in made.chunks()])
+
+
 def lang_dt(made):
     return None, made.policy(made.words, made.observations, made.actions)
 
@@ -113,7 +121,7 @@ def plain(made):
     return None, made.policy(*(torch.from_numpy(rows) for rows in made.channels.values()))
 
 
-WHOLE = {"lads": lads, "sighted": sighted, "lang_dt": lang_dt, "lisa": lisa, "history": history, "vae": vae, "lcsd": lcsd, "skilldiffuser": skilldiffuser}
+WHOLE = {"lads": lads, "sighted": sighted, "sighted_history": sighted_history, "lang_dt": lang_dt, "lisa": lisa, "history": history, "vae": vae, "lcsd": lcsd, "skilldiffuser": skilldiffuser}
 
 
 @torch.no_grad()

@@ -304,6 +304,34 @@ fn a_contract_that_does_not_fit_is_refused_by_name() {
     }
 }
 
+#[test]
+fn a_policy_with_a_camera_may_observe_the_first_elements_only() {
+    let mut contract = tiny_contract().clone();
+    let mut all = contract.channels.iter_mut();
+    let own = all.find(|it| it.name == "observation").unwrap();
+    own.elements.truncate(2);
+    own.shape = vec![2];
+    let bench = Bench::new(Spec::default());
+    let line = fit::check(&contract, &bench).unwrap_err().to_string();
+    assert!(line.contains("2 elements"), "{line}");
+    let camera = serde_json::json!({
+        "name": "camera", "role": "observation", "dtype": "u8", "shape": [4, 6, 3], "min": 0, "max": 255,
+        "rendering": {
+            "view": {"camera": "front"}, "size": [4, 6], "drawn": [4, 6], "samples": 0, "shadow_size": 0,
+            "shadow_clip": 1.0, "reflections": false, "hidden": [], "mesh_cell_m": 0.0,
+        },
+    });
+    contract
+        .channels
+        .push(serde_json::from_value(camera).unwrap());
+    assert!(fit::check(&contract, &bench).is_ok());
+    let mut all = contract.channels.iter_mut();
+    let own = all.find(|it| it.name == "observation").unwrap();
+    own.elements.reverse();
+    let line = fit::check(&contract, &bench).unwrap_err().to_string();
+    assert!(line.contains("'joint2'"), "{line}");
+}
+
 /// Tests that a thread that panics ends the others after their current episode, not after the whole queue.
 #[test]
 fn a_panic_stops_all_threads() {

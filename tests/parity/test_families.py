@@ -17,7 +17,7 @@ pytest.importorskip("onnxruntime")
 pytest.importorskip("lads_exporter.episode")
 
 # The Makefile's: with another one cargo would build its dependencies once more.
-KINDS = ("lads", "lang_dt", "lisa", "vae", "lcsd", "skilldiffuser", "history", "plain", "recurrent", "stacked", "camera", "images", "sighted")
+KINDS = ("lads", "lang_dt", "lisa", "vae", "lcsd", "skilldiffuser", "history", "plain", "recurrent", "stacked", "camera", "images", "sighted", "sighted_history")
 STEPS = 200
 
 

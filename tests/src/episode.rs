@@ -13,7 +13,7 @@ use safetensors::{SafeTensors, tensor::TensorView};
 pub const FOLDER: &str = "LADS_FAMILIES";
 
 /// Kinds of random policies.
-pub const KINDS: [&str; 13] = [
+pub const KINDS: [&str; 14] = [
     "lads",
     "lang_dt",
     "lisa",
@@ -27,6 +27,7 @@ pub const KINDS: [&str; 13] = [
     "camera",
     "images",
     "sighted",
+    "sighted_history",
 ];
 
 /// Returns the folder of the bundles and episodes.

@@ -235,4 +235,4 @@ macro_rules! kinds {
     };
 }
 
-kinds! { lads lang_dt lisa vae lcsd skilldiffuser history plain recurrent stacked camera images sighted }
+kinds! { lads lang_dt lisa vae lcsd skilldiffuser history plain recurrent stacked camera images sighted sighted_history }

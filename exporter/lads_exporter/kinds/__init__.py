@@ -10,7 +10,7 @@ import torch
 
 from .. import bundle, random_policy
 from ..config import UserError
-from . import common, history, images, lads, lang_dt, lcsd, lisa, plain, sighted, skilldiffuser, vae
+from . import common, history, images, lads, lang_dt, lcsd, lisa, plain, sighted, sighted_history, skilldiffuser, vae
 from .common import Sizes
 
 
@@ -45,6 +45,7 @@ KINDS = {
     "camera": _of(plain.Camera, plain.build_camera, plain.contract_camera),
     "images": _images("images", images.SMALL, (32,)),
     "sighted": Kind(sighted.policy, sighted.build, sighted.contract),
+    "sighted_history": Kind(sighted_history.policy, sighted_history.build, sighted_history.contract),
 }
 # Of the sizes that encoders have in the field.
 LARGE = {name: _images(name, *parts, Sizes(steps=4)) for name, parts in images.SIZES.items()}

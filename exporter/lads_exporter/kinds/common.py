@@ -112,7 +112,7 @@ def select_at_every_token(graph, policy):
     return entry, embedded
 
 
-def contract(family, sizes, seed, noise=None, segment=None, image=None):
+def contract(family, sizes, seed, noise=None, segment=None, image=None, joints=0):
     """Makes the contract of a policy on the bench with instructions."""
     return bundle.describe(
         family,
@@ -120,7 +120,7 @@ def contract(family, sizes, seed, noise=None, segment=None, image=None):
         INSTRUCTIONS,
         WORDS,
         {"setting": f"random {family['kind']}", "seed": seed},
-        channels=contracts.channels(ENVIRONMENT, words=[WORDS.max_words, WORDS.dim], noise=noise, segment=segment, image=image),
+        channels=contracts.channels(ENVIRONMENT, words=[WORDS.max_words, WORDS.dim], noise=noise, segment=segment, image=image, joints=joints),
         context={"words": WORDS.max_words, "steps": sizes.steps, "beyond": "restart"},
         network=sizes.network,
     )

@@ -17,16 +17,21 @@ LEVEL = "low_level"
 
 
 class HistoryPolicy(nn.Module):
-    def __init__(self, sizes):
+    """Low level: a causal transformer over the plan, then pairs of (previous action, observation); the action is read at the observation.
+
+    A plan is a row of a table; while it is trained `embed_option` is a layer on the code instead (`systems.lads_history`).
+    """
+
+    def __init__(self, sizes, embed_option=None):
         super().__init__()
         self.window = sizes.window
-        self.embed_option = nn.Embedding(sizes.codes, sizes.hidden)
+        self.embed_option = embed_option or nn.Embedding(sizes.codes, sizes.hidden)
         self.embed_observation = nn.Linear(sizes.observation, sizes.hidden)
         self.embed_action = nn.Linear(sizes.action, sizes.hidden)
         self.embed_position = nn.Embedding(sizes.window + sizes.horizon, sizes.hidden)
         self.embed_norm = nn.LayerNorm(sizes.hidden)
-        self.drop = Dropout(0.0)
-        self.blocks = nn.ModuleList(Block(sizes.hidden, sizes.heads, 0.0) for _ in range(sizes.low_level_layers))
+        self.drop = Dropout(sizes.dropout)
+        self.blocks = nn.ModuleList(Block(sizes.hidden, sizes.heads, sizes.dropout) for _ in range(sizes.low_level_layers))
         self.norm = nn.LayerNorm(sizes.hidden)
         self.head = nn.Linear(sizes.hidden, sizes.action)
 
@@ -38,6 +43,21 @@ class HistoryPolicy(nn.Module):
         pairs = pairs[-(before + steps) :] + self.embed_position.weight[places][:, None]
         tokens = torch.cat([self.embed_option.weight[index][None], pairs.flatten(0, 1)])
         return self.head(run_blocks(self, tokens[None])[0][2 + 2 * before :: 2])
+
+    def chunks(self, options, observations, previous, before):
+        """Computes the actions of N plans of H steps: options [N, d] embedded, observations [N, W + H, O] and previous [N, W + H, A], of which
+        the first W rows are the window and the first `before` [N] of those valid -> actions [N, H, A]."""
+        count, rows = observations.shape[:2]
+        pairs = torch.stack([self.embed_action(previous), self.embed_observation(observations)], 2)
+        pairs = pairs + self.embed_position.weight[:rows, None]
+        x = self.drop(self.embed_norm(torch.cat([options[:, None], pairs.flatten(1, 2)], 1).float()))
+        place = torch.arange(x.shape[1], device=x.device)
+        number = (place - 1) // 2  # of the pair; -1 is the plan
+        hidden = (number >= before[:, None]) & (number < self.window)
+        mask = torch.where(hidden[:, None] | (place > place[:, None]), -1e9, 0.0)[:, None]
+        for block in self.blocks[:-1]:
+            x = block(x, mask)
+        return self.head(self.norm(self.blocks[-1](x, mask, slice(2 + 2 * self.window, None, 2)))).float()
 
 
 class History(Lisa):
@@ -67,9 +87,9 @@ def _recall(graph, policy, sizes):
     _transformer(entry, policy, x, 2, record_only=True)
 
 
-def _step(graph, policy, normalizer, sizes):
+def _step(graph, policy, normalizer, sizes, observed="observation"):
     entry = graphs.Entry(graph, f"{LEVEL}/step")
-    action, observation = entry.input("previous_action", [1, sizes.action]), entry.input("observation", [1, sizes.observation])
+    action, observation = entry.input("previous_action", [1, sizes.action]), entry.input(observed, [1, sizes.observation])
     phase = entry.input("phase", [1], TensorProto.INT64)
     place = entry.op("Add", [phase, entry.integers("window", [sizes.window])], "place")
     positions = entry.weight(f"{LEVEL}.embed_position", policy.embed_position.weight)
@@ -81,37 +101,44 @@ def _step(graph, policy, normalizer, sizes):
     graphs.head(entry, x, policy.head, "action", f"{LEVEL}.head")
 
 
-def _append(graph, policy, normalizer, sizes):
+def _append(graph, policy, normalizer, sizes, observed="observation"):
     entry = graphs.Entry(graph, "memory/append")
-    action, observation = entry.input("previous_action", [1, sizes.action]), entry.input("observation", [1, sizes.observation])
-    centred = entry.centred(observation, normalizer, "observation_centred")
-    rows = []
-    for name, x, module in (("action", action, policy.embed_action), ("observation", centred, policy.embed_observation)):
-        weight = module.weight if name == "action" else graphs.fold_std(module.weight, normalizer)
+    action, observation = entry.input("previous_action", [1, sizes.action]), entry.input(observed, [1, sizes.observation])
+    observation, folded = graphs.raw(entry, observation, policy.embed_observation, normalizer)
+    rows, parts = [], (("action", action, policy.embed_action, policy.embed_action.weight), ("observation", observation, policy.embed_observation, folded))
+    for name, x, module, weight in parts:
         label = f"{LEVEL}.embed_{name}"
         rows.append(entry.gemm(x, entry.weight(label + ".weight", weight), entry.weight(label + ".bias", module.bias), f"{name}_embedded"))
     entry.op("Concat", rows, "next_row", axis=1)
     entry.output("next_row", [1, 2 * sizes.hidden])
 
 
+def add_low_level(graph, policy, normalizer, sizes, observed="observation"):
+    """Adds the low level's entries; `observed` is the name of what it observes."""
+    _plan(graph, policy)
+    _recall(graph, policy, sizes)
+    _step(graph, policy, normalizer, sizes, observed)
+    _append(graph, policy, normalizer, sizes, observed)
+
+
 def build(policy, sizes):
     graph = common.graph_of(policy, sizes)
     common.select_at_every_token(graph, policy)
-    _plan(graph, policy.low_level)
-    _recall(graph, policy.low_level, sizes)
-    _step(graph, policy.low_level, policy.normalizer, sizes)
-    _append(graph, policy.low_level, policy.normalizer, sizes)
+    add_low_level(graph, policy.low_level, policy.normalizer, sizes)
     return graph.model("history")
 
 
-def contract(sizes, seed):
-    family = {
+def family(sizes, decision):
+    return {
         "kind": "history",
         "horizon": sizes.horizon,
         "codebook": sizes.codebook,
-        "decision": common.argmax(),
+        "decision": decision,
         "window": sizes.window,
         "memory": {"dim": 2 * sizes.hidden},
         "low_level": sizes.low_level_network,
     }
-    return common.contract(family, sizes, seed)
+
+
+def contract(sizes, seed):
+    return common.contract(family(sizes, common.argmax()), sizes, seed)

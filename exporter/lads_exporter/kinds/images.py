@@ -46,13 +46,13 @@ class Pool:
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera and its encoder; a pixel is (byte - mean) / scale."""
+    """A camera and its encoder; a pixel is (byte - mean) / scale, of all colours or of each."""
 
     name: str
     shape: tuple  # rows, columns
     steps: tuple
-    mean: float = 0.0
-    scale: float = 255.0
+    mean: float | tuple = 0.0
+    scale: float | tuple = 255.0
 
 
 class Encoder(nn.Module):
@@ -75,7 +75,8 @@ class Encoder(nn.Module):
 
     def forward(self, frames):
         """Encodes frames [T, rows, columns, 3] of bytes -> [T, F]."""
-        x, known = (frames.permute(0, 3, 1, 2).float() - self.camera.mean) / self.camera.scale, {}
+        mean, scale = (torch.tensor(value, dtype=torch.float32) for value in (self.camera.mean, self.camera.scale))
+        x, known = ((frames.float() - mean) / scale).permute(0, 3, 1, 2), {}
         for step, layer in zip(self.camera.steps, self.layers):
             top, left, bottom, right = step.pads
             if isinstance(step, Conv):
@@ -155,19 +156,25 @@ class Images(nn.Module):
 def randomize(policy, seed):
     """Sets random weights with which the features keep their size from layer to layer, and follow the frame."""
     generator = torch.Generator().manual_seed(seed)
-    draw = lambda tensor: torch.randn(tensor.shape, generator=generator)
     random_policy.draw_weights(policy, generator)
     random_policy.place_normalizer(policy.normalizer, common.ENVIRONMENT["observation"])
+    spread(policy, generator)
     with torch.no_grad():
-        for module in policy.modules():
+        policy.last.weight.mul_(0.5)
+    return policy.eval()
+
+
+def spread(network, generator):
+    """Sets random weights of convolutions and batch norms with which values keep their size from layer to layer."""
+    draw = lambda tensor: torch.randn(tensor.shape, generator=generator)
+    with torch.no_grad():
+        for module in network.modules():
             if isinstance(module, nn.Conv2d):
                 module.weight.copy_(draw(module.weight) * (2 / module.weight[0].numel()) ** 0.5)
             elif isinstance(module, nn.BatchNorm2d):
                 module.weight.copy_(1 + 0.1 * draw(module.weight))
                 module.running_mean.copy_(0.1 * draw(module.running_mean))
                 module.running_var.copy_(0.8 + 0.4 * torch.rand(module.running_var.shape, generator=generator))
-        policy.last.weight.mul_(0.5)
-    return policy.eval()
 
 
 def build(policy, sizes):
@@ -207,16 +214,20 @@ def _inverted(channels, outputs, kernel, stride, expand, side, before, name):
     return [*steps, Conv(wide, kernel, stride, pads, True, 1e-3, "Relu6"), Conv(outputs, 1, norm=1e-3, activation=None, add=add, name=name)]
 
 
-def lite0():
-    """Lists the steps of EfficientNet-Lite0 up to its block 10, then means over parts of the image."""
-    rows = ((1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112))
+def lite0(whole=False):
+    """Lists the steps of EfficientNet-Lite0 up to its block 10, then means over a grid of 4x4 parts that overlap; or of the whole network
+    without its classifier."""
+    rows = [(1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112)]
+    rows += [(4, 5, 2, 6, 192), (1, 3, 1, 6, 320)] if whole else []
     steps, channels, side, before = [Conv(32, 3, 2, (0, 0, 1, 1), norm=1e-3, activation="Relu6", name="stem")], 32, 112, "stem"
     for row, (repeats, kernel, stride, expand, outputs) in enumerate(rows):
         for repeat in range(repeats):
             name, step = f"block{row}.{repeat}", stride if repeat == 0 else 1
             steps += _inverted(channels, outputs, kernel, step, expand, side, before, name)
             channels, side, before = outputs, -(-side // step), name
-    return tuple([*steps, Pool("AveragePool", 3, 3)])
+    if whole:
+        return tuple([*steps, Conv(1280, 1, norm=1e-3, activation="Relu6"), Pool("GlobalAveragePool")])
+    return tuple([*steps, Pool("AveragePool", 5, 3)])
 
 
 def resnet18():

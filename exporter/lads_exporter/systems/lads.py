@@ -77,13 +77,13 @@ class Training(base.Training):
         networks, segments = self.networks, self.segments(episodes, offsets)
         latents = networks.encoder(segments.observations, segments.executed, segments.lengths)
         plans, index, commitment = networks.codebook(latents)
-        losses = {"bc": self.cloning(segments, plans), "commitment": commitment}
+        losses = {"bc": self.cloning(segments, plans, episodes), "commitment": commitment}
         losses["align"] = self.align(plans, segments, episodes)
         codes = torch.full((len(episodes), self.corpus.steps), -1, dtype=torch.long, device=self.corpus.device)
         codes[segments.rows, segments.starts] = index
         return losses, codes
 
-    def cloning(self, segments, plans):
+    def cloning(self, segments, plans, episodes):
         """Computes the mean squared error of the low level's actions under each segment's plan (equation 5)."""
         valid = segments.valid
         each = plans[:, None].expand(-1, self.corpus.horizon, -1)[valid]
@@ -160,7 +160,11 @@ class Training(base.Training):
             uses = self.networks.codebook.uses
             self.networks.high_level.head.bias.sub_(self.config.high_level.balance * (uses / uses.sum()).log())
         if stage in ("joint", "low_level"):
-            base.gain(self.networks.low_level.last, self.config.low_level.gain)
+            base.gain(self.actions_layer(), self.config.low_level.gain)
+
+    def actions_layer(self):
+        """Returns the low level's linear layer that gives the actions."""
+        return self.networks.low_level.last
 
     @torch.no_grad()
     def validate(self, stage):

@@ -78,7 +78,7 @@ class Training(lads.Training):
         segments = self.corpus.segments(episodes, offsets)
         q = self.networks.encoder(segments.observations, segments.executed, segments.lengths)
         plans = sample(q) if self.networks.encoder.training else split(q)[0]
-        losses = {"bc": self.cloning(segments, plans), "kl": divergence(q, None).mean(), "align": self.align(plans, segments, episodes)}
+        losses = {"bc": self.cloning(segments, plans, episodes), "kl": divergence(q, None).mean(), "align": self.align(plans, segments, episodes)}
         known = q.new_zeros(len(episodes), self.corpus.steps, q.shape[1])
         marks = torch.full(known.shape[:2], -1, dtype=torch.long, device=known.device)
         known[segments.rows, segments.starts] = q.detach()

@@ -2,7 +2,8 @@
 //!
 //! A policy that is driven with the elements of its observation in another order, or at another rate, does not fail: it moves the wrong
 //! joint. So id, version, control period and every element must agree, and every sub-task must be one that is watched. Environments name
-//! an element after its joint where the joint has one coordinate, so an element agrees by its name or by its joint.
+//! an element after its joint where the joint has one coordinate, so an element agrees by its name or by its joint. A policy with cameras
+//! may observe the first elements only: the robot's own, while it sees the rest.
 
 use lads_compiler::Contract;
 use lads_compiler::contract::{Channel, DType, Element};
@@ -115,7 +116,10 @@ pub fn check(
         });
     }
     if let Some(observation) = observation {
-        same_elements("observation", observation, environment.observation_names())?;
+        let names = environment.observation_names();
+        let own = (contract.observations().any(sight::is_image)).then_some(&observation.elements);
+        let own = own.and_then(|own| names.get(..own.len()));
+        same_elements("observation", observation, own.unwrap_or(names))?;
     }
     same_elements("action", contract.action(), environment.action_names())?;
     contract

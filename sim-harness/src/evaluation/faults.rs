@@ -44,17 +44,21 @@ impl Link {
     }
 
     /// Computes what the policy sees (`seen`, which holds what it saw last) when the environment shows `observation`, which is `state` plus
-    /// noise.
+    /// noise; a policy may see the first elements only.
     pub fn sense(&mut self, observation: &[f64], state: &[f64], seen: &mut [f32]) {
         let scale = self.faults.noise_scale;
-        let noisy = observation.iter().zip(state).map(|(&shown, &truth)| {
-            // Exactly what is shown where the noise is the environment's own.
-            if scale == 1.0 {
-                shown as f32
-            } else {
-                (truth + scale * (shown - truth)) as f32
-            }
-        });
+        let noisy = observation
+            .iter()
+            .zip(state)
+            .take(seen.len())
+            .map(|(&shown, &truth)| {
+                // Exactly what is shown where the noise is the environment's own.
+                if scale == 1.0 {
+                    shown as f32
+                } else {
+                    (truth + scale * (shown - truth)) as f32
+                }
+            });
         self.late.push_back(noisy.collect());
         let arrived = if self.late.len() > self.faults.delay_steps {
             self.late.pop_front()
@@ -114,6 +118,13 @@ mod tests {
         let mut executed = [9.0, 9.0];
         link.actuate(&[0.1, -0.7], &mut executed);
         assert_eq!(executed, [0.1, -0.7]);
+    }
+
+    #[test]
+    fn a_policy_may_see_the_first_elements_only() {
+        let mut seen = [0.0; 2];
+        Link::new(Faults::default(), SEED).sense(&[1.0, 2.0, 3.0], &[0.5; 3], &mut seen);
+        assert_eq!(seen, [1.0, 2.0]);
     }
 
     #[test]

@@ -201,8 +201,8 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
         let limits = limits.collect();
         let mut seen = contract.observations();
         let channel = seen.find(|channel| channel.dtype() == DType::F32);
-        let (observation_len, action_len) =
-            (environment.observation_len(), environment.action_len());
+        let observation_len = channel.map_or(0, |channel| channel.len());
+        let action_len = environment.action_len();
         Self {
             controller,
             environment,

@@ -214,6 +214,21 @@ pub const RESERVED: [&str; 6] = [
 ];
 
 impl Blueprint {
+    /// Begins with an encoder of the observations, such as camera frames, which runs first at each of
+    /// the events and hands its features to the other entries; without `features` there is none.
+    pub fn observed(features: Option<usize>, events: &[Event]) -> Self {
+        let (encoder, handed) = ("observation_encoder/encode", "features");
+        let Some(width) = features else {
+            return Self::default();
+        };
+        let begun = Self::default()
+            .handed(handed)
+            .wide(width, "family.features")
+            .entry(Entry::new(encoder, &[handed]).acts());
+        let calls = events.iter().map(|&event| Call::on(event, encoder));
+        calls.fold(begun, Self::call)
+    }
+
     pub fn state(mut self, name: &str, keep: Keep, scope: Scope) -> Self {
         self.states.push(State {
             name: name.into(),

@@ -56,7 +56,7 @@ impl Kind for Lads {
         let (start, step, record) = ("high_level/start", "high_level/step", "high_level/record");
         let (lookup, act) = ("codebook/lookup", "low_level/act");
         let encode = "trajectory_encoder/encode";
-        self.observed()
+        Blueprint::observed(self.features, &[Event::Step, Event::Follow])
             .kv("context", contract.network)
             .plain("logits")
             .wide(self.codebook.size, "family.codebook.size")
@@ -83,21 +83,5 @@ impl Kind for Lads {
             .call(Call::on(Event::Follow, lookup))
             .call(Call::on(Event::Follow, act))
             .call(Call::on(Event::Encode, encode))
-    }
-}
-
-impl Lads {
-    /// The encoder of observations, where there is one.
-    fn observed(&self) -> Blueprint {
-        let Some(width) = self.features else {
-            return Blueprint::default();
-        };
-        let (encoder, features) = ("observation_encoder/encode", "features");
-        Blueprint::default()
-            .handed(features)
-            .wide(width, "family.features")
-            .entry(Entry::new(encoder, &[features]).acts())
-            .call(Call::step(encoder))
-            .call(Call::on(Event::Follow, encoder))
     }
 }
