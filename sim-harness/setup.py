@@ -59,7 +59,7 @@ class SetupError(Exception):
 
 
 def sha256_of(name, arch):
-    """The pinned checksum of a wheel; pure-Python wheels have one for every architecture."""
+    """Return the pinned checksum of a wheel; pure-Python wheels have one for every architecture."""
     return SHA256.get((name, arch)) or SHA256[(name, "any")]
 
 
@@ -96,7 +96,7 @@ def unpack(wheel, mapping, folder):
 
 
 def stamp_text(arch):
-    """What a finished vendor/ says about itself: equal text means nothing to do."""
+    """Return the stamp of a finished vendor/ folder; an equal stamp means nothing to do."""
     lines = [f"{name} {version} {sha256_of(name, arch)}" for name, version in WHEELS]
     return "\n".join([arch, hashlib.sha256(repr(WHEELS).encode()).hexdigest(), *lines, ""])
 

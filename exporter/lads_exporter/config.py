@@ -78,7 +78,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Images:
-    """What a policy sees with a camera, in place of the state; the paper's is LISA's."""
+    """Camera of a policy that observes images instead of the state; the paper's encoder is LISA's."""
 
     channel: str  # name of the camera's channel; "" for a policy that observes the state
     widths: list  # channels of the convolutions

@@ -186,7 +186,7 @@ def is_whole(folder, sha256=None):
 
 
 def _replace(folder, files):
-    """Writes all files into a folder beside, which then takes the folder's place."""
+    """Replaces a folder whole: all files are written into one beside it, which then takes its place."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as scratch:
         new, old = Path(scratch) / "new", Path(scratch) / "old"

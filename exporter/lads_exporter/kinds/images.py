@@ -19,7 +19,7 @@ from . import common, plain
 
 @dataclass(frozen=True)
 class Conv:
-    """A convolution, batch normalisation where `norm` is its epsilon, what is added, an activation."""
+    """Convolution, then batch normalisation (`norm` is its epsilon), a residual and an activation, each if set."""
 
     outputs: int
     kernel: int

@@ -1,4 +1,4 @@
-"""Kind `lads`: the exporter's own policy, through the code that trained ones take."""
+"""Kind `lads`: a random policy of the exporter's own system, exported by the code that exports trained ones."""
 
 from .. import config, graphs, random_policy
 from ..model import Lads

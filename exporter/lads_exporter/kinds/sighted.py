@@ -52,7 +52,7 @@ class Sighted(Lads):
 
 
 def graph(networks, encoded):
-    """All entries but the trajectory encoder, which reads features that nobody outside has."""
+    """Makes the graph of all entries but the trajectory encoder, whose features no caller has."""
     made = graphs.Graph()
     graphs.known_instructions(made, networks.high_level, encoded)
     networks.frames.build(made)

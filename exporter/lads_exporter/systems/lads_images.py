@@ -53,7 +53,7 @@ class Training(lads.Training):
         super().begin(stage)
 
     def segments(self, episodes, offsets):
-        """In the first stage, of features that the encoder gives now."""
+        """Returns the segments; in the first stage those of features that the encoder computes anew."""
         if not self.live:
             return super().segments(episodes, offsets)
         frames, rows, steps = self.corpus.seen(episodes)

@@ -9,7 +9,7 @@
 use std::fmt::Display;
 use std::io::{BufRead, ErrorKind, Read as _, Write};
 
-use lads_core::{Controller, Decision, Instruction, Policy, StepError};
+use lads_core::{Controller, Instruction, Policy, StepError};
 use lads_host::Memory;
 
 use crate::images::Images;
@@ -66,7 +66,7 @@ pub fn act(
     // A policy that answers differently on this machine is not let near a motor.
     self_test::replay(model, &policy, &mut controller)?;
     if let Some(seed) = request.sample {
-        controller.set_decision(sampling(&policy, seed));
+        controller.set_decision(policy.contract().sampling(seed));
     }
     if let Some(instruction) = instruction {
         controller
@@ -82,16 +82,6 @@ pub fn act(
         images,
     };
     pipe.answer_all(input, output)
-}
-
-/// Returns the rule of `--sample`: at the contract's temperature, or at 1 where the contract's rule
-/// is argmax.
-pub fn sampling(policy: &Policy<'_>, seed: u64) -> Decision {
-    let temperature = match policy.contract().decision() {
-        Decision::Sample { temperature, .. } => temperature,
-        Decision::Argmax => 1.0,
-    };
-    Decision::Sample { temperature, seed }
 }
 
 /// Connects a controller with a reader and a writer.

@@ -33,7 +33,6 @@ use clap::{Parser, Subcommand};
 use lads_host::Opened;
 use serde_json::Value;
 
-pub use crate::act::sampling;
 use crate::inspect::foreign::Foreign;
 use crate::model::Model;
 use crate::refusal::Refusal;

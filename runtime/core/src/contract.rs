@@ -362,6 +362,16 @@ impl<'a> Contract<'a> {
         }
     }
 
+    /// Returns the rule that draws indices with a seed, at the temperature of the contract's rule, or
+    /// at 1 where that is argmax.
+    pub fn sampling(&self, seed: u64) -> Decision {
+        let temperature = match self.decision() {
+            Decision::Sample { temperature, .. } => temperature,
+            Decision::Argmax => 1.0,
+        };
+        Decision::Sample { temperature, seed }
+    }
+
     /// Returns the source of noise unless the caller sets another one.
     pub fn noise(&self) -> Noise {
         match self.record.noise {

@@ -8,7 +8,8 @@ use lads_image::format::{CRC_WORD, FormatError, Tag};
 use lads_image::records::{self, DType, Role};
 use lads_image::tables::TablesError;
 use support::assemble::{self, ACTION, ACTIONS, OBSERVATION, WORDS};
-use support::writer::{Parts, section_row};
+use support::layout::section_row;
+use support::writer::Parts;
 use support::{Image, Model, Spec, shapes};
 
 fn lads() -> Parts {

@@ -178,6 +178,19 @@ fn episode(image: &Image, decision: Decision) -> (Vec<u32>, Vec<f32>) {
     })
 }
 
+/// The contract's own temperature counts, and 1 where it only says argmax.
+#[test]
+fn sampling_is_at_the_temperature_of_the_contract() {
+    let mut parts = parts(&tiny());
+    parts.contract.temperature = 3.0;
+    for (selection, temperature) in [(SelectionRule::Argmax, 1.0), (SelectionRule::Sample, 3.0)] {
+        parts.contract.selection = selection;
+        let sampling = parts.image().policy().contract().sampling(7);
+        let seed = 7;
+        assert_eq!(sampling, Decision::Sample { temperature, seed });
+    }
+}
+
 #[test]
 fn sampling_is_a_function_of_the_seed() {
     let image = parts(&tiny()).image();

@@ -13,7 +13,8 @@ use lads_image::op::Op;
 use lads_image::tables::TablesError;
 use proptest::prelude::*;
 use support::assemble::{self, RECORD};
-use support::writer::{Parts, section_row};
+use support::layout::section_row;
+use support::writer::Parts;
 use support::{Image, Model, Random, Spec, given, observe, shapes};
 
 /// Makes a LADS policy even smaller than the small one, because every byte of it is flipped.

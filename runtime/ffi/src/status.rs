@@ -1,5 +1,6 @@
-//! Status numbers that calls return, each with its one line of English: written once, in the table
-//! at the end.
+//! Status numbers that calls return, each with its one line of English, and how errors of lads-core
+//! become statuses. A number and its text stand in one place, the table `statuses!`: the enum, its
+//! documentation, the texts and the C header come out of it.
 
 use core::ffi::CStr;
 

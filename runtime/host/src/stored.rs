@@ -22,7 +22,7 @@ pub fn is_exact(policy: &Policy<'_>) -> bool {
         && caches.iter().all(|&format| format == CacheFormat::F32)
 }
 
-/// Of weights and of caches.
+/// Returns the formats of a policy's weights and of its KV caches.
 fn formats(policy: &Policy<'_>) -> (Vec<WeightFormat>, Vec<CacheFormat>) {
     // Opening the policy has read the same tables.
     let Ok(tables) = Tables::new(policy.image()) else {

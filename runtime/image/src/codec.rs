@@ -193,19 +193,7 @@ macro_rules! word_enum {
             pub const ALL: &'static [Self] = &[$(Self::$variant,)*];
         }
 
-        impl $crate::codec::Field for $name {
-            const WORDS: usize = 1;
-            fn put(&self, out: &mut $crate::codec::Writer) {
-                out.word(*self as u32);
-            }
-            #[inline(always)]
-            fn take(from: &mut $crate::codec::Reader) -> Option<Self> {
-                match from.word()? {
-                    $($value => Some(Self::$variant),)*
-                    _ => None,
-                }
-            }
-        }
+        $crate::codec::word_enum_for! { $name { $($variant = $value,)* } }
     };
 }
 

@@ -3,6 +3,7 @@
 
 use lads_image::codec::{Field, Reader, Writer};
 use lads_image::format::{self, HEADER_WORDS, Layout, SECTIONS, Sections, Tag};
+use lads_image::op::{Activation, Attention, Place, WeightSpan};
 use lads_image::records::{
     CallRecord, ChannelRecord, ContractRecord, ElementRecord, EntryRecord, GoldenRecord,
     InstructionRecord, PortRecord, StateRecord,
@@ -87,6 +88,11 @@ proptest! {
         prop_assert!(written::<PortRecord>(&words));
         prop_assert!(written::<CallRecord>(&words));
         prop_assert!(written::<GoldenRecord>(&words));
+        prop_assert!(written::<Place>(&words));
+        prop_assert!(written::<Option<WeightSpan>>(&words));
+        prop_assert!(written::<Activation>(&words));
+        prop_assert!(written::<Attention>(&words));
+        prop_assert!(written::<[u64; 3]>(&words));
     }
 
     #[test]

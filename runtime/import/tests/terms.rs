@@ -4,10 +4,9 @@
 mod common;
 
 use common::{
-    Case, HEAD, Happens::Reset, close, mirror, model, node, step, value, weight, wide_action,
+    Case, HEAD, Happens::Reset, SENSOR, close, mirror, model, node, step, value, weight,
+    wide_action,
 };
-
-const SENSOR: &str = "unit = \"1\"\nmin = -100\nmax = 100\n";
 
 #[test]
 fn a_term_is_moved_clipped_and_scaled_in_this_order() {

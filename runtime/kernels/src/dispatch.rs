@@ -35,7 +35,7 @@ enum Level {
     /// AVX, AVX2 and F16C.
     #[cfg(target_arch = "x86_64")]
     Avx2,
-    /// AVX-512 F, BW, DQ, VL and VNNI, and the above: Cascade Lake, Zen 4 and later.
+    /// AVX, AVX2, F16C and AVX-512 F, BW, DQ, VL and VNNI: Cascade Lake, Zen 4 and later.
     #[cfg(target_arch = "x86_64")]
     Avx512,
     /// NEON, the baseline of aarch64, through its intrinsics.
@@ -183,7 +183,7 @@ mod x86_64 {
     /// Bits of XCR0 for AVX-512: SSE, AVX, the mask registers, the upper halves of the first sixteen ZMM registers, the other sixteen.
     const ZMM_STATE: u64 = 0b1110_0110;
 
-    /// What the CPU says in a leaf.
+    /// Returns the registers of a leaf of CPUID.
     #[allow(
         unused_unsafe,
         reason = "a safe function in newer versions of Rust than our `rust-version`"

@@ -1,7 +1,7 @@
 //! Panels of float weights: short formats are decoded, then products and sums are 32-bit floats.
 
 use crate::lanes::LANES;
-use crate::linear::{PANEL_BLOCKS, Sums};
+use crate::linear::{PANEL_BLOCKS, Place, Sums};
 use crate::simd::{Simd, prefetch_ahead};
 use crate::stored::Stored;
 
@@ -16,7 +16,7 @@ pub(crate) fn panel<S: Simd, W: Stored, const R: usize>(
 ) {
     let mut at = 0;
     while at < blocks {
-        let (place, left) = ([at, blocks], blocks - at);
+        let (place, left) = (Place { at, blocks }, blocks - at);
         at += if S::SUMS >= PANEL_BLOCKS * R && left >= PANEL_BLOCKS {
             sweep::<S, W, PANEL_BLOCKS, R>(simd, w, place, x, sums)
         } else if S::SUMS >= 2 * R && left >= 2 {
@@ -27,8 +27,7 @@ pub(crate) fn panel<S: Simd, W: Stored, const R: usize>(
     }
 }
 
-/// Computes the sums of `R` rows of `k` elements with `P` blocks, starting at block `at` of a panel
-/// of `blocks`, and returns `P`.
+/// Computes the sums of `R` rows of `k` elements with `P` blocks of a panel, and returns `P`.
 #[inline(always)]
 #[expect(
     clippy::indexing_slicing,
@@ -41,7 +40,7 @@ pub(crate) fn panel<S: Simd, W: Stored, const R: usize>(
 fn sweep<S: Simd, W: Stored, const P: usize, const R: usize>(
     simd: S,
     w: &[W::Bits],
-    [at, blocks]: [usize; 2],
+    Place { at, blocks }: Place,
     x: [&[f32]; R],
     out: &mut Sums,
 ) -> usize {

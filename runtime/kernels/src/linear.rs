@@ -12,8 +12,7 @@
 //!
 //! The module `floats` sums panels of float weights, `integers` those of integer weights.
 
-use core::hint::black_box;
-use core::ops::Range;
+use core::mem;
 
 use crate::dispatch::{Isa, Kernel};
 use crate::elementwise::{Unary, UnaryKind, assign};
@@ -220,77 +219,6 @@ impl Linear<'_> {
             y,
         });
     }
-
-    /// Returns whether the weights are integers.
-    #[inline(always)]
-    fn is_scaled(&self) -> bool {
-        INTEGERS && matches!(self.w, Panels::Int8 { .. } | Panels::Int16 { .. })
-    }
-
-    /// Computes the sums of `R` rows with the panel that starts at weight `at`; with integers it
-    /// adds those of part `i` to those of earlier parts.
-    #[inline(always)]
-    fn panel<S: Simd, const R: usize, const NARROW: bool>(
-        &self,
-        simd: S,
-        (at, blocks): (Range<usize>, usize),
-        (x, parts, i): ([&[f32]; R], &[Part], usize),
-        sums: &mut Sums,
-    ) {
-        #[inline(always)]
-        fn part<T>(w: &[T], at: Range<usize>) -> &[T] {
-            w.get(at).unwrap_or(&[])
-        }
-        match self.w {
-            Panels::F32(w) if !NARROW => {
-                floats::panel::<S, F32, R>(simd, part(w, at), blocks, x, sums);
-            }
-            Panels::Int8 { panels: w, .. } if INTEGERS && !NARROW => {
-                integers::panel::<S, i8, R>(simd, part(w, at), blocks, parts, i, sums);
-            }
-            Panels::Int16 { panels: w, .. } if INTEGERS && !NARROW => {
-                integers::panel::<S, i16, R>(simd, part(w, at), blocks, parts, i, sums);
-            }
-            Panels::F16(w) if NARROW => {
-                floats::panel::<S, F16, R>(simd, part(w, at), blocks, x, sums);
-            }
-            Panels::Bf16(w) if NARROW => {
-                floats::panel::<S, Bf16, R>(simd, part(w, at), blocks, x, sums);
-            }
-            // `run` chooses the kernel by the format.
-            _ => {}
-        }
-    }
-
-    /// Applies scale, bias and activation to the up to sixteen outputs from `first` on, and stores
-    /// them.
-    #[inline(always)]
-    fn finish<S: Simd>(
-        &self,
-        simd: S,
-        activation: Activation,
-        sums: &Block,
-        first: usize,
-        y: &mut [f32],
-    ) {
-        let mut spare = [0.0; LANES];
-        let mut v = simd.load(sums);
-        if let Panels::Int8 { scales, .. } | Panels::Int16 { scales, .. } = self.w {
-            v = simd.mul(v, simd.load(block(scales, first, &mut spare)));
-        }
-        v = simd.add(v, simd.load(block(self.bias, first, &mut spare)));
-        v = activation.apply(simd, v);
-        if self.accumulate {
-            v = simd.add(simd.load(block(y, first, &mut spare)), v);
-        }
-        let y = y.get_mut(first..).unwrap_or(&mut []);
-        if let Some(y) = y.first_chunk_mut() {
-            simd.store(v, y);
-        } else {
-            simd.store(v, &mut spare);
-            assign(y, &spare);
-        }
-    }
 }
 
 /// Returns the sixteen elements from `first` on; missing ones are zero, in `spare`.
@@ -305,6 +233,47 @@ pub(crate) fn block<'b>(x: &'b [f32], first: usize, spare: &'b mut Block) -> &'b
     spare
 }
 
+/// Sums of one panel for two rows.
+pub(crate) type Sums = [[Block; PANEL_BLOCKS]; 2];
+
+/// Where in a panel a sweep over its weights starts.
+#[derive(Clone, Copy)]
+pub(crate) struct Place {
+    /// First block of the sweep.
+    pub at: usize,
+    /// Number of blocks of the whole panel.
+    pub blocks: usize,
+}
+
+/// Panel of a layer's weights.
+#[derive(Clone, Copy)]
+struct PanelRef {
+    /// First output of the panel.
+    first: usize,
+    /// Number of blocks of outputs, at most [`PANEL_BLOCKS`].
+    blocks: usize,
+    /// Number of rows of the packed weights, see [`packed_rows`].
+    rows: usize,
+}
+
+impl PanelRef {
+    /// Returns the panel's weights.
+    #[inline(always)]
+    fn weights<T>(self, packed: &[T]) -> &[T] {
+        let end = self.first + self.blocks * LANES;
+        let panel = self.first * self.rows..end * self.rows;
+        packed.get(panel).unwrap_or(&[])
+    }
+}
+
+/// One or two rows of inputs, which go through the panels together, and their outputs.
+struct RowPair<'a> {
+    /// Number of rows, 1 or 2; with one, the second input and output are empty.
+    rows: usize,
+    x: [&'a [f32]; 2],
+    y: [&'a mut [f32]; 2],
+}
+
 /// Operands of a running layer, of wide weights or integers, or of `NARROW` ones, see
 /// [`Kernel::NARROW`].
 struct Rows<'a, const NARROW: bool> {
@@ -313,71 +282,155 @@ struct Rows<'a, const NARROW: bool> {
     activation: Activation,
     /// Two parts for integer weights, else empty.
     parts: &'a mut [Part],
+    /// Inputs that are still to be read, whole rows of `k`.
     x: &'a [f32],
+    /// Outputs that are still to be written, whole rows of `n`.
     y: &'a mut [f32],
 }
-
-/// The sums of one panel for two rows.
-pub(crate) type Sums = [[Block; PANEL_BLOCKS]; 2];
 
 impl<const NARROW: bool> Kernel for Rows<'_, NARROW> {
     const NARROW: bool = NARROW;
 
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd>(mut self, simd: S) {
         let layer = self.layer;
-        let (k, n) = (layer.k, layer.n);
-        let (height, part_len) = if !NARROW && layer.is_scaled() {
-            (k.next_multiple_of(LANES), PART)
+        let (rows, part_len) = if self.is_scaled() {
+            (layer.k.next_multiple_of(LANES), PART)
         } else {
-            (k, k)
+            (layer.k, layer.k)
         };
         let mut sums = [[[0.0; LANES]; PANEL_BLOCKS]; 2];
-        let parts = self.parts;
-        let (mut x, mut y) = (self.x, self.y);
-        while let Some((x0, rest)) = x.split_at_checked(k)
-            && let Some((y0, others)) = y.split_at_mut_checked(n)
-        {
-            let (rows, x1, y1) = if let Some((x1, rest)) = rest.split_at_checked(k)
-                && let Some((y1, others)) = others.split_at_mut_checked(n)
-            {
-                (x, y) = (rest, others);
-                (2, x1, y1)
-            } else {
-                (x, y) = (&[], &mut []);
-                (1, &[][..], Default::default())
-            };
-            let mut y = [y0, y1];
-            let mut ready = None;
-            for first in (0..n).step_by(PANEL) {
-                let blocks = (n - first).div_ceil(LANES).min(PANEL_BLOCKS);
-                let place = || {
-                    let at = first * height..(first + blocks * LANES) * height;
-                    (at, blocks)
+        while let Some(mut pair) = self.next_pair() {
+            let mut quantised = None;
+            for first in (0..layer.n).step_by(PANEL) {
+                let blocks = (layer.n - first).div_ceil(LANES).min(PANEL_BLOCKS);
+                let panel = PanelRef {
+                    first,
+                    blocks,
+                    rows,
                 };
-                for i in 0..k.div_ceil(part_len.max(1)) {
-                    if !NARROW && layer.is_scaled() && ready != Some(i) {
-                        for (part, x) in parts.iter_mut().zip([x0, x1]).take(black_box(rows)) {
-                            part.take(simd, x.get(i * PART..).unwrap_or(&[]));
-                        }
-                        ready = Some(i);
+                for part in 0..layer.k.div_ceil(part_len.max(1)) {
+                    if self.is_scaled() && quantised != Some(part) {
+                        self.quantise(simd, &pair, part);
+                        quantised = Some(part);
                     }
-                    if rows == 2 {
-                        let x = ([x0, x1], &*parts, i);
-                        layer.panel::<S, 2, NARROW>(simd, place(), x, &mut sums);
+                    if pair.rows == 2 {
+                        self.sum::<S, 2>(simd, panel, pair.x, part, &mut sums);
                     } else {
-                        let x = ([x0], &*parts, i);
-                        layer.panel::<S, 1, NARROW>(simd, place(), x, &mut sums);
+                        self.sum::<S, 1>(simd, panel, [pair.x[0]], part, &mut sums);
                     }
                 }
-                // Written once for all widths and numbers of rows, and not unrolled by those who know them: activations are long.
-                for (y, sums) in y.iter_mut().zip(&sums).take(black_box(rows)) {
-                    let sums = black_box(sums.get(..blocks).unwrap_or(&[]));
-                    for (block, sums) in sums.iter().enumerate() {
-                        layer.finish(simd, self.activation, sums, first + block * LANES, y);
-                    }
-                }
+                self.finish(simd, panel, &sums, &mut pair);
             }
+        }
+    }
+}
+
+impl<'a, const NARROW: bool> Rows<'a, NARROW> {
+    /// Returns whether the weights are integers.
+    #[inline(always)]
+    fn is_scaled(&self) -> bool {
+        INTEGERS && !NARROW && matches!(self.layer.w, Panels::Int8 { .. } | Panels::Int16 { .. })
+    }
+
+    /// Takes the next two rows, or the last one.
+    #[inline(always)]
+    fn next_pair(&mut self) -> Option<RowPair<'a>> {
+        let (k, n) = (self.layer.k, self.layer.n);
+        let (x0, x) = self.x.split_at_checked(k)?;
+        let (y0, y) = mem::take(&mut self.y).split_at_mut_checked(n)?;
+        let (rows, x1, y1);
+        (rows, x1, self.x, y1, self.y) = match (x.split_at_checked(k), y.split_at_mut_checked(n)) {
+            (Some((x1, x)), Some((y1, y))) => (2, x1, x, y1, y),
+            _ => (1, &[][..], &[][..], Default::default(), Default::default()),
+        };
+        Some(RowPair {
+            rows,
+            x: [x0, x1],
+            y: [y0, y1],
+        })
+    }
+
+    /// Converts one part of each row to integers.
+    #[inline(always)]
+    fn quantise<S: Simd>(&mut self, simd: S, pair: &RowPair, part: usize) {
+        for (to, x) in self.parts.iter_mut().zip(pair.x).take(pair.rows) {
+            to.take(simd, x.get(part * PART..).unwrap_or(&[]));
+        }
+    }
+
+    /// Computes the sums of `R` rows with one panel; with integers it adds those of a part to those
+    /// of earlier parts.
+    #[inline(always)]
+    fn sum<S: Simd, const R: usize>(
+        &self,
+        simd: S,
+        panel: PanelRef,
+        x: [&[f32]; R],
+        part: usize,
+        sums: &mut Sums,
+    ) {
+        let blocks = panel.blocks;
+        match self.layer.w {
+            Panels::F32(w) if !NARROW => {
+                floats::panel::<S, F32, R>(simd, panel.weights(w), blocks, x, sums);
+            }
+            Panels::Int8 { panels: w, .. } if INTEGERS && !NARROW => {
+                integers::panel::<S, i8, R>(simd, panel.weights(w), blocks, self.parts, part, sums);
+            }
+            Panels::Int16 { panels: w, .. } if INTEGERS && !NARROW => {
+                integers::panel::<S, i16, R>(
+                    simd,
+                    panel.weights(w),
+                    blocks,
+                    self.parts,
+                    part,
+                    sums,
+                );
+            }
+            Panels::F16(w) if NARROW => {
+                floats::panel::<S, F16, R>(simd, panel.weights(w), blocks, x, sums);
+            }
+            Panels::Bf16(w) if NARROW => {
+                floats::panel::<S, Bf16, R>(simd, panel.weights(w), blocks, x, sums);
+            }
+            // `Linear::run` chooses the kernel by the format.
+            _ => {}
+        }
+    }
+
+    /// Computes a panel's outputs from its sums and stores them.
+    #[inline(always)]
+    fn finish<S: Simd>(&self, simd: S, panel: PanelRef, sums: &Sums, pair: &mut RowPair) {
+        for (y, sums) in pair.y.iter_mut().zip(sums).take(pair.rows) {
+            let sums = sums.get(..panel.blocks).unwrap_or(&[]);
+            for (block, sums) in sums.iter().enumerate() {
+                self.finish_block(simd, sums, panel.first + block * LANES, y);
+            }
+        }
+    }
+
+    /// Applies scale, bias and activation to the up to sixteen outputs from `first` on, and stores
+    /// them.
+    #[inline(always)]
+    fn finish_block<S: Simd>(&self, simd: S, sums: &Block, first: usize, y: &mut [f32]) {
+        let layer = self.layer;
+        let mut spare = [0.0; LANES];
+        let mut v = simd.load(sums);
+        if let Panels::Int8 { scales, .. } | Panels::Int16 { scales, .. } = layer.w {
+            v = simd.mul(v, simd.load(block(scales, first, &mut spare)));
+        }
+        v = simd.add(v, simd.load(block(layer.bias, first, &mut spare)));
+        v = self.activation.apply(simd, v);
+        if layer.accumulate {
+            v = simd.add(simd.load(block(y, first, &mut spare)), v);
+        }
+        let y = y.get_mut(first..).unwrap_or(&mut []);
+        if let Some(y) = y.first_chunk_mut() {
+            simd.store(v, y);
+        } else {
+            simd.store(v, &mut spare);
+            assign(y, &spare);
         }
     }
 }

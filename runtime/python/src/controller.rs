@@ -41,7 +41,7 @@ impl Settings {
             Working::of(policy, isa).map_err(|error| WorkspaceError::new_err(error.to_string()))?;
         working.with(|controller| {
             if let Some(seed) = self.sample {
-                controller.set_decision(lads_cli::sampling(policy.view(), seed));
+                controller.set_decision(policy.view().contract().sampling(seed));
             }
             if let Some(seed) = self.noise {
                 controller.set_noise(Noise::Seeded { seed });
@@ -162,7 +162,7 @@ impl Controller {
     /// Describes the rule that picks indices.
     pub fn rule(&self) -> String {
         let rule = match self.settings.sample {
-            Some(seed) => lads_cli::sampling(self.checked.view(), seed),
+            Some(seed) => self.contract().sampling(seed),
             None => self.contract().decision(),
         };
         match rule {

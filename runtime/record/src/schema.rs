@@ -71,7 +71,7 @@ pub const TIMING: usize = 5;
 pub const GRIPPER: usize = 6;
 pub const COMPLETION: usize = 7;
 
-/// All topics, named by the constants above.
+/// Topics of a recording; constants such as [`EPISODE`] are their indices.
 pub const TOPICS: [Topic; 8] = [
     Topic {
         name: "/episode",

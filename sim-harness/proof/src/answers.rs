@@ -83,7 +83,7 @@ pub struct Replay {
     pub episode: usize,
     /// Replies in order; fewer than the trace's steps where the policy refused.
     pub replies: Vec<Reply>,
-    /// Why the policy refused the next step, if it did.
+    /// Reason for which the policy refused the next step, if it did.
     pub refused: Option<String>,
     /// Plan that the trajectory encoder sees in each segment of the reference's trace, fewer where it refused one; `None` without an
     /// encoder.
@@ -149,8 +149,8 @@ impl Answers {
         (answers.all(&traced, &numbering), numbering)
     }
 
-    /// The same of an image with fewer bits than 32, whose answers with 32 have shown how plans are numbered: its logits are measured, and what
-    /// they decide is judged.
+    /// Judges the replays of an image with fewer bits than 32, given the numbering of plans that its answers with 32 bits have shown. Logits are
+    /// measured, not bounded; what they decide is judged.
     pub fn judge_rounded(
         reference: &Reference,
         replays: &[Replay],

@@ -145,7 +145,7 @@ pub struct Certificate {
     pub reference: ReferenceUsed,
     /// Notes beside the verdict, one sentence each.
     pub notes: Vec<String>,
-    /// What the certificate says nothing about, one sentence each.
+    /// Limits of the certificate: what it says nothing about, one sentence each.
     pub not_covered: Vec<String>,
     /// Comparison of the contracts, field by field.
     pub contract: Compared,

@@ -19,50 +19,50 @@ use crate::reference::Reference;
 /// A decision is clear if its margin is more than so many times the largest difference of a logit: two logits may be off.
 pub const MARGIN_FACTOR: f64 = 2.0;
 
-/// The share of decisions that have to be clear: of a hundred, one may hang on the rounding, if it came to the worst.
+/// Share of decisions that have to be clear: at worst, one of a hundred may depend on the rounding.
 pub const CLEAR_SHARE: f64 = 0.99;
 
-/// Chance of calling too many decisions unclear where only those that may be are.
+/// Probability of finding too many unclear decisions when their share is as large as allowed.
 const UNCLEAR: f64 = 0.01;
 
-/// Why it is another policy.
+/// Reason why an image with fewer bits is another policy than with 32.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Loss {
-    /// It does not compile, fails the golden episode or refuses a question.
+    /// The image does not compile, fails the golden episode or refuses a question.
     Refused(String),
     /// Decisions selected another index.
     Selected {
-        /// How many.
+        /// Number of decisions that changed.
         changed: usize,
-        /// The largest margin of one of them with 32 bits.
+        /// Largest margin, with 32 bits, of a decision that changed.
         margin: f64,
     },
-    /// A logit is off by more than it may.
+    /// A logit differs by more than its tolerance.
     Logit {
-        /// By so much at most.
+        /// Largest difference of a logit.
         difference: f64,
-        /// What is allowed.
+        /// Largest difference that is allowed.
         tolerance: f64,
     },
     /// Every decision is the same, and too many are close calls.
     Unclear {
-        /// The share that is clear.
+        /// Share of the decisions that are clear.
         share: f64,
         /// Largest difference of a logit.
         logit: f64,
         /// Whether the decisions are enough to say so, and not a few with one close call by chance.
         shown: bool,
     },
-    /// An action is off.
+    /// An action element differs by more than its tolerance.
     Action {
-        /// By so much at most.
+        /// Largest difference of an action element.
         difference: f64,
-        /// What is allowed.
+        /// Largest difference that is allowed.
         tolerance: f64,
     },
     /// The trajectory encoder sees other plans.
     Encoded {
-        /// In so many segments.
+        /// Number of segments that are encoded as another plan.
         changed: usize,
     },
 }
@@ -105,7 +105,7 @@ impl fmt::Display for Loss {
 }
 
 impl Loss {
-    /// Whether the questions are enough to call it another policy.
+    /// Returns whether the questions are enough to call the image another policy.
     fn is_shown(&self) -> bool {
         !matches!(self, Self::Unclear { shown: false, .. })
     }
@@ -117,39 +117,40 @@ impl Serialize for Loss {
     }
 }
 
-/// What fewer bits do to a policy's answers.
+/// Comparison of a policy's answers with fewer bits and with 32.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct Rounding {
-    /// Episodes replayed.
+    /// Number of episodes that were replayed.
     pub episodes: usize,
-    /// Control steps in them.
+    /// Number of control steps of the replayed episodes.
     pub steps: usize,
-    /// Decisions in them.
+    /// Number of decisions in the replayed episodes.
     pub decisions: usize,
     /// The smallest lead of a selected index over the second best, with 32 bits; `None` where no decision has two logits.
     pub smallest_margin: Option<f64>,
     /// Largest difference of a logit, up to a constant added to all of a decision's.
     pub largest_logit_difference: f64,
-    /// Share of the decisions with two logits or more whose margin is more than `margin_factor` times that difference; 1 where there is none.
+    /// Share of the decisions with two logits or more whose margin is more than `margin_factor` times the largest difference of a logit; 1 without such
+    /// decisions.
     pub clear_share: f64,
-    /// The factor.
+    /// Factor on the largest difference of a logit beyond which a margin is clear.
     pub margin_factor: f64,
-    /// Segments that the trajectory encoder saw.
+    /// Number of segments that the trajectory encoder saw.
     pub segments: usize,
     /// Largest difference of an action's element.
     pub largest_action_difference: f64,
-    /// What it may be.
+    /// Largest difference of an action element that is allowed.
     pub action_tolerance: f64,
-    /// Why it is another policy, in words; `None` if it is the same.
+    /// Reason why fewer bits make another policy, in words; `None` if it is the same.
     pub loss: Option<Loss>,
 }
 
-/// What may be off.
+/// Differences that are allowed between fewer bits and 32.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Allowed {
-    /// An action's element.
+    /// Largest difference of an action element.
     pub action: f64,
-    /// A logit, where its value matters, as it does to a draw; `None` where the largest is selected.
+    /// Largest difference of a logit, where its value matters, as for a draw; `None` where the largest logit is selected.
     pub logit: Option<f64>,
 }
 
@@ -276,14 +277,14 @@ fn largest(wanted: &[f32], got: &[f32]) -> f64 {
     })
 }
 
-/// The policy alone: what the image answers to a reference's questions and, where it has fewer bits than 32, what it would with 32.
+/// Answers of the policy alone to a reference's questions: those of the image and, if it has fewer bits than 32, those with 32.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Asked {
-    /// The image that runs, beside the reference.
+    /// Answers of the image that runs, compared with the reference.
     pub policy: Answers,
-    /// The same bundle with 32 bits, beside the reference; `None` where that is the image that runs.
+    /// Answers of the bundle with 32 bits, compared with the reference; `None` if the image that runs has 32 bits.
     pub exact: Option<Answers>,
-    /// The image beside the same bundle with 32 bits.
+    /// Comparison of the image with the bundle with 32 bits; `None` if the image has 32 bits.
     pub rounding: Option<Rounding>,
 }
 
@@ -322,7 +323,7 @@ impl Asked {
         self.rounding.as_ref()?.loss.as_ref()
     }
 
-    /// What the decisions are too few to tell.
+    /// Returns what the decisions are too few to tell, if there is such a thing.
     pub fn undecided(&self) -> Option<String> {
         let loss = self.loss().filter(|loss| !loss.is_shown())?;
         Some(format!(
@@ -330,7 +331,7 @@ impl Asked {
         ))
     }
 
-    /// Why it is another policy than the reference's, a sentence each.
+    /// Lists why the image is another policy than the reference's, a sentence for each reason.
     pub fn differences(&self) -> Vec<String> {
         let beside = |answers: &Answers, which: &str| {
             let answer = answers.first_difference.as_ref()?;

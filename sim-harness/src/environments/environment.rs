@@ -132,7 +132,7 @@ pub trait Environment: Send {
         None
     }
 
-    /// How its benchmark's images are drawn; `None` in an environment without any.
+    /// Rendering of the benchmark's images; `None` in an environment without images.
     fn rendering(&self) -> Option<Rendering> {
         None
     }
@@ -172,5 +172,13 @@ pub(crate) fn check_action(action: &[f64], needed: usize) -> Result<(), ActionEr
     match action.iter().position(|value| !value.is_finite()) {
         Some(index) => Err(ActionError::NotFinite { index }),
         None => Ok(()),
+    }
+}
+
+/// Adds a completion unless the sub-task was completed before, for implementations of
+/// [`Environment::step`].
+pub fn latch(completions: &mut Vec<Completion>, sub_task: usize, step: usize) {
+    if completions.iter().all(|done| done.sub_task != sub_task) {
+        completions.push(Completion { sub_task, step });
     }
 }

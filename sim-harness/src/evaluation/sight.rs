@@ -12,18 +12,18 @@ use thiserror::Error;
 use crate::environment::Environment;
 use crate::frames::Rendering;
 
-/// Why a policy sees nothing.
+/// Reason why a policy cannot be shown frames.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum SightError {
     /// A channel's rendering cannot be read, or is of frames of another size.
     #[error("channel `{channel}` of the contract: {wrong}")]
     Channel {
-        /// Its name.
+        /// Name of the channel.
         channel: String,
-        /// What is wrong with it.
+        /// Problem of the channel's rendering.
         wrong: String,
     },
-    /// There is no renderer.
+    /// This program was built without a renderer.
     #[cfg(not(feature = "camera"))]
     #[error(
         "the policy sees images, and this program was built without cameras; build it with --features camera"
@@ -34,7 +34,8 @@ pub enum SightError {
     Draw(String),
 }
 
-/// How the frames of a contract's image channels are drawn, in the order of the channels; refuses what is no image.
+/// Returns the image channels of a contract with their renderings, in the order of the channels; refuses a rendering that does not fit its
+/// channel.
 pub fn renderings(contract: &Contract) -> Result<Vec<(&Channel, Rendering)>, SightError> {
     let images = contract.observations().filter(|channel| is_image(channel));
     images
@@ -131,13 +132,13 @@ impl Sight {
         Ok(())
     }
 
-    /// Looks at nothing: there is no camera.
+    /// Does nothing: this program was built without cameras.
     #[cfg(not(feature = "camera"))]
     pub fn look(&mut self, _: &[f64]) -> Result<(), SightError> {
         Ok(())
     }
 
-    /// What the cameras show.
+    /// Returns the frames that the cameras show, by channel.
     pub fn given(&self) -> impl Iterator<Item = (ChannelId, Data<'_>)> {
         self.shown.iter().map(|(id, shown)| (*id, Data::U8(shown)))
     }

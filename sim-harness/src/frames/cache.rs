@@ -25,26 +25,26 @@ pub const FORMAT: &str = "lads-frames";
 /// Frames that a thread draws at a time.
 const CHUNK: usize = 50;
 
-/// Why there is no cache.
+/// Reason why a cache of frames cannot be made.
 #[derive(Debug, Error)]
 pub enum CacheError {
     /// The dataset cannot be used.
     #[error("{}: {reason}; make one with lads-collect", .path.display())]
     Dataset {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong.
+        /// Problem of the dataset.
         reason: String,
     },
-    /// What is there was begun for something else.
+    /// The file was begun for another dataset or rendering.
     #[error("{}: it was begun for another dataset or rendering; remove it, or write to another file", .0.display())]
     Other(PathBuf),
     /// The file system refuses.
     #[error("{}: {source}; name a file in an existing, writable folder with room", .path.display())]
     Io {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Error of the operating system.
         source: io::Error,
     },
     /// A frame cannot be drawn.
@@ -52,14 +52,14 @@ pub enum CacheError {
     Film(#[from] FilmError),
 }
 
-/// The states of a dataset, and what it is.
+/// States of a dataset, with the dataset's environment and digest.
 #[derive(Debug, Clone, PartialEq)]
 pub struct States {
-    /// Name of its environment.
+    /// Name of the dataset's environment.
     pub environment: String,
-    /// sha256 of the file.
+    /// SHA-256 of the dataset's file.
     pub sha256: String,
-    /// Numbers of a state.
+    /// Number of elements of a state.
     width: usize,
     values: Vec<f32>,
 }
@@ -98,12 +98,12 @@ impl States {
         })
     }
 
-    /// How many there are.
+    /// Returns the number of states.
     pub fn len(&self) -> usize {
         self.values.len() / self.width
     }
 
-    /// Whether there is none.
+    /// Returns whether there are no states.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -127,7 +127,7 @@ impl States {
     }
 }
 
-/// How far the work came.
+/// Number of frames that are done, and of all.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Progress {
     /// Frames that are in the file.
@@ -136,7 +136,7 @@ pub struct Progress {
     pub all: usize,
 }
 
-/// Makes the cache at `path`, or goes on with it, until `stop` is raised. `progress` is called with the frames that are in the file.
+/// Makes the cache of frames at `path`, or continues it, until `stop` is raised. `progress` is called with the frames that are in the file.
 pub fn make(
     (states, rendering): (&States, &Rendering),
     path: &Path,

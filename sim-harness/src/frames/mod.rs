@@ -20,13 +20,13 @@ use crate::environment::View;
 #[cfg(feature = "camera")]
 pub use draw::Frames;
 
-/// Everything that a frame depends on besides the state of the scene.
+/// Settings that a frame depends on besides the state of the scene.
 ///
 /// Two renderings differ in what a policy sees: without shadows lit surfaces are darker too, by a quarter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Rendering {
-    /// From where.
+    /// Viewpoint of the camera.
     pub view: View,
     /// Rows and columns of a frame.
     pub size: [u32; 2],
@@ -53,7 +53,7 @@ impl Rendering {
         rows as usize * columns as usize * 3
     }
 
-    /// Whether a frame can be drawn so; else what is wrong.
+    /// Checks that frames can be drawn with this rendering; the error says what is wrong.
     pub fn check(&self) -> Result<(), String> {
         let ([rows, columns], [drawn_rows, drawn_columns]) = (self.size, self.drawn);
         let sides = [rows, columns, drawn_rows, drawn_columns];

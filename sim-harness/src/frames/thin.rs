@@ -78,7 +78,7 @@ impl Mesh {
         })
     }
 
-    /// The same with one vertex for each cell of a grid.
+    /// Returns the mesh with one vertex for each cell of a grid.
     fn clustered(&self, cell: f64) -> Self {
         let mut places: HashMap<[i64; 3], usize> = HashMap::new();
         let mut sums: Vec<([f64; 3], f64)> = Vec::new();

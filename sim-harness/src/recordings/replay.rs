@@ -112,10 +112,7 @@ pub fn replay(
         };
         controller.set_decision(match flight.trace.sampling_seed {
             None => Decision::Argmax,
-            Some(seed) => Decision::Sample {
-                temperature: temperature(contract),
-                seed,
-            },
+            Some(seed) => contract.sampling(seed),
         });
         let noise = flight.trace.noise_seed;
         controller.set_noise(noise.map_or(Noise::Zero, |seed| Noise::Seeded { seed }));
@@ -153,14 +150,6 @@ pub fn replay(
         finished();
     }
     Ok(replayed)
-}
-
-/// Temperature of the contract, or the 1 that `--sample` takes where the contract's rule is argmax.
-fn temperature(contract: &Contract<'_>) -> f32 {
-    match contract.decision() {
-        Decision::Sample { temperature, .. } => temperature,
-        Decision::Argmax => 1.0,
-    }
 }
 
 fn fits(contract: &Contract<'_>, period: Option<usize>, log: &Log) -> Result<(), ReplayError> {

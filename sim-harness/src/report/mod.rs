@@ -4,6 +4,8 @@
 //! table and the K-rates. What can fail: the template, which is compiled in.
 
 mod charts;
+mod plans;
+mod timelines;
 
 use std::collections::BTreeSet;
 
@@ -209,14 +211,14 @@ impl Report<'_> {
             charts,
         };
         // The first shows all instructions, the others composites and their parts.
-        let starts = charts::start_distributions(self);
+        let starts = plans::start_distributions(self);
         let composites = starts.len() > 1;
         let mut figures = vec![
             figure(
                 "Latent plans over an episode",
                 "The plan in force at every control step. Vertical lines are completions, by number; those that the instruction does not ask \
                  for are grey and dotted. Episodes that failed come first.",
-                charts::timelines(self),
+                timelines::timelines(self),
             ),
             figure(
                 "Plans at the start of an episode",
@@ -231,13 +233,13 @@ impl Report<'_> {
             figure(
                 "Gripper by plan",
                 "Where the gripper went from the decision on while a plan was in force, for the plans used most, in metres from where it was.",
-                charts::gripper(self),
+                plans::gripper(self),
             ),
             figure(
                 "Plans by word and by sub-task",
                 "First: how often each plan was decided under instructions that contain a word, as a share of the word's decisions. Second: which plan was in \
                  force when a sub-task was completed, as a share of its completions.",
-                charts::heat_maps(self),
+                plans::heat_maps(self),
             ),
             figure(
                 "Latency of the controller",

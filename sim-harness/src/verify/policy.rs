@@ -17,24 +17,24 @@ use lads_proof::rounding::Asked;
 use crate::evaluate::{Assignment, EvaluationError};
 use crate::plans::Segment;
 
-/// What is asked: the first traced episodes of each assigned instruction.
+/// Questions to a policy: the first traced episodes of each assigned instruction.
 #[derive(Debug, Clone, Copy)]
 pub struct Questions<'q> {
-    /// Where they were recorded.
+    /// Reference that recorded the episodes.
     pub reference: &'q Reference,
-    /// The instructions.
+    /// Instructions whose episodes are asked.
     pub assignments: &'q [Assignment],
-    /// How many episodes of each, at most.
+    /// Largest number of episodes of each instruction.
     pub episodes: u32,
 }
 
-/// How often an image is asked for [`judge`]: a second time with 32 bits where it has fewer and selects the largest logit.
+/// Returns how many times [`judge`] asks the questions: a second time with 32 bits if the image has fewer and selects the largest logit.
 pub fn rounds(policy: &Policy<'_>) -> usize {
     let selects = policy.index_count() > 0 && policy.contract().decision() == Decision::Argmax;
     1 + usize::from(selects && !lads_host::is_exact(policy))
 }
 
-/// Asks the image that `policy` is a view of, and `bundle`, which it is of, with 32 bits if the image has fewer, and judges the answers.
+/// Puts the questions to an image and, if it has fewer bits than 32, to its bundle with 32, and judges the answers.
 pub fn judge(
     (policy, isa): (&Policy<'_>, Isa),
     bundle: &Bundle,

@@ -6,7 +6,7 @@ use std::sync::LazyLock;
 use lads_compiler::Contract;
 use lads_core::Policy;
 use lads_host::Opened;
-use lads_sim::environment::{ActionError, Completion, Environment, EpisodeSeed};
+use lads_sim::environment::{ActionError, Completion, Environment, EpisodeSeed, latch};
 use lads_sim::random::Stream;
 
 static TINY: LazyLock<Opened> = LazyLock::new(|| {
@@ -119,15 +119,8 @@ impl Environment for Bench {
             *value = (*value + drift).clamp(-0.05, 0.5);
         }
         for (sub_task, value) in self.state[2..].iter().enumerate() {
-            let latched = self
-                .completions
-                .iter()
-                .any(|completion| completion.sub_task == sub_task);
-            if *value > 0.2 && !latched {
-                self.completions.push(Completion {
-                    sub_task,
-                    step: self.steps,
-                });
+            if *value > 0.2 {
+                latch(&mut self.completions, sub_task, self.steps);
             }
         }
         self.observe();

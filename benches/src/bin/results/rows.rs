@@ -1,12 +1,15 @@
-//! Ratios that the runtime is held to, each with its target and its measurement.
+//! Ratios that the runtime is held to, each with its target and its measurement: the table
+//! [`COMPARISONS`], and four single numbers.
 
-use lads_pace::contender::Kind;
+use lads_pace::contender::Kind::{self, Act, Decision, Ordinary};
 use lads_pace::stats::{Ratio, Rounds, quantile};
 use serde::Serialize;
 use serde_json::Value;
 
 use crate::files::Measured;
 use crate::measure::{Run, ratio};
+use Mode::{Hot, Loaded, Paced, PacedAll};
+use Statistic::{P50, P999};
 
 /// A ratio of the table.
 #[derive(Debug, Clone, Serialize)]
@@ -32,34 +35,142 @@ impl Row {
     }
 }
 
-/// One side of a ratio, as `(run, contender, kind, quantile)`.
-type Side<'r> = (&'r Run, &'static str, Kind, f64);
-
-fn per_round((run, name, kind, q): Side<'_>) -> Vec<f64> {
-    run.of(name)
-        .map(|rounds| rounds.quantiles(kind, q))
-        .unwrap_or_default()
+/// Runs that ratios are computed of.
+#[derive(Clone, Copy)]
+enum Mode {
+    /// One call after the other.
+    Hot,
+    /// 50 Hz, with few contenders.
+    Paced,
+    /// 50 Hz, with all contenders.
+    PacedAll,
+    /// 50 Hz, on a machine under load.
+    Loaded,
 }
 
-/// Computes the row of a p50: the median over rounds of the rounds' ratios.
-fn paired(id: &str, label: &str, above: Side<'_>, below: Side<'_>, target: Option<f64>) -> Row {
-    let found = ratio(&per_round(above), &per_round(below));
-    Row {
-        id: id.into(),
-        label: label.into(),
-        ratio: found.map(|(ratio, _)| ratio),
-        halves: found
-            .map(|(_, halves)| halves)
-            .filter(|halves| !halves.is_nan()),
-        target,
-        unit: "",
+/// Latencies that are divided.
+#[derive(Clone, Copy)]
+enum Statistic {
+    /// Median, with [`paired`].
+    P50,
+    /// 99.9th percentile, with [`pooled`].
+    P999,
+}
+
+/// One side of a ratio, a contender and a kind of its calls.
+type Side = (&'static str, Kind);
+
+/// Ratio of the latencies of two contenders in one run.
+struct Comparison {
+    id: &'static str,
+    label: &'static str,
+    run: Mode,
+    statistic: Statistic,
+    above: Side,
+    below: Side,
+    target: Option<f64>,
+}
+
+const F32: &str = "lads f32";
+const INT16: &str = "lads int16";
+const F16: &str = "lads f16";
+const ORT: &str = "ONNX Runtime";
+const SWEEP: &str = "bare sweep f32";
+const THIRD: Option<f64> = Some(1.0 / 3.0);
+
+/// Ratios of the page, in its order.
+#[rustfmt::skip]
+const COMPARISONS: &[Comparison] = &[
+    Comparison { id: "act_hot_f32", label: "`low_level/act`, hot: f32 / ONNX Runtime", run: Hot, statistic: P50, above: (F32, Act), below: (ORT, Act), target: THIRD },
+    Comparison { id: "act_hot_f32_sweep", label: "`low_level/act`, hot: f32 / bare sweep over the same bytes", run: Hot, statistic: P50, above: (F32, Act), below: (SWEEP, Act), target: Some(1.3) },
+    Comparison { id: "step_hot_f32", label: "ordinary step, hot: f32 / ONNX Runtime", run: Hot, statistic: P50, above: (F32, Ordinary), below: (ORT, Ordinary), target: THIRD },
+    Comparison { id: "decision_hot", label: "decision step / ordinary step, hot, f32", run: Hot, statistic: P50, above: (F32, Decision), below: (F32, Ordinary), target: Some(1.25) },
+    Comparison { id: "decision_paced", label: "decision step / ordinary step, 50 Hz, f32", run: Paced, statistic: P50, above: (F32, Decision), below: (F32, Ordinary), target: Some(1.25) },
+    Comparison { id: "act_hot_int16", label: "`low_level/act`, hot: int16 / ONNX Runtime f32", run: Hot, statistic: P50, above: (INT16, Act), below: (ORT, Act), target: Some(0.25) },
+    Comparison { id: "act_hot_f16", label: "`low_level/act`, hot: f16 / ONNX Runtime f32", run: Hot, statistic: P50, above: (F16, Act), below: (ORT, Act), target: Some(0.25) },
+    Comparison { id: "step_hot_int16", label: "ordinary step, hot: int16 / ONNX Runtime f32", run: Hot, statistic: P50, above: (INT16, Ordinary), below: (ORT, Ordinary), target: None },
+    Comparison { id: "step_hot_f16", label: "ordinary step, hot: f16 / ONNX Runtime f32", run: Hot, statistic: P50, above: (F16, Ordinary), below: (ORT, Ordinary), target: None },
+    Comparison { id: "act_paced_f32_p50", label: "`low_level/act`, 50 Hz: f32 / ONNX Runtime f32, p50", run: Paced, statistic: P50, above: (F32, Act), below: (ORT, Act), target: Some(0.2) },
+    Comparison { id: "act_paced_f32_p999", label: "`low_level/act`, 50 Hz: f32 / ONNX Runtime f32, p99.9", run: Paced, statistic: P999, above: (F32, Act), below: (ORT, Act), target: THIRD },
+    Comparison { id: "act_paced_int16_p50", label: "`low_level/act`, 50 Hz: int16 / ONNX Runtime f32, p50", run: Paced, statistic: P50, above: (INT16, Act), below: (ORT, Act), target: Some(0.125) },
+    Comparison { id: "act_paced_int16_p999", label: "`low_level/act`, 50 Hz: int16 / ONNX Runtime f32, p99.9", run: Paced, statistic: P999, above: (INT16, Act), below: (ORT, Act), target: THIRD },
+    Comparison { id: "act_paced_f16_p50", label: "`low_level/act`, 50 Hz: f16 / ONNX Runtime f32, p50", run: Paced, statistic: P50, above: (F16, Act), below: (ORT, Act), target: Some(0.125) },
+    Comparison { id: "act_paced_f16_p999", label: "`low_level/act`, 50 Hz: f16 / ONNX Runtime f32, p99.9", run: Paced, statistic: P999, above: (F16, Act), below: (ORT, Act), target: THIRD },
+    Comparison { id: "step_paced_f32_p50", label: "ordinary step, 50 Hz: f32 / ONNX Runtime f32, p50", run: Paced, statistic: P50, above: (F32, Ordinary), below: (ORT, Ordinary), target: Some(0.2) },
+    Comparison { id: "step_paced_f32_p999", label: "ordinary step, 50 Hz: f32 / ONNX Runtime f32, p99.9", run: Paced, statistic: P999, above: (F32, Ordinary), below: (ORT, Ordinary), target: THIRD },
+    Comparison { id: "step_paced_int16_p50", label: "ordinary step, 50 Hz: int16 / ONNX Runtime f32, p50", run: Paced, statistic: P50, above: (INT16, Ordinary), below: (ORT, Ordinary), target: Some(0.125) },
+    Comparison { id: "step_paced_int16_p999", label: "ordinary step, 50 Hz: int16 / ONNX Runtime f32, p99.9", run: Paced, statistic: P999, above: (INT16, Ordinary), below: (ORT, Ordinary), target: THIRD },
+    Comparison { id: "step_paced_f16_p50", label: "ordinary step, 50 Hz: f16 / ONNX Runtime f32, p50", run: Paced, statistic: P50, above: (F16, Ordinary), below: (ORT, Ordinary), target: Some(0.125) },
+    Comparison { id: "step_paced_f16_p999", label: "ordinary step, 50 Hz: f16 / ONNX Runtime f32, p99.9", run: Paced, statistic: P999, above: (F16, Ordinary), below: (ORT, Ordinary), target: THIRD },
+    Comparison { id: "int16_act_hot", label: "`low_level/act`, hot: int16 / f32", run: Hot, statistic: P50, above: (INT16, Act), below: (F32, Act), target: Some(0.7) },
+    Comparison { id: "f16_act_hot", label: "`low_level/act`, hot: f16 / f32", run: Hot, statistic: P50, above: (F16, Act), below: (F32, Act), target: Some(0.7) },
+    Comparison { id: "int16_step_hot", label: "ordinary step, hot: int16 / f32", run: Hot, statistic: P50, above: (INT16, Ordinary), below: (F32, Ordinary), target: Some(0.7) },
+    Comparison { id: "f16_step_hot", label: "ordinary step, hot: f16 / f32", run: Hot, statistic: P50, above: (F16, Ordinary), below: (F32, Ordinary), target: Some(0.7) },
+    Comparison { id: "int16_act_paced", label: "`low_level/act`, 50 Hz: int16 / f32", run: Paced, statistic: P50, above: (INT16, Act), below: (F32, Act), target: Some(0.7) },
+    Comparison { id: "f16_act_paced", label: "`low_level/act`, 50 Hz: f16 / f32", run: Paced, statistic: P50, above: (F16, Act), below: (F32, Act), target: Some(0.7) },
+    Comparison { id: "int16_step_paced", label: "ordinary step, 50 Hz: int16 / f32", run: Paced, statistic: P50, above: (INT16, Ordinary), below: (F32, Ordinary), target: Some(0.7) },
+    Comparison { id: "f16_step_paced", label: "ordinary step, 50 Hz: f16 / f32", run: Paced, statistic: P50, above: (F16, Ordinary), below: (F32, Ordinary), target: Some(0.7) },
+    Comparison { id: "act_paced_sweep", label: "`low_level/act`, 50 Hz: f32 / bare sweep", run: Paced, statistic: P50, above: (F32, Act), below: (SWEEP, Act), target: None },
+    Comparison { id: "step_loaded_f32", label: "ordinary step, 50 Hz under load: f32 / ONNX Runtime", run: Loaded, statistic: P50, above: (F32, Ordinary), below: (ORT, Ordinary), target: None },
+    Comparison { id: "act_hot_tract", label: "`low_level/act`, hot: f32 / tract", run: Hot, statistic: P50, above: (F32, Act), below: ("tract", Act), target: None },
+    Comparison { id: "step_hot_tract", label: "ordinary step, hot: f32 / tract", run: Hot, statistic: P50, above: (F32, Ordinary), below: ("tract", Ordinary), target: None },
+    Comparison { id: "act_paced_tract", label: "`low_level/act`, 50 Hz: f32 / tract", run: PacedAll, statistic: P50, above: (F32, Act), below: ("tract", Act), target: None },
+    Comparison { id: "step_paced_tract", label: "ordinary step, 50 Hz: f32 / tract", run: PacedAll, statistic: P50, above: (F32, Ordinary), below: ("tract", Ordinary), target: None },
+    Comparison { id: "act_hot_rten", label: "`low_level/act`, hot: f32 / rten", run: Hot, statistic: P50, above: (F32, Act), below: ("rten", Act), target: None },
+    Comparison { id: "step_hot_rten", label: "ordinary step, hot: f32 / rten", run: Hot, statistic: P50, above: (F32, Ordinary), below: ("rten", Ordinary), target: None },
+    Comparison { id: "act_paced_rten", label: "`low_level/act`, 50 Hz: f32 / rten", run: PacedAll, statistic: P50, above: (F32, Act), below: ("rten", Act), target: None },
+    Comparison { id: "step_paced_rten", label: "ordinary step, 50 Hz: f32 / rten", run: PacedAll, statistic: P50, above: (F32, Ordinary), below: ("rten", Ordinary), target: None },
+    Comparison { id: "act_hot_pytorch", label: "`low_level/act`, hot: f32 / PyTorch", run: Hot, statistic: P50, above: (F32, Act), below: ("PyTorch", Act), target: None },
+    Comparison { id: "step_hot_pytorch", label: "ordinary step, hot: f32 / PyTorch", run: Hot, statistic: P50, above: (F32, Ordinary), below: ("PyTorch", Ordinary), target: None },
+    Comparison { id: "act_paced_pytorch", label: "`low_level/act`, 50 Hz: f32 / PyTorch", run: PacedAll, statistic: P50, above: (F32, Act), below: ("PyTorch", Act), target: None },
+    Comparison { id: "step_paced_pytorch", label: "ordinary step, 50 Hz: f32 / PyTorch", run: PacedAll, statistic: P50, above: (F32, Ordinary), below: ("PyTorch", Ordinary), target: None },
+    Comparison { id: "act_hot_openvino", label: "`low_level/act`, hot: f32 / OpenVINO", run: Hot, statistic: P50, above: (F32, Act), below: ("OpenVINO", Act), target: None },
+    Comparison { id: "step_hot_openvino", label: "ordinary step, hot: f32 / OpenVINO", run: Hot, statistic: P50, above: (F32, Ordinary), below: ("OpenVINO", Ordinary), target: None },
+    Comparison { id: "act_paced_openvino", label: "`low_level/act`, 50 Hz: f32 / OpenVINO", run: PacedAll, statistic: P50, above: (F32, Act), below: ("OpenVINO", Act), target: None },
+    Comparison { id: "step_paced_openvino", label: "ordinary step, 50 Hz: f32 / OpenVINO", run: PacedAll, statistic: P50, above: (F32, Ordinary), below: ("OpenVINO", Ordinary), target: None },
+];
+
+impl Comparison {
+    /// Computes the row, whose ratio is missing if a contender was not measured.
+    fn row(&self, measured: &Measured) -> Row {
+        let run = match self.run {
+            Hot => &measured.hot,
+            Paced => &measured.paced,
+            PacedAll => &measured.paced_all,
+            Loaded => &measured.loaded,
+        };
+        let (ratio, halves) = match self.statistic {
+            P50 => paired(run, self.above, self.below),
+            P999 => (pooled(run, self.above, self.below, 0.999), None),
+        };
+        Row {
+            id: self.id.into(),
+            label: self.label.into(),
+            ratio,
+            halves,
+            target: self.target,
+            unit: "",
+        }
     }
 }
 
-/// Computes the row of a tail: over all calls of the run, because a round is too short for one. Its quartiles are those of four parts of
-/// the run.
-fn pooled(id: &str, label: &str, above: Side<'_>, below: Side<'_>, target: Option<f64>) -> Row {
-    let of = |(run, name, kind, q): Side<'_>, part: Option<usize>| {
+/// Computes a ratio of medians, the median over rounds of the rounds' ratios, and the distance
+/// between the two halves of the run.
+fn paired(run: &Run, above: Side, below: Side) -> (Option<Ratio>, Option<f64>) {
+    let per_round = |(name, kind): Side| {
+        let rounds = run.of(name);
+        rounds.map_or_else(Vec::new, |rounds| rounds.quantiles(kind, 0.5))
+    };
+    match ratio(&per_round(above), &per_round(below)) {
+        Some((ratio, halves)) => (Some(ratio), Some(halves).filter(|halves| !halves.is_nan())),
+        None => (None, None),
+    }
+}
+
+/// Computes a ratio of tails, over all calls of the run, because a round is too short for one; its
+/// range is that of four parts of the run.
+fn pooled(run: &Run, above: Side, below: Side, q: f64) -> Option<Ratio> {
+    let of = |(name, kind): Side, part: Option<usize>| {
         let rounds: &Rounds = run.of(name)?;
         let part = rounds
             .0
@@ -76,17 +187,10 @@ fn pooled(id: &str, label: &str, above: Side<'_>, below: Side<'_>, target: Optio
     let at = |part| Some(of(above, part)? / of(below, part)?).filter(|ratio| ratio.is_finite());
     let parts: Vec<_> = (0..4).filter_map(|part| at(Some(part))).collect();
     let (low, high) = (quantile(&parts, 0.0), quantile(&parts, 1.0));
-    let ratio = at(None).map(|median| Ratio { median, low, high });
-    Row {
-        id: id.into(),
-        label: label.into(),
-        ratio,
-        halves: None,
-        target,
-        unit: "",
-    }
+    at(None).map(|median| Ratio { median, low, high })
 }
 
+/// Computes the row of a number that was measured elsewhere, with its range.
 fn number(id: &str, label: &str, value: &Value, target: Option<f64>, unit: &'static str) -> Row {
     let part = |name: &str| value[name].as_f64();
     let ratio = (|| {
@@ -106,172 +210,41 @@ fn number(id: &str, label: &str, value: &Value, target: Option<f64>, unit: &'sta
     }
 }
 
-const ORT: &str = "ONNX Runtime";
-
-/// Contenders whose weights have half the bytes, each with the format of its weights.
-const HALVED: [[&str; 2]; 2] = [["lads int16", "int16"], ["lads f16", "f16"]];
-
 /// Computes all rows, in the order of the page.
-#[expect(clippy::too_many_lines, reason = "a list: every row of the page, once")]
 pub fn rows(measured: &Measured) -> Vec<Row> {
     let Measured {
-        hot,
-        paced,
-        paced_all,
-        loaded,
-        ..
+        cold, preparation, ..
     } = measured;
-    let (act, ordinary, decision) = (Kind::Act, Kind::Ordinary, Kind::Decision);
-    let third = Some(1.0 / 3.0);
-    let mut rows = vec![
-        paired(
-            "act_hot_f32",
-            "`low_level/act`, hot: f32 / ONNX Runtime",
-            (hot, "lads f32", act, 0.5),
-            (hot, ORT, act, 0.5),
-            third,
+    let mut rows: Vec<Row> = COMPARISONS.iter().map(|row| row.row(measured)).collect();
+    rows.extend([
+        number(
+            "first_step",
+            "first control step after warming up / the same step hot",
+            &cold["with"]["first_to_hot"],
+            Some(1.5),
+            "",
         ),
-        paired(
-            "act_hot_f32_sweep",
-            "`low_level/act`, hot: f32 / bare sweep over the same bytes",
-            (hot, "lads f32", act, 0.5),
-            (hot, "bare sweep f32", act, 0.5),
-            Some(1.3),
+        number(
+            "first_step_cold",
+            "first control step without warming up / the same step hot",
+            &cold["without"]["first_to_hot"],
+            None,
+            "",
         ),
-        paired(
-            "step_hot_f32",
-            "ordinary step, hot: f32 / ONNX Runtime",
-            (hot, "lads f32", ordinary, 0.5),
-            (hot, ORT, ordinary, 0.5),
-            third,
+        number(
+            "compile",
+            "compile kitchen.onnx",
+            &preparation["compile_ms"],
+            Some(150.0),
+            "ms",
         ),
-        paired(
-            "decision_hot",
-            "decision step / ordinary step, hot, f32",
-            (hot, "lads f32", decision, 0.5),
-            (hot, "lads f32", ordinary, 0.5),
-            Some(1.25),
+        number(
+            "open",
+            "open its image",
+            &preparation["images"][0]["open_ms"],
+            Some(1.0),
+            "ms",
         ),
-        paired(
-            "decision_paced",
-            "decision step / ordinary step, 50 Hz, f32",
-            (paced, "lads f32", decision, 0.5),
-            (paced, "lads f32", ordinary, 0.5),
-            Some(1.25),
-        ),
-    ];
-    let kinds = [
-        (act, "`low_level/act`", "act"),
-        (ordinary, "ordinary step", "step"),
-    ];
-    for (kind, name, short) in kinds {
-        for [ours, weights] in HALVED {
-            rows.push(paired(
-                &format!("{short}_hot_{weights}"),
-                &format!("{name}, hot: {weights} / ONNX Runtime f32"),
-                (hot, ours, kind, 0.5),
-                (hot, ORT, kind, 0.5),
-                (kind == act).then_some(0.25),
-            ));
-        }
-    }
-    for (kind, name, short) in kinds {
-        let full = ["lads f32", "f32"];
-        for ([ours, weights], target) in [(full, 0.2), (HALVED[0], 0.125), (HALVED[1], 0.125)] {
-            let (id, label) = (
-                format!("{short}_paced_{weights}"),
-                format!("{name}, 50 Hz: {weights} / ONNX Runtime f32"),
-            );
-            rows.push(paired(
-                &format!("{id}_p50"),
-                &format!("{label}, p50"),
-                (paced, ours, kind, 0.5),
-                (paced, ORT, kind, 0.5),
-                Some(target),
-            ));
-            rows.push(pooled(
-                &format!("{id}_p999"),
-                &format!("{label}, p99.9"),
-                (paced, ours, kind, 0.999),
-                (paced, ORT, kind, 0.999),
-                third,
-            ));
-        }
-    }
-    for (run, name, short) in [(hot, "hot", "hot"), (paced, "50 Hz", "paced")] {
-        for (kind, what, part) in kinds {
-            for [ours, weights] in HALVED {
-                rows.push(paired(
-                    &format!("{weights}_{part}_{short}"),
-                    &format!("{what}, {name}: {weights} / f32"),
-                    (run, ours, kind, 0.5),
-                    (run, "lads f32", kind, 0.5),
-                    Some(0.7),
-                ));
-            }
-        }
-    }
-    rows.push(paired(
-        "act_paced_sweep",
-        "`low_level/act`, 50 Hz: f32 / bare sweep",
-        (paced, "lads f32", act, 0.5),
-        (paced, "bare sweep f32", act, 0.5),
-        None,
-    ));
-    rows.push(paired(
-        "step_loaded_f32",
-        "ordinary step, 50 Hz under load: f32 / ONNX Runtime",
-        (loaded, "lads f32", ordinary, 0.5),
-        (loaded, ORT, ordinary, 0.5),
-        None,
-    ));
-    for peer in ["tract", "rten", "PyTorch", "OpenVINO"] {
-        for (run, mode, short) in [(hot, "hot", "hot"), (paced_all, "50 Hz", "paced")] {
-            for (kind, what, part) in [
-                (act, "`low_level/act`", "act"),
-                (ordinary, "ordinary step", "step"),
-            ] {
-                let (id, label) = (
-                    format!("{part}_{short}_{}", peer.to_lowercase()),
-                    format!("{what}, {mode}: f32 / {peer}"),
-                );
-                rows.push(paired(
-                    &id,
-                    &label,
-                    (run, "lads f32", kind, 0.5),
-                    (run, peer, kind, 0.5),
-                    None,
-                ));
-            }
-        }
-    }
-    rows.push(number(
-        "first_step",
-        "first control step after warming up / the same step hot",
-        &measured.cold["with"]["first_to_hot"],
-        Some(1.5),
-        "",
-    ));
-    rows.push(number(
-        "first_step_cold",
-        "first control step without warming up / the same step hot",
-        &measured.cold["without"]["first_to_hot"],
-        None,
-        "",
-    ));
-    rows.push(number(
-        "compile",
-        "compile kitchen.onnx",
-        &measured.preparation["compile_ms"],
-        Some(150.0),
-        "ms",
-    ));
-    rows.push(number(
-        "open",
-        "open its image",
-        &measured.preparation["images"][0]["open_ms"],
-        Some(1.0),
-        "ms",
-    ));
+    ]);
     rows
 }

@@ -60,14 +60,9 @@ pub(super) fn fuse(fused: Fused) -> Result<Fused, String> {
             Op::Unary(unary) if alone[0] => activated(g, *unary, operands[0])?,
             _ => None,
         };
-        let new = match taken {
-            Some(new) => new,
-            None => rewriter.rebuild(id, &operands)?,
-        };
-        rewriter.set(id, new);
+        rewriter.set_or_rebuild(id, taken, &operands)?;
     }
-    let copies: HashMap<Id, Id> = order.iter().map(|&id| (id, rewriter.copy_of(id))).collect();
-    let graph = rewriter.new;
+    let (graph, copies) = rewriter.finish(&order);
     Ok(fused.mapped(graph, |id| copies[&id]))
 }
 

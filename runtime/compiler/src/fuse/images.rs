@@ -33,14 +33,9 @@ pub(super) fn channels_to_the_end(fused: Fused) -> Result<Fused, String> {
         let operands = rewriter.operands(id);
         rewriter.at(id);
         let turned = turned(&mut rewriter.new, old, id, &operands)?;
-        let new = match turned {
-            Some(new) => new,
-            None => rewriter.rebuild(id, &operands)?,
-        };
-        rewriter.set(id, new);
+        rewriter.set_or_rebuild(id, turned, &operands)?;
     }
-    let copies: HashMap<Id, Id> = order.iter().map(|&id| (id, rewriter.copy_of(id))).collect();
-    let graph = rewriter.new;
+    let (graph, copies) = rewriter.finish(&order);
     Ok(fused.mapped(graph, |id| copies[&id]))
 }
 

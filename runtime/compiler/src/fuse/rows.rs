@@ -94,8 +94,7 @@ pub(super) fn narrow(fused: Fused) -> Result<Fused, String> {
         };
         rewriter.set(id, new);
     }
-    let copies: HashMap<Id, Id> = order.iter().map(|&id| (id, rewriter.copy_of(id))).collect();
-    let graph = rewriter.new;
+    let (graph, copies) = rewriter.finish(&order);
     Ok(fused.mapped(graph, |id| copies[&id]))
 }
 

@@ -87,6 +87,28 @@ impl<'g> Rewriter<'g> {
         self.new.current = self.old.node(old).origin;
     }
 
+    /// Sets what replaces an old node: the new node that a pass made of it, else a copy with other
+    /// operands.
+    pub fn set_or_rebuild(
+        &mut self,
+        old: Id,
+        made: Option<Id>,
+        operands: &[Id],
+    ) -> Result<(), String> {
+        let new = match made {
+            Some(new) => new,
+            None => self.rebuild(old, operands)?,
+        };
+        self.set(old, new);
+        Ok(())
+    }
+
+    /// Ends a pass over the nodes of `order`: returns the new graph, and the new node of each of them.
+    pub fn finish(self, order: &[Id]) -> (Graph, HashMap<Id, Id>) {
+        let copies = order.iter().map(|&id| (id, self.copy_of(id))).collect();
+        (self.new, copies)
+    }
+
     /// Rebuilds an old node with other operands.
     pub fn rebuild(&mut self, old: Id, x: &[Id]) -> Result<Id, String> {
         self.at(old);

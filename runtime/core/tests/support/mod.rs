@@ -5,10 +5,13 @@
 pub mod assemble;
 pub mod draft;
 pub mod guarding;
+pub mod layout;
 #[path = "../../../image/tests/support/model.rs"]
 pub mod model;
 #[path = "../../../image/tests/support/assemble.rs"]
 pub mod programs;
+#[path = "../../../image/tests/support/random.rs"]
+pub mod random;
 pub mod shapes;
 pub mod writer;
 
@@ -16,6 +19,7 @@ use lads_core::{ChannelId, Controller, DType, Data, Instruction, Policy, PolicyE
 
 #[allow(unused_imports, reason = "as above")]
 pub use model::{Model, Spec};
+pub use random::Random;
 
 /// An image in memory with the alignment that images need.
 #[derive(Clone)]
@@ -151,23 +155,4 @@ pub fn attend(rows: &[Vec<f64>]) -> Vec<f64> {
 
 pub fn wide(values: &[f32]) -> Vec<f64> {
     values.iter().copied().map(f64::from).collect()
-}
-
-/// A small linear congruential generator (Knuth's MMIX constants), the same on every platform.
-#[derive(Clone)]
-pub struct Random(pub u64);
-
-impl Random {
-    /// Returns a number that is uniform in -1..1.
-    pub fn next(&mut self) -> f32 {
-        self.0 = self
-            .0
-            .wrapping_mul(6364136223846793005)
-            .wrapping_add(1442695040888963407);
-        (self.0 >> 40) as f32 / (1_u64 << 23) as f32 - 1.0
-    }
-
-    pub fn vec(&mut self, len: usize, scale: f32) -> Vec<f32> {
-        (0..len).map(|_| self.next() * scale).collect()
-    }
 }

@@ -1,6 +1,7 @@
 /* Start-up of a Cortex-M with a floating-point unit, and its way to speak: semihosting, which qemu and debuggers understand. */
-#include <stddef.h>
 #include <stdint.h>
+
+#include "memory.h"
 
 extern uint32_t stack_top, data_start, data_end, data_load, bss_start, bss_end;
 int run(void);
@@ -71,23 +72,6 @@ void count_from_here(void) {
 }
 
 uint32_t instructions_counted(void) { return (TICKS_MOST - SYST_CVR) * INSTRUCTIONS_PER_TICK; }
-
-void *memcpy(void *restrict to, const void *restrict from, size_t bytes) {
-    unsigned char *t = to;
-    const unsigned char *f = from;
-    while (bytes-- > 0) {
-        *t++ = *f++;
-    }
-    return to;
-}
-
-void *memset(void *to, int value, size_t bytes) {
-    unsigned char *t = to;
-    while (bytes-- > 0) {
-        *t++ = (unsigned char)value;
-    }
-    return to;
-}
 
 void reset(void) {
     /* Full access to the floating-point unit. */

@@ -2,27 +2,12 @@
  * in static memory. The image is linked in. Its exit status is that of the first call that failed, 0 for none. */
 #include <lads.h>
 
+#include "../../examples/targets/memory.h"
+
 extern const unsigned char image_start[], image_end[];
 
 static lads_policy policy;
 static _Alignas(LADS_WORKSPACE_ALIGN) unsigned char workspace[WORKSPACE_BYTES];
-
-void *memcpy(void *restrict to, const void *restrict from, size_t bytes) {
-    unsigned char *t = to;
-    const unsigned char *f = from;
-    while (bytes-- > 0) {
-        *t++ = *f++;
-    }
-    return to;
-}
-
-void *memset(void *to, int value, size_t bytes) {
-    unsigned char *t = to;
-    while (bytes-- > 0) {
-        *t++ = (unsigned char)value;
-    }
-    return to;
-}
 
 static lads_status run(void) {
     lads_controller *controller;

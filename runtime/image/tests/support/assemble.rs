@@ -1,13 +1,18 @@
 //! Assembles the programs of a [`Model`] from ops, by hand.
 
+#[path = "draft.rs"]
+mod draft;
+
 use lads_image::op::{
-    self, Activation, BinaryKind, CacheFormat, IntSlot, OP_WORDS, Op, Place, Span, StateSpan,
-    WeightSpan,
+    self, Activation, CacheFormat, IntSlot, OP_WORDS, Op, Place, Span, StateSpan, WeightSpan,
 };
 use lads_image::{Program, ProgramError, Spaces};
-use lads_kernels::{attention_scratch_len, pack, packed_len};
+use lads_kernels::attention_scratch_len;
 
-use super::model::{ALPHA, Dense, EPS, Model, Norm};
+pub use draft::{Draft, TIMESTEP};
+use draft::{Packed, Pool};
+
+use super::model::{ALPHA, Dense, Model};
 
 /// The programs of a policy, in the order of [`Assembled::programs`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -64,51 +69,7 @@ impl Assembled {
     }
 }
 
-pub const TIMESTEP: IntSlot = IntSlot(0);
 pub const INDEX: IntSlot = IntSlot(1);
-
-/// A dense layer in the weights.
-#[derive(Clone, Copy)]
-struct Packed {
-    k: u32,
-    n: u32,
-    w: WeightSpan,
-    b: WeightSpan,
-}
-
-/// Weights of an image, each stored once.
-struct Pool(Vec<f32>);
-
-impl Pool {
-    fn dense(&mut self, dense: &Dense) -> Packed {
-        let mut panels = vec![0.0; packed_len(op::WeightFormat::F32, [dense.k, dense.n])];
-        pack(
-            op::WeightFormat::F32,
-            &dense.w,
-            [dense.k, dense.n],
-            &mut panels,
-        );
-        Packed {
-            k: dense.k as u32,
-            n: dense.n as u32,
-            w: self.add(&panels),
-            b: self.add(&dense.b),
-        }
-    }
-
-    fn norm(&mut self, norm: &Norm) -> [WeightSpan; 2] {
-        [self.add(&norm.gamma), self.add(&norm.beta)]
-    }
-
-    fn add(&mut self, values: &[f32]) -> WeightSpan {
-        let offset = self.0.len() as u32;
-        self.0.extend(values);
-        WeightSpan {
-            offset,
-            len: values.len() as u32,
-        }
-    }
-}
 
 /// One transformer layer in the weights, and its cache.
 struct PackedLayer {
@@ -120,109 +81,6 @@ struct PackedLayer {
     down: Packed,
     cache_k: StateSpan,
     cache_v: StateSpan,
-}
-
-/// A program under construction and its ports by name; arena is never reused.
-#[derive(Clone, Default)]
-pub struct Draft {
-    pub ops: Vec<Op>,
-    pub arena_len: u32,
-    pub tokens: u32,
-    pub inputs: Vec<(&'static str, Place)>,
-    pub outputs: Vec<(&'static str, Place)>,
-}
-
-impl Draft {
-    fn new(tokens: usize) -> Self {
-        Self {
-            tokens: tokens as u32,
-            ..Self::default()
-        }
-    }
-
-    fn span(&mut self, len: u32) -> Span {
-        let offset = self.arena_len;
-        self.arena_len += len;
-        Span { offset, len }
-    }
-
-    fn input(&mut self, port: &'static str, place: Place) {
-        self.inputs.push((port, place));
-    }
-
-    fn input_span(&mut self, port: &'static str, len: usize) -> Span {
-        let span = self.span(len as u32);
-        self.input(port, Place::Span(span));
-        span
-    }
-
-    fn output(&mut self, port: &'static str, place: Place) {
-        self.outputs.push((port, place));
-    }
-
-    fn op(&mut self, op: impl Into<Op>) {
-        self.ops.push(op.into());
-    }
-
-    fn linear(
-        &mut self,
-        x: Span,
-        dense: Packed,
-        y: Span,
-        activation: Activation,
-        accumulate: bool,
-    ) {
-        let Packed { k, n, w, b } = dense;
-        self.op(op::Linear {
-            x,
-            format: op::WeightFormat::F32,
-            w,
-            scales: None,
-            bias: Some(b),
-            y,
-            m: x.len / k,
-            k,
-            n,
-            activation,
-            accumulate,
-        });
-    }
-
-    fn norm(&mut self, x: Span, [gamma, beta]: [WeightSpan; 2]) -> Span {
-        let y = self.span(x.len);
-        self.op(op::LayerNorm {
-            x,
-            y,
-            gamma,
-            beta,
-            rows: x.len / gamma.len,
-            cols: gamma.len,
-            eps: EPS,
-        });
-        y
-    }
-
-    /// Adds the embedding of a timestep, `x += table[timestep + shift]`.
-    fn add_timestep(&mut self, x: Span, table: WeightSpan, shift: i32) {
-        let row = self.span(x.len);
-        self.op(op::GatherRow {
-            table: table.into(),
-            row_len: x.len,
-            rows: table.len / x.len,
-            index: TIMESTEP,
-            shift,
-            y: row,
-        });
-        self.op(op::Binary {
-            kind: BinaryKind::Add,
-            a: x.into(),
-            b: row.into(),
-            y: x,
-            dims: [1, 1, 1, x.len],
-            a_strides: [0, 0, 0, 1],
-            b_strides: [0, 0, 0, 1],
-        });
-    }
 }
 
 /// Weights of the transformer.

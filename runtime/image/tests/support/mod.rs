@@ -4,12 +4,14 @@
 
 pub mod assemble;
 pub mod model;
+pub mod random;
 
 use lads_image::op::{INT_SLOTS, Place};
 use lads_image::{ExecError, Isa, Machine};
 
 pub use assemble::{Assembled, Kind};
 pub use model::{Model, Spec};
+pub use random::Random;
 
 /// Assembles a policy that is smaller than tiny, because every word of it is changed.
 pub fn sound() -> Assembled {
@@ -96,24 +98,5 @@ impl<'p> Runner<'p> {
             Place::Span(span) => self.arena[span.range()].to_vec(),
             Place::Int(slot) => vec![self.ints[usize::from(slot.0)] as f32],
         }
-    }
-}
-
-/// A small linear congruential generator (Knuth's MMIX constants), the same on every platform.
-#[derive(Clone)]
-pub struct Random(pub u64);
-
-impl Random {
-    /// Returns a number that is uniform in -1..1.
-    pub fn next(&mut self) -> f32 {
-        self.0 = self
-            .0
-            .wrapping_mul(6364136223846793005)
-            .wrapping_add(1442695040888963407);
-        (self.0 >> 40) as f32 / (1_u64 << 23) as f32 - 1.0
-    }
-
-    pub fn vec(&mut self, len: usize, scale: f32) -> Vec<f32> {
-        (0..len).map(|_| self.next() * scale).collect()
     }
 }

@@ -109,8 +109,12 @@ pub fn wide_action(width: usize) -> String {
     )
 }
 
+/// Fields of a description that every policy needs.
 pub const HEAD: &str =
     "environment = { id = \"test\", version = \"1\" }\ncontrol_period_s = 0.02\n";
+
+/// Fields of a term with a unit and limits.
+pub const SENSOR: &str = "unit = \"1\"\nmin = -100\nmax = 100\n";
 
 /// A folder with a policy and a description.
 pub struct Case {

@@ -59,7 +59,7 @@ class Rate:
 
     @property
     def rate(self) -> float:
-        """The share, `count` over `episodes`."""
+        """Success rate, `count` over `episodes`."""
         return self.count / self.episodes
 
     @property

@@ -194,7 +194,7 @@ fn equal_rates_do_not_excuse_a_policy_or_an_environment_that_differs() {
     reason(&found, "another state");
 }
 
-/// Of an image with fewer bits three pairs are compared: each with the reference, and both with each other.
+/// Tests that all three comparisons of an image with fewer bits count: image and 32 bits each with the reference, and with each other.
 #[test]
 fn fewer_bits_excuse_nothing_that_is_different_with_all_of_them() {
     let sound = certificate(500, 400, 0, 0);

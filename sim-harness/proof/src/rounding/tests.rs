@@ -103,7 +103,7 @@ fn an_action_counts_beside_an_unclear_decision() {
     );
 }
 
-/// By 0.2 and clear by 0.5: the index is what it was; a draw would not be.
+/// Tests that logits which differ by 0.2, with a margin of 0.5, keep the index selected, but would change a draw.
 #[test]
 fn values_of_logits_matter_where_they_do_more_than_select() {
     let mut other = exact();

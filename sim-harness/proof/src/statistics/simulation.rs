@@ -107,7 +107,7 @@ const BEYOND_LEVEL: f64 = 1e-3;
 struct Regions(HashMap<(usize, usize, Option<u64>), usize>);
 
 impl Regions {
-    /// Of a test of a difference beyond the margin at a level, or of one inside of it.
+    /// Returns whether a test rejects: at a level the test of a difference beyond the margin, without one that of a difference inside of it.
     fn rejects(&mut self, b: usize, c: usize, n: usize, beyond: Option<f64>) -> bool {
         let (delta, level) = match beyond {
             Some(level) => (MARGIN, level),

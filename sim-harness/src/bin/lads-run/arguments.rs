@@ -226,6 +226,7 @@ pub struct Rollouts {
     pub faults: FaultArguments,
 }
 
+/// Options of `lads-run verify`.
 #[derive(Debug, Args)]
 pub struct Verify {
     #[command(flatten)]
@@ -248,12 +249,13 @@ pub struct Verify {
     pub threads: Option<usize>,
 }
 
-/// Path of the reference: the one that was named, else the file beside the model.
+/// Returns the path of the reference: the one that was named, else the file beside the model.
 pub fn reference(named: Option<&Path>, model: &Path) -> PathBuf {
     let beside = || model.with_extension("reference.json");
     named.map_or_else(beside, Path::to_owned)
 }
 
+/// Options of `lads-run tune`.
 #[derive(Debug, Args)]
 pub struct Tune {
     /// The policy bundle (ONNX)
@@ -270,6 +272,7 @@ pub struct Tune {
     pub isa: Option<IsaName>,
 }
 
+/// Options of `lads-run replay`.
 #[derive(Debug, Args)]
 pub struct Replay {
     /// The log, made with --log
@@ -278,6 +281,7 @@ pub struct Replay {
     pub policy: PolicyArguments,
 }
 
+/// Options of `lads-run encode`.
 #[derive(Debug, Args)]
 pub struct Encode {
     /// The log, made with --log
@@ -289,6 +293,7 @@ pub struct Encode {
     pub json: Option<PathBuf>,
 }
 
+/// Options of `lads-run sweep`.
 #[derive(Debug, Args)]
 pub struct Sweep {
     #[command(flatten)]
@@ -302,6 +307,7 @@ pub struct Sweep {
     pub language: LanguageArguments,
 }
 
+/// Options of `lads-run record`.
 #[derive(Debug, Args)]
 pub struct Record {
     /// The film: .gif, .mp4 (by ffmpeg), or with a slash at its end a folder of PNG
@@ -321,7 +327,7 @@ pub struct Frames {
     /// The frames, a safetensors file: a cache, which the dataset makes again
     #[arg(short, long, value_name = "FILE")]
     pub output: PathBuf,
-    /// How they are drawn, as JSON (its form: the `rendering` of a bundle's image channel); left out, as the environment's benchmark has it
+    /// Rendering of the frames, as JSON (its form: the `rendering` of a bundle's image channel); left out, as the environment's benchmark has it
     #[arg(long, value_name = "FILE")]
     pub rendering: Option<PathBuf>,
     /// Threads; left out, one per core
@@ -329,7 +335,7 @@ pub struct Frames {
     pub threads: Option<usize>,
 }
 
-/// What a job needs of its episodes, in a form common to all jobs.
+/// Episodes that a job runs and how, in a form common to all jobs.
 pub struct Wanted<'a> {
     pub policy: &'a PolicyArguments,
     pub language: &'a LanguageArguments,

@@ -213,14 +213,12 @@ fn check_plans(
     Ok(())
 }
 
-/// Decision rule of the run: the contract's, or, where sampling was asked for, sampling at the contract's temperature (1 where its rule is
-/// argmax).
+/// Returns the decision rule of the run; a rule that draws gets a seed for each episode.
 fn decision(policy: &Policy<'_>, sample: bool) -> Decision {
-    match policy.contract().decision() {
-        Decision::Argmax if sample => Decision::Sample {
-            temperature: 1.0,
-            seed: 0,
-        },
-        rule => rule,
+    let contract = policy.contract();
+    if sample {
+        contract.sampling(0)
+    } else {
+        contract.decision()
     }
 }

@@ -117,11 +117,11 @@ fn given<'p>(
         .collect()
 }
 
-/// Number of threads to run on: as asked for, else one per core, or one where a window shows the episodes.
+/// Returns the number of threads to run on: as asked for, else one per core, or one where a window shows the episodes.
 fn threads(asked: Option<usize>, viewer: bool) -> Result<usize, End> {
     match asked {
         Some(0) => Err(refused(
-            "--threads 0: nobody to run the episodes; give at least 1",
+            "--threads 0: no thread to run the episodes; give at least 1",
         )),
         Some(threads) if threads > 1 && viewer => Err(refused(format!(
             "view --threads {threads}: a window shows one episode at a time; leave --threads out"
@@ -150,6 +150,7 @@ fn progress_over(count: usize, things: &str) -> ProgressBar {
     command::progress(count, things)
 }
 
+/// Converts the error of an evaluation to the end of the run.
 fn unfinished(error: EvaluationError) -> End {
     match error {
         EvaluationError::Interrupted => End::Interrupted,

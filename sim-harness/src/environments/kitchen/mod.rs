@@ -15,7 +15,7 @@ use thiserror::Error;
 
 use crate::assets::{MissingAssets, OtherMujoco, asset, check_mujoco, remedy};
 use crate::environment::{
-    ActionError, Completion, Environment, EpisodeSeed, Stage, View, check_action,
+    ActionError, Completion, Environment, EpisodeSeed, Stage, View, check_action, latch,
 };
 use crate::frames::{Rendering, thin};
 use crate::random::Stream;
@@ -202,15 +202,8 @@ impl Environment for Kitchen {
         }
         self.steps += 1;
         for (sub_task, task) in SUB_TASKS.iter().enumerate() {
-            let latched = self
-                .completions
-                .iter()
-                .any(|completion| completion.sub_task == sub_task);
-            if !latched && task.is_done(self.data.qpos()) {
-                self.completions.push(Completion {
-                    sub_task,
-                    step: self.steps,
-                });
+            if task.is_done(self.data.qpos()) {
+                latch(&mut self.completions, sub_task, self.steps);
             }
         }
         self.observe();

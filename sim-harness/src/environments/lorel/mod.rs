@@ -21,7 +21,7 @@ use thiserror::Error;
 
 use crate::assets::{MissingAssets, OtherMujoco, asset, check_mujoco, remedy};
 use crate::environment::{
-    ActionError, Completion, Environment, EpisodeSeed, Stage, View, check_action,
+    ActionError, Completion, Environment, EpisodeSeed, Stage, View, check_action, latch,
 };
 use crate::frames::{Rendering, thin};
 use crate::random::Stream;
@@ -309,13 +309,8 @@ impl Environment for Lorel {
         advance(&mut self.data, FRAME_SKIP);
         self.steps += 1;
         for (sub_task, task) in SUB_TASKS.iter().enumerate() {
-            let mut latched = self.completions.iter();
-            let latched = latched.any(|completion| completion.sub_task == sub_task);
-            if !latched && task.holds(&self.start, self.data.qpos()) {
-                self.completions.push(Completion {
-                    sub_task,
-                    step: self.steps,
-                });
+            if task.holds(&self.start, self.data.qpos()) {
+                latch(&mut self.completions, sub_task, self.steps);
             }
         }
         Ok(self.data.qpos())

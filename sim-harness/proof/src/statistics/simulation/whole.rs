@@ -14,7 +14,7 @@ use super::{NUMBERS, Regions, Stream, slack};
 use crate::certificate::DIFFERENCE;
 use crate::pairs::{N_RATE_MARGIN, RATE_MARGIN};
 
-/// How one episode ended: which of the commanded sub-tasks were done, a bit for each in their order, and whether that counts as success.
+/// Outcome of one episode: which of the commanded sub-tasks were done, a bit for each in their order, and whether that counts as success.
 #[derive(Clone, Copy, PartialEq)]
 struct Outcome {
     done: u32,
@@ -33,33 +33,33 @@ struct Instruction {
     episodes: Vec<Outcome>,
 }
 
-/// A shipped reference.
+/// Reference of a shipped policy.
 struct Shipped {
     sub_tasks: Vec<String>,
     instructions: Vec<Instruction>,
-    /// Pairs of its verification.
+    /// Number of pairs of a whole verification.
     all: usize,
 }
 
-/// What is lost.
+/// Loss that the simulated policy has against the reference's.
 #[derive(Clone, Copy, PartialEq)]
 enum Lost {
-    /// Nothing: run and reference are samples of one policy.
+    /// No loss: run and reference are samples of one policy.
     Nothing,
-    /// As much of one rate as its margin; the last one is full success.
+    /// Loss of a rate by its margin; the last rate is full success.
     Rate(usize),
-    /// As much of the N-rate as its margin, a sub-task in each of many episodes.
+    /// Loss of the N-rate by its margin: a sub-task in each of many episodes.
     Completions,
 }
 
-/// How the run's episodes are otherwise related to the reference's.
+/// Relation of the run's episodes to the reference's, besides the loss.
 #[derive(Clone, Copy)]
 enum Beside {
-    /// They are the same.
+    /// The episodes are the same.
     Same,
-    /// Four of a hundred are drawn anew.
+    /// Four of a hundred episodes are drawn anew.
     Few,
-    /// All are drawn anew.
+    /// All episodes are drawn anew.
     All,
 }
 
@@ -208,7 +208,7 @@ impl Shipped {
         [equivalent && !different, different]
     }
 
-    /// The same of many verifications, as shares.
+    /// Computes the shares of many verifications that find equivalence and difference.
     fn shares(
         &self,
         regions: &mut Regions,
