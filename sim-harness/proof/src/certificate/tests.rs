@@ -101,7 +101,7 @@ fn judged(asked: Asked, environment: Physics, outcome: [usize; 4]) -> Certificat
         used,
         contract,
         asked,
-        environment,
+        (environment, None),
         rollouts,
         Vec::new(),
     )
