@@ -158,7 +158,7 @@ fn a_frame_that_cannot_be_used_is_as_no_frame() {
     let run = |bad: [(&[LadsInput], u64); 5]| {
         let mut host = Host::new(image.clone());
         let c = host.controller();
-        let mut step = |list: &[LadsInput], timestamp: u64| {
+        let step = |list: &[LadsInput], timestamp: u64| {
             let tick = LadsTick {
                 timestamp,
                 ..LadsTick::default()
