@@ -76,15 +76,15 @@ pub struct Sight {
 }
 
 /// What a camera shows now.
+#[cfg_attr(
+    not(feature = "camera"),
+    expect(dead_code, reason = "nothing is drawn")
+)]
 struct Shown {
     id: ChannelId,
     /// Name of the channel.
     name: String,
     /// Rows and columns.
-    #[cfg_attr(
-        not(feature = "camera"),
-        expect(dead_code, reason = "nothing is drawn")
-    )]
     size: [u32; 2],
     frame: Vec<u8>,
 }
