@@ -220,9 +220,10 @@ table: setup $(VENV)/stamp $(DATA)
 $(DATA):
 	$(MAKE) collect ENV=$(ENV)
 
-## reference: the policy of $(MODEL) in PyTorch and the official environment, 20 episodes of each instruction, for `lads-run verify`
+## reference: the policy of $(MODEL) in PyTorch and the official environment, 20 episodes of each instruction, for `lads-run verify`;
+##         ARGS="--noise none" on the LOReL table; a policy with a camera needs the built program, which draws for it (--lads-run)
 reference: $(VENV)/stamp
-	$(PY) -m lads_exporter reference --model $(MODEL) -o $(MODEL:.onnx=.reference.json)
+	$(PY) -m lads_exporter reference --model $(MODEL) -o $(MODEL:.onnx=.reference.json) $(ARGS)
 
 ## verify: is the compiled policy the reference's? Fails unless EQUIVALENT; `lads-run verify` itself exits with 0, 1 DIFFERENT or 3 INCONCLUSIVE
 verify: setup

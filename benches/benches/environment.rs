@@ -1,4 +1,5 @@
-//! Measures a simulated control step, and how many of them an evaluation makes in a second, with the simulator that `make setup` fetches.
+//! Measures a simulated control step, a camera's frame, and how many control steps an evaluation makes in a second, with the simulator that
+//! `make setup` fetches.
 
 use std::sync::atomic::AtomicBool;
 
@@ -9,6 +10,8 @@ use lads_core::{Decision, Isa, Policy};
 use lads_sim::assets::vendor_dir;
 use lads_sim::environment::{Environment, EpisodeSeed};
 use lads_sim::evaluate::{Assignment, Evaluation};
+use lads_sim::frames::Frames;
+use lads_sim::registry;
 use lads_sim::rollout::Actor;
 
 /// Number of control steps of an episode.
@@ -21,7 +24,7 @@ const START: EpisodeSeed = EpisodeSeed {
 };
 
 fn environment(criterion: &mut Criterion) {
-    let open = lads_sim::registry::load("franka-kitchen", "v0", &vendor_dir())
+    let open = registry::load("franka-kitchen", "v0", &vendor_dir())
         .expect("make setup has fetched the simulator");
     let mut kitchen = open();
     let command = vec![0.1; kitchen.action_len()];
@@ -43,7 +46,7 @@ fn environment(criterion: &mut Criterion) {
 }
 
 fn evaluation(criterion: &mut Criterion) {
-    let open = lads_sim::registry::load("franka-kitchen", "v0", &vendor_dir())
+    let open = registry::load("franka-kitchen", "v0", &vendor_dir())
         .expect("make setup has fetched the simulator");
     let bundle = Bundle::open(&bundle()).expect("the bundle that ships opens");
     let image = compile(&bundle).expect("it compiles");
@@ -86,5 +89,29 @@ fn evaluation(criterion: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, environment, evaluation);
+/// Frames as policies with a camera see them. No time of a control step has one in; with this it is the whole of a simulated one.
+fn frame(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("frame");
+    group.sample_size(10);
+    for id in ["lorel-table", "franka-kitchen"] {
+        let noise = registry::default_noise(id).unwrap_or("none");
+        let open = registry::load(id, noise, &vendor_dir());
+        let scene = open.expect("make setup has fetched the simulator")();
+        let rendering = scene.rendering().expect("it has a camera");
+        let mut frames = match Frames::new(scene.as_ref(), &rendering) {
+            Ok(frames) => frames,
+            Err(error) => {
+                eprintln!("frame/{id}: not measured: {error}");
+                continue;
+            }
+        };
+        let [rows, columns] = rendering.size;
+        group.bench_function(format!("{id}, {rows}x{columns}"), |bencher| {
+            bencher.iter(|| frames.draw(scene.state()).expect("it is drawn")[0]);
+        });
+    }
+    group.finish();
+}
+
+criterion_group!(benches, environment, frame, evaluation);
 criterion_main!(benches);

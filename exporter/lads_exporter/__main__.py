@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import hashlib
+import json
 import sys
 from pathlib import Path
 
@@ -19,12 +20,13 @@ def _encode(setting):
 def _random(arguments):
     from . import bundle, config, kinds, random_policy
 
-    read = [] if arguments.kind else [arguments.config]
+    read = [path for path in (arguments.config, arguments.rendering) if path]
     output.check_apart(read, [arguments.output])
     if arguments.kind:
         _, model = kinds.export(arguments.kind, arguments.seed)
     else:
-        setting = config.load(arguments.config)
+        rendering = json.loads(Path(arguments.rendering).read_text()) if arguments.rendering else None
+        setting = dataclasses.replace(config.load(arguments.config), rendering=rendering)
         _, model = random_policy.export(setting, _encode(setting), arguments.seed)
     print(f"{arguments.output}: random weights, sha256 {bundle.save(model, arguments.output)}")
 
@@ -155,10 +157,10 @@ def _reference(arguments):
     if arguments.complete:
         from . import questions
 
-        questions.complete(arguments.model, arguments.output, arguments.run)
+        questions.complete(arguments.model, arguments.output, arguments.run, arguments.lads_run)
         print(f"{arguments.output}: completed; next: lads-run verify --model {arguments.model} --reference {arguments.output}")
         return
-    chosen = {key: getattr(arguments, key) for key in ("run", "episodes", "traced", "seed", "noise")}
+    chosen = {key: getattr(arguments, key) for key in ("run", "episodes", "traced", "seed", "noise", "lads_run")}
     reference.write(arguments.model, arguments.output, **chosen)
     print(f"{arguments.output}: written; next: lads-run verify --model {arguments.model} --reference {arguments.output}")
 
@@ -207,6 +209,7 @@ def _parser():
     network.add_argument("--kind", help="a small policy of this kind: lads, lang_dt, lisa, vae, lcsd, skilldiffuser, history, plain, recurrent, stacked, camera, images, sighted, sighted_history; or with an encoder of the field's sizes: lorel-encoder, lite0, resnet18")
     random.add_argument("-o", "--output", required=True)
     random.add_argument("--seed", type=int, default=0)
+    random.add_argument("--rendering", metavar="FILE", help="how the frames are drawn that a configuration's policy sees, as lads-run frames --rendering takes it")
     random.set_defaults(run_command=_random)
 
     episode = commands.add_parser("episode", help="a made-up episode of a bundle and what it does there, for tests of the runtime")
@@ -263,6 +266,7 @@ def _parser():
     rollouts.add_argument("--seed", type=int, default=0)
     rollouts.add_argument("--complete", action="store_true", help="add to the reference that is there what an earlier version did not record")
     rollouts.add_argument("--noise", default="v0", help="observation noise: v0, v1 or none")
+    rollouts.add_argument("--lads-run", default="target/release/lads-run", help="draws the frames of a policy with a camera (target/release/lads-run)")
     rollouts.set_defaults(run_command=_reference)
 
     upgraded = commands.add_parser("upgrade", help="a bundle of contract version 1 to version 2; graphs and weights stay as they are")

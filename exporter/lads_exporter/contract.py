@@ -108,6 +108,12 @@ def action(contract):
     return of_role(contract, "action")[0]
 
 
+def camera(contract):
+    """Returns the only observation channel of a policy that sees by one camera; None of a policy that observes something else."""
+    found = of_role(contract, "observation")
+    return found[0] if len(found) == 1 and found[0].get("layout") == "hwc" else None
+
+
 def observation(contract):
     """Returns the only observation channel of a policy that has one vector."""
     found = of_role(contract, "observation")

@@ -1,13 +1,18 @@
-"""Frames of a camera as what policies learn from: the file of `lads-run frames`, augmentation, a corpus of images.
+"""Frames of a camera as what policies learn from and act on: the file and the stream of `lads-run frames`, augmentation, a corpus of images.
 
 Shapes: N frames, r rows, c columns, F features; E episodes, T control steps. Frames are bytes [r, c, 3]; between augmentation and encoder they
-are floats 0 to 255. What can fail: a file that is half written, or of another dataset.
+are floats 0 to 255. What can fail: a file that is half written, or of another dataset; a program that
+is not there or cannot draw.
 """
 
+import hashlib
 import json
 import math
 import mmap
 import struct
+import subprocess
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,6 +22,7 @@ from .config import UserError
 from .corpus import Corpus
 
 FORMAT = "lads-frames"
+DIGEST = 16  # bytes of a frame's sha256 by which it is known again
 BATCH = 256  # frames that are encoded at a time where nothing is learnt
 RED, GREEN, BLUE = 0.299, 0.587, 0.114  # of a pixel's luminance
 
@@ -43,6 +49,61 @@ def read(path, dataset_sha256):
     if made_of != dataset_sha256:
         raise UserError(f"{path}: made of another dataset; make it anew with lads-run frames")
     return data.reshape(shape), rendering
+
+
+def digest(frame):
+    """-> the first DIGEST bytes of a frame's sha256."""
+    return np.frombuffer(hashlib.sha256(np.ascontiguousarray(frame)).digest(), np.uint8)[:DIGEST]
+
+
+class Renderer:
+    """Draws frames of states: `lads-run frames --stream`, which draws them for the harness too, as its own process.
+
+    `versions` are those of what draws, by name.
+    """
+
+    def __init__(self, program, environment, rendering):
+        self.program, self.errors, folder = program, tempfile.TemporaryFile(), tempfile.TemporaryDirectory()
+        with folder:
+            file = Path(folder.name, "rendering.json")
+            file.write_text(json.dumps(rendering))
+            command = [program, "frames", "--stream", environment, "--rendering", file]
+            try:
+                self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self.errors)
+            except OSError as error:
+                raise UserError(f"{program}: cannot be run ({error.strerror}); build it: cargo build --release -p lads-sim --features camera, or name it with --lads-run") from error
+            heading = self.process.stdout.readline()
+        if not heading.endswith(b"\n"):
+            self._broke()
+        heading = json.loads(heading)
+        self.versions, self.positions, self.shape = heading["versions"], heading["positions"], (*rendering["size"], 3)
+
+    def draw(self, state):
+        """Draws the frame of a state, the simulator's positions -> [r, c, 3] of bytes."""
+        state = np.ascontiguousarray(state, "<f8")
+        if state.shape != (self.positions,):
+            raise UserError(f"{self.program}: draws states of {self.positions} numbers, not of {state.size}")
+        try:
+            self.process.stdin.write(state.tobytes())
+            self.process.stdin.flush()
+        except BrokenPipeError:
+            self._broke()
+        drawn = self.process.stdout.read(math.prod(self.shape))
+        if len(drawn) < math.prod(self.shape):
+            self._broke()
+        return np.frombuffer(drawn, np.uint8).reshape(self.shape)
+
+    def close(self):
+        self.process.stdin.close()
+        self.process.stdout.close()
+        self.process.wait()
+        self.errors.close()
+
+    def _broke(self):
+        self.process.wait()
+        self.errors.seek(0)
+        said = self.errors.read().decode(errors="replace").strip() or f"ended with exit code {self.process.returncode}"
+        raise UserError(f"{self.program}: {said.removeprefix('error: ')}")
 
 
 def augmented(frames, owners, count, config):

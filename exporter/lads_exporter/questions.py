@@ -8,6 +8,7 @@ answers, which is what a verification must allow. So a reference that was made w
 import base64
 import copy
 import json
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from onnx import numpy_helper
 
-from . import config
+from . import config, contract as contracts, frames
 from .bundle import write_atomically
 
 # Relative size of the noise: some rounding errors of 32-bit floats, and what another order of sums makes of them.
@@ -38,14 +39,47 @@ def _traced(rows):
     return [(index, row) for index, instruction in enumerate(rows) for row in instruction["episodes"] if "trace" in row]
 
 
-def _ask(policy, index, episode):
+class Shown:
+    """What the policy was shown in each trace: recorded observations, or frames of the recorded states, drawn once into a temporary file."""
+
+    def __init__(self, rows, contract, renderer):
+        self.frames = {}
+        if renderer is None:
+            self.len = contracts.observation(contract)["shape"][0]
+            return
+        traced = [(index, episode, _states(episode)) for index, episode in _traced(rows)]
+        shape = (sum(len(states) for *_, states in traced), *renderer.shape)
+        self.file = tempfile.NamedTemporaryFile()
+        drawn, at = np.memmap(self.file.name, np.uint8, "w+", shape=(max(1, shape[0]), *shape[1:])), 0
+        for index, episode, states in traced:
+            known = _numbers(episode["trace"]["frames"], "u1", frames.DIGEST)
+            first = at
+            for state, digest in zip(states, known, strict=True):
+                drawn[at] = renderer.draw(state)
+                if not np.array_equal(frames.digest(drawn[at]), digest):
+                    where = f"{rows[index]['id']}, episode {episode['episode']}, step {at - first}"
+                    raise config.UserError(f"{where}: its frame is drawn otherwise here than when it was recorded; make the reference again")
+                at += 1
+            self.frames[index, episode["episode"]] = drawn[first:at]
+
+    def of(self, index, episode):
+        """Returns what was shown at each step [steps, ...]."""
+        if self.frames:
+            return self.frames[index, episode["episode"]]
+        return _numbers(episode["trace"]["observations"], "<f4", self.len)
+
+
+def _states(episode):
+    return _numbers(episode["trace"]["states"], "<f8", len(episode["final_state"]))
+
+
+def _ask(policy, shown, index, episode):
     """Asks a policy what a trace's policy was asked -> logits per decision, actions [steps, A]."""
-    lens = len(policy.acting.normalizer.mean), len(policy.low)
     trace = episode["trace"]
     policy.start(index)
     actions = []
-    for seen, done in zip(_numbers(trace["observations"], "<f4", lens[0]), _numbers(trace["actions"], "<f4", lens[1]), strict=True):
-        actions.append(policy.act(seen.copy()))
+    for seen, done in zip(shown.of(index, episode), _numbers(trace["actions"], "<f4", len(policy.low)), strict=True):
+        actions.append(policy.act(np.array(seen)))
         policy.actions[-1] = torch.from_numpy(done.copy())
     return policy.logits, np.stack(actions)
 
@@ -67,17 +101,17 @@ def _half_range(difference):
 
 
 @torch.no_grad()
-def float_noise(policy, rows):
+def float_noise(policy, shown, rows):
     """Measures the effect of noise on all weights on a policy's answers -> the largest differences of an action and of a logit."""
     generator = torch.Generator().manual_seed(0)
     largest = {"relative": NOISE, "action": 0.0, "logit": 0.0}
-    answers = {id(episode): _ask(policy, index, episode) for index, episode in _traced(rows)}
+    answers = {id(episode): _ask(policy, shown, index, episode) for index, episode in _traced(rows)}
     exact = policy.acting
     for _ in range(DRAWS):
         policy.acting = _disturbed(exact, generator)
         for index, episode in _traced(rows):
             logits, actions = answers[id(episode)]
-            noisy, others = _ask(policy, index, episode)
+            noisy, others = _ask(policy, shown, index, episode)
             plans = [int(row.argmax()) for row in logits], [int(row.argmax()) for row in noisy]
             for a, b in zip(logits, noisy, strict=True):
                 largest["logit"] = max(largest["logit"], _half_range(a - b))
@@ -127,18 +161,21 @@ class Encoder:
 
 
 @torch.no_grad()
-def add(head, rows, model, contract, policy):
-    """Adds contract and noise to a reference's heading, logits and encodings to its traces; refuses traces of another policy."""
-    lens = len(policy.acting.normalizer.mean), len(policy.low)
+def add(head, rows, model, contract, policy, renderer=None):
+    """Adds contract and noise to a reference's heading, logits and encodings to its traces; refuses traces of another policy.
+
+    `renderer` draws again what a policy with a camera saw.
+    """
+    shown = Shown(rows, contract, renderer)
     horizon = head["horizon"]
     try:
         encoder = Encoder(model, policy.acting)
     except KeyError:
         encoder = None  # a bundle without one
     for index, episode in _traced(rows):
-        logits, actions = _ask(policy, index, episode)
+        logits, actions = _ask(policy, shown, index, episode)
         trace, where = episode["trace"], f"{rows[index]['id']}, episode {episode['episode']}"
-        done = _numbers(trace["actions"], "<f4", lens[1])
+        done = _numbers(trace["actions"], "<f4", len(policy.low))
         if [int(row.argmax()) for row in logits] != episode["plans"] and min(episode["margins"], default=0) > SAME_PLAN:
             raise config.UserError(f"{where}: the recorded plans are not this policy's; make the reference again")
         if policy.plans == episode["plans"] and np.abs(actions - done).max(initial=0) > SAME_ACTION:
@@ -147,15 +184,15 @@ def add(head, rows, model, contract, policy):
             trace["logits"] = _text([row.numpy() for row in logits], "<f4")
         segments = len(done) // horizon
         if encoder and segments:
-            cut = lambda key, columns: _numbers(trace[key], "<f4", columns)[: segments * horizon].reshape(segments, horizon, columns)
-            trace["encoded"], trace["encoded_margins"] = encoder.plans(cut("observations", lens[0]), cut("actions", lens[1]))
+            cut = lambda steps: steps[: segments * horizon].reshape(segments, horizon, -1)
+            trace["encoded"], trace["encoded_margins"] = encoder.plans(cut(shown.of(index, episode)), cut(done))
         elif encoder:
             trace["encoded"], trace["encoded_margins"] = [], []
     head["contract"] = contract
-    head["float_noise"] = float_noise(policy, rows)
+    head["float_noise"] = float_noise(policy, shown, rows)
 
 
-def complete(bundle, path, run=None):
+def complete(bundle, path, run=None, lads_run="target/release/lads-run"):
     """Adds to the reference at `path`, made by an earlier version, what it does not record; its rollouts stay as they are."""
     from . import reference
 
@@ -168,7 +205,10 @@ def complete(bundle, path, run=None):
     torch.set_num_threads(1)
     acting, weights_from = reference._acting(model, contract, run)
     words, _, _ = reference._words(model, contract)
-    add(head, rows, model, contract, reference.FullSequencePolicy(acting, contract, words))
+    renderer = reference.renderer_of(contract, lads_run)
+    add(head, rows, model, contract, reference.FullSequencePolicy(acting, contract, words), renderer)
+    if renderer:
+        renderer.close()
     head["purpose_sha256"] = reference.purpose_sha256(contract)
     head["format_version"] = reference.FORMAT_VERSION
     head["logits_from"] = weights_from

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from . import bundle, contract as contracts
-from .model import Lads
+from . import bundle, contract as contracts, systems
+from .config import UserError
 
 
 def draw_weights(module, generator):
@@ -43,8 +43,13 @@ def randomize(lads, setting, seed):
         for norm in getattr(lads.low_level, "norms", ()):  # only the MLP has batch norms
             norm.running_mean.copy_(0.2 * draw(norm.running_mean))
             norm.running_var.copy_(0.5 + torch.rand(norm.running_var.shape, generator=generator))
-        if setting.rendering is None:  # features are not normalised
+        if setting.rendering is None:
             place_normalizer(lads.normalizer, setting.environment["observation"])
+        else:  # features are not normalised; convolutions keep their size
+            own = torch.Generator().manual_seed(seed)
+            for module in lads.frames.modules():
+                if isinstance(module, torch.nn.Conv2d):
+                    module.weight.copy_(torch.randn(module.weight.shape, generator=own) * (2 / module.weight[0].numel()) ** 0.5)
         lads.codebook.codes.copy_(draw(lads.codebook.codes))
         lads.codebook.started.fill_(True)
 
@@ -84,11 +89,18 @@ def _size(row):
 
 def export(setting, encoded, seed, steps=None):
     """Makes a bundle with random weights and a golden episode of so many control steps, or over the whole context."""
+    seen = setting.config.images.channel
+    if bool(seen) != (setting.rendering is not None):
+        raise UserError(f"{setting.config.name}: {'sees frames; say how they are drawn with --rendering' if seen else 'sees no frames; leave --rendering out'}")
     torch.manual_seed(seed)
-    lads = Lads(setting, encoded)
+    lads = systems.of(setting.config).Networks(setting, encoded)
     randomize(lads, setting, seed)
     steps = steps or setting.config.high_level.context_steps
     count = len(setting.instructions)
-    candidates = ((tried % count, observations(setting, steps, seed + tried)) for tried in range(1, 200))
+    if seen:
+        drawn = lambda tried: np.random.default_rng([seed, tried]).integers(0, 256, (steps, *setting.rendering["size"], 3), np.uint8)
+    else:
+        drawn = lambda tried: observations(setting, steps, seed + tried)
+    candidates = ((tried % count, drawn(tried)) for tried in range(1, 200))
     provenance = {"dataset_sha256": "", "seed": seed, "steps": {}}
     return lads, bundle.assemble(lads, setting, encoded, provenance, candidates)

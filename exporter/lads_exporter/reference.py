@@ -7,8 +7,9 @@ encoder is installed. What is not: the weights come from the bundle's initialize
 then the normaliser's scale and batch norm are those that the exporter folded; the observation noise is numpy's stream, so
 that the runtime can run the very same episodes.
 
-The policy sees observations as float32 and acts with float32, as the runtime does. An interrupted run continues from its
-progress file, which lies beside the output until that is complete.
+The policy sees observations as float32 and acts with float32, as the runtime does. Frames of a policy with a camera are drawn of the
+official environment's states by the harness's renderer, so that both sides see by the same one; a trace holds the states, and of
+every frame a digest, by which a verifier knows whether it draws the same. An interrupted run continues from its progress file, which lies beside the output until that is complete.
 """
 
 import base64
@@ -24,7 +25,7 @@ import onnx
 import torch
 from tqdm import tqdm
 
-from . import __version__, config, contract as contracts, language, official, questions, weights
+from . import __version__, config, contract as contracts, frames, language, official, questions, weights
 from .output import write_atomically
 
 FORMAT, FORMAT_VERSION = "lads-reference", 2
@@ -88,7 +89,7 @@ class FullSequencePolicy:
 
     @torch.no_grad()
     def act(self, observation):
-        """Acts on observation [O] float32 -> action [A] float32, clipped to the contract's limits."""
+        """Acts on observation [O] float32, or a frame [r, c, 3] of bytes -> action [A] float32, clipped to the contract's limits."""
         if len(self.observations) == self.contract["context"]["steps"]:
             if self.contract["context"]["beyond"] != "restart":
                 raise config.UserError("an episode is longer than the policy's context, and its contract says to refuse")
@@ -115,18 +116,19 @@ class FullSequencePolicy:
         return self.acting.high_level([self.words[self.instruction]], observations, actions)[0, -1]
 
 
-def episode(policy, environment, entropy, instruction, known, traced):
+def episode(policy, environment, entropy, instruction, known, traced, renderer=None):
     """Runs one episode -> a JSON object; it ends when the instruction is carried out or its split's steps are up."""
     policy.start(instruction)
     commanded, most = known["sub_tasks"], environment.max_steps(known["split"])
     observation = environment.reset(entropy, commanded)
     states, observations, actions = [], [], []
     while environment.steps < most and not environment.succeeded(commanded):
-        if traced and len(states) < TRACED_STATES:
+        if traced and (renderer or len(states) < TRACED_STATES):
             states.append(environment.state())
-        seen = observation.astype(np.float32)
+        seen = renderer.draw(environment.state()).copy() if renderer else observation.astype(np.float32)
         action = policy.act(seen)
-        observations.append(seen)
+        if traced:
+            observations.append(frames.digest(seen) if renderer else seen)
         actions.append(action)
         observation = environment.step(action.astype(np.float64))
     order = sorted(environment.completions.items(), key=lambda row: (row[1], environment.SUB_TASKS.index(row[0])))
@@ -143,8 +145,9 @@ def episode(policy, environment, entropy, instruction, known, traced):
     if traced:
         text = lambda rows, kind: base64.b64encode(np.stack(rows).astype(kind).tobytes()).decode()
         # What the policy saw and did at every step, so that a verifier can ask another policy the same questions; and the
-        # noise-free states that the environment's physics is compared by.
-        row["trace"] = {"observations": text(observations, "<f4"), "actions": text(actions, "<f4"), "states": text(states, "<f8")}
+        # noise-free states that the environment's physics is compared by. Frames are made of the states of all steps.
+        seen = {"observations": "", "frames": text(observations, "u1")} if renderer else {"observations": text(observations, "<f4")}
+        row["trace"] = seen | {"actions": text(actions, "<f4"), "states": text(states, "<f8")}
     return row
 
 
@@ -168,8 +171,7 @@ def _words(model, contract):
 def _acting(model, contract, run):
     if run is None:
         return weights.from_bundle(model, contract), "the bundle's initializers"
-    from . import training
-    from .model import Lads
+    from . import systems, training
 
     saved, setting = training.load_run(run)
     if saved["identity"]["dataset_sha256"] != contract["provenance"]["dataset_sha256"]:
@@ -178,7 +180,7 @@ def _acting(model, contract, run):
     if system.kind != "lads" or system.regressed:
         raise config.UserError(f"{run}: its networks are folded when they are exported; leave --run out, the bundle has their weights")
     encoded = language.encode(setting.config.language, [row["text"] for row in setting.instructions])
-    lads = Lads(setting, encoded)
+    lads = systems.of(setting.config).Networks(setting, encoded)
     lads.load_state_dict(saved["networks"])
     trained, exported = weights.from_lads(lads), weights.from_bundle(model, contract)
     if not all(torch.equal(a, b) for a, b in ((trained.codes, exported.codes), (trained.high_level.head.weight, exported.high_level.head.weight))):
@@ -230,8 +232,18 @@ def _text(head, instructions):
     return "\n".join([*lines, " ]", "}", ""])
 
 
-def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0"):
-    """Rolls out all instructions of `bundle` and writes the reference to `output`."""
+def renderer_of(contract, lads_run):
+    """Makes the renderer of the policy's camera; None for a policy without."""
+    seen = contracts.camera(contract)
+    if seen is None:
+        return None
+    if "rendering" not in seen:
+        raise config.UserError(f"channel {seen['name']}: the contract does not say how its frames are drawn; export the policy with the frames of lads-run")
+    return frames.Renderer(lads_run, contract["environment"]["id"], seen["rendering"])
+
+
+def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0", lads_run="target/release/lads-run"):
+    """Rolls out all instructions of `bundle` and writes the reference to `output`. `lads_run` draws what a policy with a camera sees."""
     if episodes < 1 or not 1 <= traced <= episodes:
         raise config.UserError(f"{episodes} episodes of which {traced} traced: give at least 1 of each, and no more traced than episodes")
     data = Path(bundle).read_bytes()
@@ -248,6 +260,7 @@ def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0"):
     if make is None:
         raise config.UserError(f"{bundle}: no official environment for {contract['environment']['id']!r}")
     torch.set_num_threads(1)  # sums depend on their number
+    renderer = renderer_of(contract, lads_run)
     environment = make(noise)
     acting, weights_from = _acting(model, contract, run)
     words, words_from, words_difference = _words(model, contract)
@@ -276,6 +289,8 @@ def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0"):
             **environment.versions(),
         },
     }
+    if renderer:
+        head["renderer"] = renderer.versions
     progress = Progress(output, head)
     with tqdm(total=len(known) * episodes, initial=len(progress.done), unit="episode") as bar:
         for number in range(episodes):
@@ -283,14 +298,16 @@ def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0"):
                 if (index, number) in progress.done:
                     continue
                 entropy = [seed, index, number]
-                progress.add(index, episode(policy, environment, entropy, index, instruction, number < traced))
+                progress.add(index, episode(policy, environment, entropy, index, instruction, number < traced, renderer))
                 bar.update()
     environment.close()
     rows = [
         {key: row[key] for key in ("id", "text", "split", "sub_tasks")} | {"episodes": [progress.done[index, n] for n in range(episodes)]}
         for index, row in enumerate(known)
     ]
-    questions.add(head, rows, model, contract, policy)
+    questions.add(head, rows, model, contract, policy, renderer)
+    if renderer:
+        renderer.close()
     text = _text(head, rows)
     write_atomically(output, text.encode())
     progress.finish()

@@ -13,13 +13,25 @@ from onnx import numpy_helper
 from torch import nn
 
 from . import contract as contracts
-from .config import HighLevel, LowLevel, UserError
+from .config import HighLevel, Images, LowLevel, UserError
+from .kinds.sighted import FrameEncoder
 from .model import HighLevelPolicy, LowLevelPolicy, Normalizer
+
+
+class Eyes(nn.Module):
+    """Reads a frame [r, c, 3] as both levels do: its normalised features [F]."""
+
+    def __init__(self, frames, normalizer):
+        super().__init__()
+        self.frames, self.normalizer = frames, normalizer
+
+    def forward(self, frame):
+        return self.normalizer(self.frames(frame[None])[0])
 
 
 @dataclass(frozen=True)
 class Acting:
-    """Networks that act: normaliser, high level, codes [M, D], low level. All in eval mode."""
+    """Networks that act: what reads an observation (the normaliser, or `Eyes`), high level, codes [M, D], low level. All in eval mode."""
 
     normalizer: nn.Module
     high_level: nn.Module
@@ -30,7 +42,8 @@ class Acting:
 def from_lads(lads):
     """Takes the acting part of trained networks."""
     lads.eval()
-    return Acting(lads.normalizer, lads.high_level, lads.codebook.codes, lads.low_level)
+    reads = Eyes(lads.frames, lads.normalizer) if hasattr(lads, "frames") else lads.normalizer
+    return Acting(reads, lads.high_level, lads.codebook.codes, lads.low_level)
 
 
 def _tensors(model):
@@ -46,8 +59,25 @@ def _slope(model):
 
 
 def _lengths(contract):
-    """Returns the numbers of elements of the observation and of the action."""
-    return contracts.observation(contract)["shape"][0], contracts.action(contract)["shape"][0]
+    """Returns the numbers of elements that both levels read, of the observation or of a frame's features, and of the action."""
+    features = contract["family"].get("features")
+    return features or contracts.observation(contract)["shape"][0], contracts.action(contract)["shape"][0]
+
+
+def _frame_encoder(tensors, contract):
+    """Loads the encoder of frames; its layout is that of `FrameEncoder`, its sizes are the tensors'."""
+    channel, size = contracts.camera(contract)["name"], contracts.camera(contract)["shape"][:2]
+    numbered = lambda stem, part: [tensors[f"{stem}.{n}.{part}"] for n in range(sum(name.startswith(f"{stem}.") and name.endswith(f".{part}") for name in tensors))]
+    convolutions = list(zip(numbered(channel, "weight"), numbered(channel, "bias"), strict=True))
+    dense = list(zip(numbered("observation_encoder.dense", "weight"), numbered("observation_encoder.dense", "bias"), strict=True))
+    widths, hidden = ([len(bias) for _, bias in layers] for layers in (convolutions, dense))
+    encoder = FrameEncoder(Images(channel, widths, hidden[:-1], hidden[-1], 0.0, 0.0, 0.0, 0.0, 0.0), size)
+    state = {}
+    for stem, layers in ((lambda n: f"convolutions.layers.{n}.conv", convolutions), (lambda n: f"dense.{n}", dense)):
+        for number, (weight, bias) in enumerate(layers):
+            state |= {f"{stem(number)}.weight": weight, f"{stem(number)}.bias": bias}
+    encoder.load_state_dict(state)
+    return encoder.eval()
 
 
 def _high_level(tensors, contract):
@@ -96,8 +126,9 @@ def from_bundle(model, contract):
     try:
         normalizer = Normalizer(_lengths(contract)[0])
         normalizer.mean.copy_(tensors["observation_mean"])
+        reads = Eyes(_frame_encoder(tensors, contract), normalizer) if "features" in contract["family"] else normalizer
         slope = _slope(model)
         low_level = _low_level(tensors, contract, slope)
-        return Acting(normalizer.eval(), _high_level(tensors, contract), tensors["codebook"], low_level)
-    except (KeyError, RuntimeError) as error:
+        return Acting(reads.eval(), _high_level(tensors, contract), tensors["codebook"], low_level)
+    except (KeyError, IndexError, ValueError, RuntimeError) as error:
         raise UserError(f"the bundle's weights are not those of a {contract['family']['kind']} policy of this exporter: {error}") from error

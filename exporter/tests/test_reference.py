@@ -2,13 +2,15 @@
 
 import base64
 import json
+import sys
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from safetensors.numpy import load
 
-from lads_exporter import config, contract as contracts, questions, reference, training, weights
+from lads_exporter import bundle as bundles, config, contract as contracts, frames, kinds, questions, reference, training, weights
 
 
 def contract_of(model):
@@ -188,3 +190,114 @@ def test_a_reference_of_another_policy_is_not_completed(bundle, tmp_path):
     file.write_text(json.dumps(made))
     with pytest.raises(config.UserError, match="instructions are not those"):
         questions.complete(bundle, file)
+
+
+RENDERING = {"size": [12, 16], "view": {"camera": "front"}}
+# Stands in for `lads-run frames --stream`: colours tell the state, and a state of zeros stops it.
+STREAM = f"""#!{sys.executable}
+import json, sys
+import numpy as np
+
+if sys.argv[3] != "tiny-bench":
+    sys.exit("error: no environment is called '" + sys.argv[3] + "'")
+rendering = json.load(open(sys.argv[5]))
+out = sys.stdout.buffer
+out.write(json.dumps({{"environment": sys.argv[3], "rendering": rendering, "positions": 5, "versions": {{"pencil": "2B"}}}}).encode() + b"\\n")
+out.flush()
+while state := sys.stdin.buffer.read(40):
+    state = np.frombuffer(state, "<f8")
+    if not state.any():
+        sys.exit("error: a picture cannot be drawn: nothing to see")
+    count = int(np.prod(rendering["size"])) * 3
+    out.write(np.clip(128 + 2000 * np.resize(state, count) * np.sin(np.arange(count)), 0, 255).astype(np.uint8).tobytes())
+    out.flush()
+"""
+
+
+@pytest.fixture
+def program(tmp_path):
+    path = tmp_path / "lads-run"
+    path.write_text(STREAM)
+    path.chmod(0o755)
+    return path
+
+
+@pytest.fixture
+def sighted(tmp_path, monkeypatch):
+    """A policy with a camera -> its bundle, the networks that it was made of."""
+    monkeypatch.setitem(reference.official.ENVIRONMENTS, "tiny-bench", Bench)
+    networks, model = kinds.export("sighted")
+    contract = contract_of(model)
+    (camera,) = contracts.of_role(contract, "observation")
+    camera["rendering"] = RENDERING
+    contract["environment"]["id"] = "tiny-bench"
+    for row in model.metadata_props:
+        if row.key == "lads.contract":
+            row.value = json.dumps(contract)
+    path = tmp_path / "sighted.onnx"
+    bundles.save(model, path)
+    return path, networks
+
+
+def test_a_stream_of_frames_draws_and_says_why_not(program):
+    renderer = frames.Renderer(program, "tiny-bench", RENDERING)
+    states = np.random.default_rng(0).uniform(-0.05, 0.05, (3, 5))
+    drawn = [renderer.draw(state) for state in states]
+    assert drawn[0].shape == (12, 16, 3) and not np.array_equal(drawn[0], drawn[1])
+    assert np.array_equal(renderer.draw(states[0]), drawn[0])
+    assert renderer.versions == {"pencil": "2B"}
+    with pytest.raises(config.UserError, match="5 numbers, not of 4"):
+        renderer.draw(states[0, :4])
+    with pytest.raises(config.UserError, match="nothing to see"):
+        renderer.draw(np.zeros(5))
+    with pytest.raises(config.UserError, match="no environment is called 'other'"):
+        frames.Renderer(program, "other", RENDERING)
+    with pytest.raises(config.UserError, match="no-such.*--lads-run"):
+        frames.Renderer(program.with_name("no-such"), "tiny-bench", RENDERING)
+
+
+def test_a_camera_s_policy_comes_back_out_of_its_bundle(sighted):
+    path, networks = sighted
+    model = onnx.load(path)
+    contract = contracts.of(model)
+    trained, loaded = weights.from_lads(networks), weights.from_bundle(model, contract)
+    drawn = torch.from_numpy(np.random.default_rng(1).integers(0, 256, (12, 16, 3), np.uint8))
+    with torch.no_grad():
+        assert (trained.normalizer(drawn) - loaded.normalizer(drawn)).abs().max() < 1e-5
+        assert loaded.normalizer(drawn).shape == (contract["family"]["features"],)
+
+
+def test_a_reference_of_a_camera_keeps_states_and_digests(sighted, program, tmp_path):
+    path, _ = sighted
+    file = tmp_path / "r.json"
+    reference.write(path, file, episodes=2, traced=1, lads_run=program)
+    made = json.loads(file.read_text())
+    assert made["renderer"] == {"pencil": "2B"} and made["float_noise"]["action"] > 0
+    renderer = frames.Renderer(program, "tiny-bench", RENDERING)
+    for instruction in made["instructions"]:
+        for episode in instruction["episodes"]:
+            assert ("trace" in episode) == (episode["episode"] == 0)
+        episode = instruction["episodes"][0]
+        trace, steps = episode["trace"], episode["steps"]
+        assert trace["observations"] == "" and trace["logits"] and "encoded" not in trace
+        read = lambda key, kind, columns: np.frombuffer(base64.b64decode(trace[key]), kind).reshape(steps, columns)
+        for state, digest in zip(read("states", "<f8", 5), read("frames", "u1", frames.DIGEST), strict=True):
+            assert np.array_equal(frames.digest(renderer.draw(state)), digest)
+    # What is recorded is found again, and frames that are drawn otherwise are not taken for it.
+    questions.complete(path, file, lads_run=program)
+    assert json.loads(file.read_text())["instructions"] == made["instructions"]
+    program.write_text(STREAM.replace("2000", "2001"))
+    with pytest.raises(config.UserError, match="step 0: its frame is drawn otherwise here"):
+        questions.complete(path, file, lads_run=program)
+
+
+def test_a_camera_without_a_rendering_is_refused(tmp_path, monkeypatch, program):
+    monkeypatch.setitem(reference.official.ENVIRONMENTS, "tiny-bench", Bench)
+    _, model = kinds.export("sighted")
+    contract = contract_of(model) | {"environment": {"id": "tiny-bench", "version": "1"}}
+    for row in model.metadata_props:
+        if row.key == "lads.contract":
+            row.value = json.dumps(contract)
+    bundles.save(model, tmp_path / "s.onnx")
+    with pytest.raises(config.UserError, match="does not say how its frames are drawn"):
+        reference.write(tmp_path / "s.onnx", tmp_path / "r.json", lads_run=program)

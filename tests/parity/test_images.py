@@ -3,6 +3,7 @@
 Run with `python -m pytest tests/parity` after `cargo build -p lads-cli`; skipped where the program is missing.
 """
 
+import json
 import subprocess
 
 import pytest
@@ -90,6 +91,17 @@ def test_frames_beside_lines(policies, tmp_path):
     refused(policy.run(*options, input=lines), f"{STEPS - 1} to {STEPS} frames")
     refused(policy.run("--images", tmp_path, input=lines), "several cameras", ", ".join(policy.cameras))
     refused(policy.run("--images", "raw", input=lines), "leave no place for other observations")
+
+
+def test_a_paced_step_reads_its_frame(policies):
+    policy = policies["sighted"]
+    bench = [newest("lads"), "bench", "--model", policy.path, "--rate", 80, "--seconds", 1]
+    report = lambda *more: subprocess.run([str(part) for part in (*bench, *more)], capture_output=True, text=True, timeout=120)
+    text = answer(report())
+    assert "80 Hz (a period of 12500.0 us)" in text and "reads a frame (camera 12x16x3)" in text and "not in the times" in text
+    measured = json.loads(answer(report("--json")))
+    assert measured["period_us"] == 12500 and measured["images"] == ["camera 12x16x3"]
+    assert measured["contenders"][0]["latency_us"]["ordinary"]["p50"] > 0
 
 
 def test_bad_frames_are_refused(policies, tmp_path):

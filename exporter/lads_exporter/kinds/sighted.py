@@ -68,11 +68,6 @@ def policy(sizes, seed):
     made = dataclasses.replace(made, config=dataclasses.replace(made.config, images=SEEN), rendering={"size": SIZE})
     networks = Sighted(made, common.WORDS)
     random_policy.randomize(networks, made, seed)
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for module in networks.frames.modules():
-            if isinstance(module, nn.Conv2d):  # so that features keep their size
-                module.weight.copy_(torch.randn(module.weight.shape, generator=generator) * (2 / module.weight[0].numel()) ** 0.5)
     return networks.eval()
 
 

@@ -29,6 +29,10 @@ fn bench_measures_every_kind_of_step() {
         serde_json::from_str(&answer(&[&short[..], &["--json"]].concat(), "")).unwrap();
     let contender = &report["contenders"][0];
     assert_eq!(contender["name"], "lads auto");
+    assert_eq!(
+        (&report["period_us"], &report["images"]),
+        (&500.0.into(), &Value::Array(vec![]))
+    );
     let latency = &contender["latency_us"];
     for kind in ["act", "ordinary", "decision", "instruct"] {
         let [p50, max] = ["p50", "max"].map(|q| latency[kind][q].as_f64().unwrap());

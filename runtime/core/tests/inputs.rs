@@ -79,6 +79,16 @@ fn what_is_given_has_to_be_what_the_contract_says() {
             (action, controller.last_action()),
             ([7.0; 2], &[0.0; 2][..])
         );
+        // Whatever was refused left no trace: the next step is a fresh controller's first.
+        let given: [_; 4] = std::array::from_fn(|i| (ids[i], sound[i]));
+        controller
+            .step_with(&given, &mut action)
+            .expect("it is sound");
+        with_controller(&image, |fresh| {
+            let mut first = [7.0; 2];
+            fresh.step_with(&given, &mut first).expect("it is sound");
+            assert_eq!(first, action);
+        });
         let error = outside(4, 1, 9.0, [-4.0, 4.0]);
         assert_eq!((error.channel(), error.element()), (4, Some(1)));
         assert_eq!((short.channel(), short.element()), (2, None));

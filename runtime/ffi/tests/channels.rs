@@ -138,6 +138,78 @@ fn a_camera_is_described_and_checked() {
     assert_eq!(step(c, &[0.0; 2], &mut action).0, Status::ChannelMissing);
 }
 
+/// Tests that a camera that sends nothing, the same frame again or a bad one leaves everything as a period without a frame does: the
+/// fallback acts, and the next frame is judged as if only time had passed.
+#[test]
+fn a_frame_that_cannot_be_used_is_as_no_frame() {
+    let image = shapes::camera().image();
+    let mut random = Random(4);
+    let [first, next] = [(); 2].map(|()| observe(&image.policy(), &mut random));
+    let [first, next] = [inputs(&first), inputs(&next)];
+    let with = |change: fn(&mut LadsInput)| {
+        let mut list = next.clone();
+        let camera = list.iter_mut().find(|input| input.channel == CAMERA);
+        change(camera.expect("it is an observation"));
+        list
+    };
+    let stride = with(|input| input.row_bytes = 64);
+    let short = with(|input| input.len -= 1);
+    let layout = with(|input| input.dtype = 9);
+    let run = |bad: [(&[LadsInput], u64); 5]| {
+        let mut host = Host::new(image.clone());
+        let c = host.controller();
+        let step = |list: &[LadsInput], timestamp: u64| {
+            let tick = LadsTick {
+                timestamp,
+                ..LadsTick::default()
+            };
+            let (mut action, mut report) = ([7.0_f32; 2], LadsReport::default());
+            let (data, to) = (list.as_ptr(), action.as_mut_ptr());
+            let data = if list.is_empty() {
+                core::ptr::null()
+            } else {
+                data
+            };
+            let tick = &raw const tick;
+            // SAFETY: all of it is alive.
+            let status =
+                unsafe { lads_step_channels(c, data, list.len(), tick, to, 2, &raw mut report) };
+            (status, action)
+        };
+        let before = step(&first, 10);
+        let refused = bad.map(|(list, timestamp)| step(list, timestamp));
+        (before, refused, step(&next, 20))
+    };
+    let none: (&[LadsInput], u64) = (&[], 10);
+    let (before, blind, after) = run([none; 5]);
+    assert_eq!((before.0, after.0), (Status::Ok, Status::Ok));
+    assert!(
+        blind
+            .iter()
+            .all(|&(status, _)| status == Status::NoObservation)
+    );
+    let bad = [
+        none,
+        (&first[..], 10),
+        (&stride[..], 11),
+        (&short[..], 12),
+        (&layout[..], 13),
+    ];
+    let (_, refused, again) = run(bad);
+    assert_eq!(
+        refused.map(|(status, _)| status),
+        [
+            Status::NoObservation,
+            Status::Stale,
+            Status::ChannelRows,
+            Status::ObservationLength,
+            Status::ChannelType
+        ]
+    );
+    assert_eq!(refused.map(|it| it.1), blind.map(|it| it.1));
+    assert_eq!(again, after);
+}
+
 #[test]
 fn values_over_the_action_are_refused() {
     let image = shapes::camera().image();

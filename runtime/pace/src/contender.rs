@@ -4,7 +4,7 @@
 //! or paced, of one kind of work, so that contenders can take turns and a change of the machine's
 //! state affects them all.
 
-use lads_core::Policy;
+use lads_core::{DType, Policy};
 use lads_host::schedule;
 use lads_image::Tables;
 
@@ -135,6 +135,8 @@ pub struct Episode {
     pub recorded: Vec<Computed>,
     /// Limits of each action element.
     pub limits: Vec<(f32, f32)>,
+    /// Names and shapes of the image channels, a frame of each of which every control step reads.
+    pub images: Vec<String>,
 }
 
 impl Episode {
@@ -165,6 +167,14 @@ impl Episode {
             limits: contract
                 .action_limits()
                 .map(|limits| (limits.min, limits.max))
+                .collect(),
+            images: contract
+                .observations()
+                .filter(|channel| channel.dtype() == DType::U8)
+                .map(|channel| {
+                    let sides = channel.shape().iter().map(u32::to_string);
+                    format!("{} {}", channel.name(), sides.collect::<Vec<_>>().join("x"))
+                })
                 .collect(),
         })
     }

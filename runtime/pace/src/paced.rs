@@ -91,6 +91,8 @@ pub struct Report {
     granted: String,
     entrants: Vec<Entrant>,
     absent: Vec<String>,
+    /// Image channels of the policy.
+    images: Vec<String>,
     runs: Vec<Rounds>,
     /// Number of control steps of one part of the episode.
     part: usize,
@@ -148,6 +150,7 @@ fn run(
         granted: granted.to_string(),
         entrants: field.entrants.clone(),
         absent: field.absent.clone(),
+        images: field.episode.images.clone(),
         runs,
         part,
         steps,
@@ -225,6 +228,8 @@ impl Report {
         });
         json!({
             "rate_hz": self.protocol.rate,
+            "period_us": us(self.period_ns()),
+            "images": self.images,
             "seconds": self.protocol.seconds,
             "load_threads": self.protocol.load,
             "granted": self.granted,
@@ -261,9 +266,17 @@ impl Display for Report {
         } = &self.protocol;
         writeln!(
             f,
-            "{rate} Hz, {seconds} s for each contender, {load} load threads, {}",
+            "{rate} Hz (a period of {:.1} us), {seconds} s for each contender, {load} load threads, {}",
+            us(self.period_ns()),
             self.granted
         )?;
+        if !self.images.is_empty() {
+            let images = self.images.join(", ");
+            writeln!(
+                f,
+                "  each control step reads a frame ({images}) that is there when it begins: to draw or capture it is not in the times"
+            )?;
+        }
         for entrant in &self.entrants {
             writeln!(f, "  {:<13} {}", entrant.name, entrant.detail)?;
         }

@@ -16,7 +16,7 @@ use lads_proof::contract::Compared;
 use lads_proof::episode::{Completion, Episode};
 use lads_proof::numbering::Numbering;
 use lads_proof::page::Page;
-use lads_proof::pairs::{Episodes, Paired, Traced};
+use lads_proof::pairs::{Done, Episodes, Paired, Traced};
 use lads_proof::physics::Physics;
 use lads_proof::reference::{Reference, Trace};
 use lads_proof::rounding::Asked;
@@ -122,7 +122,7 @@ pub fn judge(
         used,
         compared,
         answers,
-        physics,
+        (physics, None),
         rollouts,
         about.not_covered,
     );
@@ -407,7 +407,11 @@ fn pairs(
                     episode,
                     steps: seen
                         .zip(trace.actions.chunks_exact(lens[1]))
-                        .map(|(seen, done)| [seen, done])
+                        .map(|(observation, action)| Done {
+                            observation,
+                            shown: None,
+                            action,
+                        })
                         .collect(),
                 })
             })

@@ -212,6 +212,8 @@ fn flight(policy: &Policy, number: u32, episode: Recorded<'_>) -> PyResult<Fligh
             scores: episode.scores[i].clone(),
             controller_ns: episode.controller_ns[i],
             gripper: None,
+            shown: None,
+            pictures: vec![],
         });
     let steps = steps.collect();
     Ok(Flight {

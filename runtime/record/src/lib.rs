@@ -7,6 +7,7 @@
 //! |---|---|---|
 //! | `/episode` | at the start of each | instruction, number, decision rule, outcome |
 //! | `/observation` | every control step | what the policy saw, in the contract's units |
+//! | `/images/NAME` | every control step, for each camera | its frame, as Foxglove's `CompressedImage` in PNG |
 //! | `/action` | every control step | what it answered, and what was executed |
 //! | `/plan` | every control step | plan in force, null of a policy that selects none; whether decided now, margin |
 //! | `/logits` | every decision | the scores, one per plan |
@@ -114,6 +115,26 @@ pub enum LogError {
     /// The file is MCAP, but not a log that [`write()`] makes.
     #[error("it is not a log of lads ({0}); record one with lads-run --log")]
     Foreign(String),
+}
+
+/// Beginning of the topics of cameras, before the channel's name.
+const IMAGES: &str = "/images/";
+
+/// Message of a camera's topic, in the form that Foxglove shows: its schema `foxglove.CompressedImage`.
+#[derive(Debug, Serialize, Deserialize)]
+struct ImageMessage {
+    timestamp: Time,
+    frame_id: String,
+    /// The file in base64.
+    data: String,
+    format: String,
+}
+
+/// Time of a message of Foxglove.
+#[derive(Debug, Serialize, Deserialize)]
+struct Time {
+    sec: u32,
+    nsec: u32,
 }
 
 /// Message of the topic `/episode`.

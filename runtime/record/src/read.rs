@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use mcap::Summary;
 use mcap::read::{MessageStream, metadata};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
@@ -11,10 +13,11 @@ use serde::de::DeserializeOwned;
 use crate::schema::{
     ACTION, COMPLETION, EPISODE, GRIPPER, LOGITS, OBSERVATION, PLAN, TIMING, TOPICS,
 };
-use crate::trace::{Step, Trace};
+use crate::trace::{Picture, Step, Trace};
 use crate::{
-    ActionMessage, CompletionMessage, EpisodeMessage, FORMAT_VERSION, Flight, GripperMessage, Log,
-    LogError, METADATA, Origin, PERIOD, PlanMessage, TimingMessage, Values,
+    ActionMessage, CompletionMessage, EpisodeMessage, FORMAT_VERSION, Flight, GripperMessage,
+    IMAGES, ImageMessage, Log, LogError, METADATA, Origin, PERIOD, PlanMessage, TimingMessage,
+    Values,
 };
 use lads_proof::episode::{Completion, Episode};
 
@@ -31,6 +34,9 @@ pub fn read(path: &Path) -> Result<Log, LogError> {
             .position(|known| known.name == message.channel.topic);
         if let Some(topic) = topic {
             take(topic, &message.data, &mut flights)?;
+        } else if let Some(camera) = message.channel.topic.strip_prefix(IMAGES) {
+            let picture = picture(camera, &message.data)?;
+            last_step(&mut flights)?.pictures.push(picture);
         }
     }
     if flights.len() != episodes {
@@ -154,6 +160,8 @@ fn take(topic: usize, data: &[u8], flights: &mut Vec<Flight>) -> Result<(), LogE
             scores: Vec::new(),
             controller_ns: 0,
             gripper: None,
+            shown: None,
+            pictures: Vec::new(),
         });
         return Ok(());
     }
@@ -190,6 +198,30 @@ fn take(topic: usize, data: &[u8], flights: &mut Vec<Flight>) -> Result<(), LogE
         _ => {}
     }
     Ok(())
+}
+
+fn last_step(flights: &mut [Flight]) -> Result<&mut Step, LogError> {
+    let flight = flights
+        .last_mut()
+        .ok_or_else(|| foreign("a message comes before the first episode"))?;
+    let step = flight.trace.steps.last_mut();
+    step.ok_or_else(|| foreign("a message comes before the first observation"))
+}
+
+fn picture(camera: &str, data: &[u8]) -> Result<Picture, LogError> {
+    let wrong =
+        |wrong: &dyn std::fmt::Display| foreign(format!("a message of {IMAGES}{camera}: {wrong}"));
+    let message: ImageMessage = serde_json::from_slice(data).map_err(|error| wrong(&error))?;
+    if message.format != "png" {
+        return Err(wrong(&format_args!("its format is {}", message.format)));
+    }
+    let png = STANDARD
+        .decode(message.data)
+        .map_err(|error| wrong(&error))?;
+    Ok(Picture {
+        channel: camera.to_owned(),
+        png,
+    })
 }
 
 fn begun(start: EpisodeMessage) -> Result<Flight, LogError> {

@@ -2,6 +2,33 @@
 
 use serde_json::{Value, json};
 
+/// Name of the schema of cameras' messages, by which Foxglove knows them.
+pub const IMAGE: &str = "foxglove.CompressedImage";
+
+/// JSON schema of cameras' messages, the fields of Foxglove's.
+pub fn image_schema() -> String {
+    json!({
+        "title": IMAGE,
+        "description": "What a camera showed the policy.",
+        "type": "object",
+        "properties": {
+            "timestamp": {
+                "type": "object",
+                "title": "time",
+                "properties": {
+                    "sec": {"type": "integer", "minimum": 0},
+                    "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999},
+                },
+                "description": "simulated time",
+            },
+            "frame_id": {"type": "string", "description": "name of the contract's channel"},
+            "data": {"type": "string", "contentEncoding": "base64", "description": "the file"},
+            "format": {"type": "string", "description": "png"},
+        },
+    })
+    .to_string()
+}
+
 /// A topic with the name and the JSON schema of its messages.
 pub struct Topic {
     /// Name of the topic.

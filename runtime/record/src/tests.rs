@@ -6,7 +6,7 @@ use std::path::Path;
 use lads_proof::episode::{Completion, Episode};
 
 use super::*;
-use crate::trace::Step;
+use crate::trace::{Picture, Step};
 
 fn step(number: u32) -> Step {
     let value = number as f32;
@@ -25,6 +25,17 @@ fn step(number: u32) -> Step {
         },
         controller_ns: u64::from(number) * 1000,
         gripper: (number == 1).then_some([0.1, -0.2, 1.0 / 3.0]),
+        shown: None,
+        pictures: ["left", "right eye"]
+            .map(|name| picture(name, number))
+            .into(),
+    }
+}
+
+fn picture(channel: &str, number: u32) -> Picture {
+    Picture {
+        channel: channel.to_owned(),
+        png: vec![0x89, b'P', b'N', b'G', number as u8, 0xff],
     }
 }
 
@@ -91,6 +102,43 @@ fn a_log_reads_back_bit_for_bit() {
         ..log()
     };
     assert_eq!(read_back(&bytes(&empty)).unwrap(), empty);
+}
+
+/// Tests the form that Foxglove shows: its schema's name and fields, a topic for each camera, the time of the control step.
+#[test]
+fn pictures_have_the_form_of_foxglove() {
+    let bytes = bytes(&log());
+    let messages = mcap::MessageStream::new(&bytes).unwrap();
+    let images: Vec<_> = messages
+        .map(Result::unwrap)
+        .filter(|message| message.channel.topic.starts_with("/images/"))
+        .collect();
+    assert_eq!(images.len(), 8);
+    let last = images.last().unwrap();
+    assert_eq!(last.channel.topic, "/images/right eye");
+    let schema = last.channel.schema.as_ref().unwrap();
+    assert_eq!(
+        (schema.name.as_str(), schema.encoding.as_str()),
+        ("foxglove.CompressedImage", "jsonschema")
+    );
+    let described: serde_json::Value = serde_json::from_slice(&schema.data).unwrap();
+    let message: serde_json::Value = serde_json::from_slice(&last.data).unwrap();
+    for (field, value) in message.as_object().unwrap() {
+        let kind = &described["properties"][field]["type"];
+        assert_eq!(
+            kind,
+            if value.is_object() {
+                "object"
+            } else {
+                "string"
+            }
+        );
+    }
+    assert_eq!(message["format"], "png");
+    assert_eq!(message["data"], "iVBORwP/");
+    // The fourth control step of 20 ms.
+    assert_eq!(message["timestamp"]["nsec"], 60_000_000);
+    assert_eq!(last.log_time, 60_000_000);
 }
 
 #[test]

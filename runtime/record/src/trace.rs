@@ -2,9 +2,10 @@
 //! and to film it.
 //!
 //! A trace is kept in memory while episodes run and written afterwards, so that recording cannot slow the control loop down by waiting for
-//! a disk, and an interrupted run leaves nothing half-written. It costs some 0.3 kB per control step.
+//! a disk, and an interrupted run leaves nothing half-written. It costs some 0.3 kB per control step, and what its pictures take.
 
 use lads_proof::episode::Episode;
+use lads_proof::frames::Digest;
 
 /// Record of one control step. Lengths and units are those of the contract.
 #[derive(Debug, Clone, PartialEq)]
@@ -29,6 +30,19 @@ pub struct Step {
     /// Position of the gripper when the observation was taken, in metres, if the environment has
     /// one.
     pub gripper: Option<[f64; 3]>,
+    /// Digest of what the cameras showed; `None` of a policy without, and in a log.
+    pub shown: Option<Digest>,
+    /// What each camera showed, where pictures are kept.
+    pub pictures: Vec<Picture>,
+}
+
+/// Frame of a camera, as it was given to the controller.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Picture {
+    /// Name of the contract's channel.
+    pub channel: String,
+    /// The frame as a PNG file of 8 bits per sample: no pixel is lost.
+    pub png: Vec<u8>,
 }
 
 /// Trace of an episode, with the seeds that reproduce it.

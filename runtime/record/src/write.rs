@@ -1,18 +1,22 @@
 //! Writes episodes to an MCAP file.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufWriter, Seek, Write};
 
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{WriteOptions, Writer};
 use serde::Serialize;
 
 use crate::schema::{
-    ACTION, COMPLETION, EPISODE, GRIPPER, LOGITS, OBSERVATION, PLAN, TIMING, TOPICS,
+    ACTION, COMPLETION, EPISODE, GRIPPER, IMAGE, LOGITS, OBSERVATION, PLAN, TIMING, TOPICS,
+    image_schema,
 };
+use crate::trace::Picture;
 use crate::{
-    ActionMessage, CompletionMessage, EpisodeMessage, FORMAT_VERSION, Flight, GripperMessage, Log,
-    METADATA, Origin, PERIOD, PlanMessage, TimingMessage, Values,
+    ActionMessage, CompletionMessage, EpisodeMessage, FORMAT_VERSION, Flight, GripperMessage,
+    IMAGES, ImageMessage, Log, METADATA, Origin, PERIOD, PlanMessage, Time, TimingMessage, Values,
 };
 
 /// Simulated time between two episodes, in nanoseconds, so that they stay apart on a time axis.
@@ -26,7 +30,10 @@ pub fn write<W: Write + Seek>(log: &Log, to: W) -> mcap::McapResult<()> {
         .library(concat!("lads-record ", env!("CARGO_PKG_VERSION")));
     let mut writer = Writer::with_options(BufWriter::new(to), options)?;
     writer.write_metadata(&metadata(&log.origin, log.flights.len()))?;
-    let mut recorder = Recorder::new(writer, &log.origin)?;
+    let steps = log.flights.iter().flat_map(|flight| &flight.trace.steps);
+    let cameras = steps.flat_map(|step| &step.pictures);
+    let cameras = cameras.map(|picture| picture.channel.as_str()).collect();
+    let mut recorder = Recorder::new(writer, &log.origin, &cameras)?;
     log.flights
         .iter()
         .try_for_each(|flight| recorder.flight(flight))?;
@@ -67,13 +74,19 @@ fn listed(names: &[String]) -> String {
 struct Recorder<W: Write + Seek> {
     writer: Writer<W>,
     channels: Vec<u16>,
+    /// Channels of the cameras, by their names.
+    cameras: BTreeMap<String, u16>,
     time_ns: u64,
     period_ns: u64,
     sequence: u32,
 }
 
 impl<W: Write + Seek> Recorder<W> {
-    fn new(mut writer: Writer<W>, origin: &Origin) -> mcap::McapResult<Self> {
+    fn new(
+        mut writer: Writer<W>,
+        origin: &Origin,
+        cameras: &BTreeSet<&str>,
+    ) -> mcap::McapResult<Self> {
         let mut channels = Vec::with_capacity(TOPICS.len());
         for (index, topic) in TOPICS.iter().enumerate() {
             let schema =
@@ -89,9 +102,17 @@ impl<W: Write + Seek> Recorder<W> {
                 .collect();
             channels.push(writer.add_channel(schema, topic.name, "json", &about)?);
         }
+        let mut images = BTreeMap::new();
+        for &name in cameras {
+            let schema = writer.add_schema(IMAGE, "jsonschema", image_schema().as_bytes())?;
+            let topic = format!("{IMAGES}{name}");
+            let channel = writer.add_channel(schema, &topic, "json", &BTreeMap::new())?;
+            images.insert(name.to_owned(), channel);
+        }
         Ok(Self {
             writer,
             channels,
+            cameras: images,
             time_ns: 0,
             period_ns: (origin.control_period_s * 1e9).round() as u64,
             sequence: 0,
@@ -122,6 +143,9 @@ impl<W: Write + Seek> Recorder<W> {
         for (number, step) in (1..).zip(&trace.steps) {
             let values = step.observation.clone();
             self.message(OBSERVATION, &Values { values })?;
+            for picture in &step.pictures {
+                self.picture(picture)?;
+            }
             let action = ActionMessage {
                 policy: step.action.clone(),
                 executed: step.executed.clone(),
@@ -156,9 +180,30 @@ impl<W: Write + Seek> Recorder<W> {
     }
 
     fn message(&mut self, topic: usize, message: &impl Serialize) -> mcap::McapResult<()> {
+        self.write(self.channels[topic], message)
+    }
+
+    fn picture(&mut self, picture: &Picture) -> mcap::McapResult<()> {
+        let Some(&channel) = self.cameras.get(&picture.channel) else {
+            return Ok(());
+        };
+        let (sec, nsec) = (self.time_ns / 1_000_000_000, self.time_ns % 1_000_000_000);
+        let message = ImageMessage {
+            timestamp: Time {
+                sec: u32::try_from(sec).unwrap_or(u32::MAX),
+                nsec: nsec as u32,
+            },
+            frame_id: picture.channel.clone(),
+            data: STANDARD.encode(&picture.png),
+            format: "png".to_owned(),
+        };
+        self.write(channel, &message)
+    }
+
+    fn write(&mut self, channel_id: u16, message: &impl Serialize) -> mcap::McapResult<()> {
         let data = serde_json::to_vec(message).map_err(std::io::Error::from)?;
         let header = MessageHeader {
-            channel_id: self.channels[topic],
+            channel_id,
             sequence: self.sequence,
             log_time: self.time_ns,
             publish_time: self.time_ns,

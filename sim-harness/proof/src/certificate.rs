@@ -8,10 +8,11 @@
 //!    decisions at other steps, another encoding of a trajectory); if an image with fewer bits than 32 is of a bundle that does so with 32, or is not
 //!    the same policy as with 32 ([`rounding`](super::rounding): of its logits counts what they decide); if the reference's actions lead through other states; or if a test finds a paired
 //!    difference larger than its margin (1 % over all of them together).
-//! 2. **EQUIVALENT** if none of this holds, contract, actions, states and, where the reference decides, logits were compared at all, and every paired difference is
+//! 2. **EQUIVALENT** if none of this holds, contract, actions, states and, where the reference decides, logits were compared at all, every frame of a policy with cameras is the reference's, and every paired difference is
 //!    equivalent: two one-sided tests at 5 %, within 0.05 for rates and 0.1 for the N-rate. Of an image with fewer bits, at least 99 % of the decisions
 //!    are clear; fewer are DIFFERENT only if a binomial test shows it (1 %).
-//! 3. **INCONCLUSIVE** otherwise; then it says how many more episodes of each instruction would decide, at these rates.
+//! 3. **INCONCLUSIVE** otherwise; then it says how many more episodes of each instruction would decide, at these rates. So it is where a frame
+//!    is drawn otherwise than the reference's: the policy was not asked what the reference was ([`frames`](super::frames)).
 //!
 //! A difference that is significant (McNemar's test, 5 % over all rates together) and yet negligible is noted as such: with enough episodes
 //! every difference is significant, and the margin says which ones matter. What was not looked at is listed.
@@ -25,6 +26,7 @@ use serde::Serialize;
 
 use super::answers::Answers;
 use super::contract::{Compared, FieldDifference};
+use super::frames::Frames;
 use super::pairs::Paired;
 use super::physics::Physics;
 use super::rounding::{Asked, Rounding};
@@ -157,6 +159,8 @@ pub struct Certificate {
     pub rounding: Option<Rounding>,
     /// Open-loop comparison of the environment alone.
     pub environment: Physics,
+    /// Comparison of what its cameras show; `None` of a policy without.
+    pub frames: Option<Frames>,
     /// Closed-loop comparison of policy and environment together.
     pub rollouts: Paired,
 }
@@ -168,7 +172,7 @@ impl Certificate {
         reference: ReferenceUsed,
         contract: Compared,
         asked: Asked,
-        environment: Physics,
+        (environment, frames): (Physics, Option<Frames>),
         rollouts: Paired,
         mut not_covered: Vec<String>,
     ) -> Self {
@@ -182,8 +186,10 @@ impl Certificate {
         let mut undecided = undecided(&rollouts);
         let uncompared = uncompared(&contract, &policy, &environment);
         not_covered.extend(unseen(&reference, &policy, rounding.as_ref()));
-        let more_would_help = uncompared.is_empty() && unclear.is_none();
+        let unlike = frames.as_ref().and_then(Frames::undecided);
+        let more_would_help = uncompared.is_empty() && unclear.is_none() && unlike.is_none();
         undecided.extend(uncompared);
+        undecided.extend(unlike.clone());
         undecided.extend(unclear);
         let (verdict, reasons) = if !different.is_empty() {
             (Verdict::Different, different)
@@ -193,7 +199,7 @@ impl Certificate {
                 vec![agreement(
                     &policy,
                     rounding.as_ref(),
-                    &environment,
+                    (&environment, frames.as_ref()),
                     &rollouts,
                 )],
             )
@@ -203,7 +209,11 @@ impl Certificate {
         let more = (verdict == Verdict::Inconclusive && more_would_help)
             .then(|| more_episodes(&rollouts, setting.episodes_per_instruction))
             .flatten();
-        let notes = notes(&reference, &contract, &policy, &rollouts);
+        let mut notes = notes(&reference, &contract, &policy, &rollouts);
+        if verdict == Verdict::Different {
+            // What is shown by other means stands, and this may be why.
+            notes.extend(unlike);
+        }
         Self {
             format: FORMAT,
             format_version: FORMAT_VERSION,
@@ -219,6 +229,7 @@ impl Certificate {
             exact,
             rounding,
             environment,
+            frames,
             rollouts,
         }
     }
@@ -401,9 +412,12 @@ fn undecided(rollouts: &Paired) -> Vec<String> {
 fn agreement(
     policy: &Answers,
     rounding: Option<&Rounding>,
-    environment: &Physics,
+    (environment, frames): (&Physics, Option<&Frames>),
     rollouts: &Paired,
 ) -> String {
+    let frames = frames.map_or(String::new(), |it| {
+        format!(", the same bytes in {} frames", it.steps)
+    });
     let physics = if environment.identical_bits {
         "the same bits".to_owned()
     } else {
@@ -419,7 +433,7 @@ fn agreement(
             )
         });
     format!(
-        "logits within {:.1e} over {} decisions{clear}, actions within {:.1e} over {} steps, states {physics} over {} states, {:.1} % of {} episodes with identical completions",
+        "logits within {:.1e} over {} decisions{clear}, actions within {:.1e} over {} steps, states {physics} over {} states{frames}, {:.1} % of {} episodes with identical completions",
         policy.largest_logit_difference,
         policy.compared_decisions,
         policy.largest_action_difference,

@@ -11,6 +11,7 @@ pub mod certificate;
 pub mod contract;
 pub mod episode;
 pub mod faults;
+pub mod frames;
 pub mod metrics;
 pub mod numbering;
 pub mod page;

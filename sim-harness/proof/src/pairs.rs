@@ -6,6 +6,7 @@
 
 use serde::Serialize;
 
+use super::frames::Digest;
 use super::numbering::Numbering;
 use super::reference::Reference;
 use super::statistics::{Counts, Difference, Pairs};
@@ -135,8 +136,19 @@ pub struct Traced<'r> {
     pub instruction: usize,
     /// Number of the episode.
     pub episode: usize,
-    /// Observation and action of each control step.
-    pub steps: Vec<[&'r [f32]; 2]>,
+    /// What the policy was given and did at each control step.
+    pub steps: Vec<Done<'r>>,
+}
+
+/// A control step of a traced episode.
+#[derive(Debug, Clone, Copy)]
+pub struct Done<'r> {
+    /// Observed vector; empty of a policy that sees by cameras alone.
+    pub observation: &'r [f32],
+    /// Digest of what the cameras showed; `None` of a policy without.
+    pub shown: Option<Digest>,
+    /// Action of the policy.
+    pub action: &'r [f32],
 }
 
 /// Plans of the reference in the run's numbers, and the control steps at which they were decided.
@@ -213,11 +225,10 @@ impl Sum {
     /// Compares actions for as long as both trajectories are the same.
     fn follow(
         &mut self,
-        ours: &[[&[f32]; 2]],
+        ours: &[Done<'_>],
         theirs: &super::reference::Trace,
         [observation_len, action_len]: [usize; 2],
     ) {
-        let seen = theirs.observations.chunks_exact(observation_len);
         let done = theirs.actions.chunks_exact(action_len);
         self.agreeing_steps[1] += done.len();
         let largest = |a: &[f32], b: &[f32]| {
@@ -226,13 +237,17 @@ impl Sum {
                 .map(|(a, b)| f64::from((a - b).abs()))
                 .fold(0.0, f64::max)
         };
-        for ([observation, action], (seen, done)) in ours.iter().zip(seen.zip(done)) {
-            if largest(observation, seen) > TRAJECTORY_TOLERANCE {
+        for (number, (ours, done)) in ours.iter().zip(done).enumerate() {
+            let seen = theirs.observations.get(number * observation_len..);
+            let apart = largest(ours.observation, seen.unwrap_or_default());
+            let shown = ours.shown.as_ref();
+            if apart > TRAJECTORY_TOLERANCE || shown != theirs.frames.get(number) {
                 return;
             }
             self.agreeing_steps[0] += 1;
-            self.largest_action_difference =
-                self.largest_action_difference.max(largest(action, done));
+            self.largest_action_difference = self
+                .largest_action_difference
+                .max(largest(ours.action, done));
         }
     }
 

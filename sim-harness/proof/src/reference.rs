@@ -1,7 +1,7 @@
 //! Reads and checks reference rollouts, which `lads_exporter reference` writes.
 //!
 //! Invariants of a [`Reference`] that was read: every instruction has the same number of episodes, numbered from 0, at least one of them
-//! traced; every trace holds as many observations, actions and states as its lengths say. What can fail: no such file, another format or
+//! traced; every trace holds as many observations or frames, actions and states as its lengths say. What can fail: no such file, another format or
 //! version of it, numbers that contradict each other. Whether it is of *this* policy and environment is [`Reference::check`]'s to say,
 //! by name.
 
@@ -13,6 +13,7 @@ use serde::Deserialize;
 use serde_json::Value;
 use thiserror::Error;
 
+use super::frames::{DIGEST_LEN, Digest};
 use super::purpose;
 
 /// Value of the JSON's `format`.
@@ -88,6 +89,9 @@ pub struct Reference {
     pub float_noise: Option<FloatNoise>,
     /// Versions of everything that took part.
     pub versions: std::collections::BTreeMap<String, String>,
+    /// Versions of what drew the frames, by name; none of a policy without cameras.
+    #[serde(default)]
+    pub renderer: std::collections::BTreeMap<String, String>,
     /// Instructions with their episodes, in the contract's order.
     pub instructions: Vec<Instruction>,
     #[serde(skip)]
@@ -158,11 +162,13 @@ pub struct Completion {
 #[derive(Debug, Deserialize)]
 #[serde(try_from = "Written")]
 pub struct Trace {
-    /// Observations of the policy, `[steps, O]`.
+    /// Observations of the policy, `[steps, O]`; empty of one that sees by cameras alone.
     pub observations: Vec<f32>,
+    /// Digest of what the cameras showed at each step; empty of a policy without.
+    pub frames: Vec<Digest>,
     /// Actions of the policy, `[steps, A]`.
     pub actions: Vec<f32>,
-    /// Noise-free states before the first steps' actions, `[n, O]`.
+    /// Noise-free states before the first steps' actions, `[n, S]`; of a policy with cameras, whose frames are drawn of them, all steps'.
     pub states: Vec<f64>,
     /// Logits of each decision, `[decisions, M]`; empty where none were recorded.
     pub logits: Vec<f32>,
@@ -175,6 +181,8 @@ pub struct Trace {
 #[derive(Deserialize)]
 struct Written {
     observations: String,
+    #[serde(default)]
+    frames: String,
     actions: String,
     states: String,
     #[serde(default)]
@@ -193,12 +201,35 @@ impl Trace {
     }
 }
 
+impl Trace {
+    /// Refuses other lengths than those of an episode of `steps` control steps.
+    fn check(&self, steps: usize, subject: &Subject<'_>) -> Result<(), &'static str> {
+        if self.frames.is_empty() == (subject.sees && steps > 0) {
+            return Err(if subject.sees {
+                "its traces hold no frames, and the policy has cameras"
+            } else {
+                "its traces hold frames, and the policy has no camera"
+            });
+        }
+        let frames = if subject.sees { steps } else { 0 };
+        let states = self.states.len() / subject.state_len.max(1);
+        let fits = self.observations.len() == steps * subject.observation_len
+            && self.actions.len() == steps * subject.action_len
+            && self.frames.len() == frames
+            && self.states.len() == states * subject.state_len
+            && (states >= frames && (states == 0) == (steps == 0));
+        let wrong = "the lengths of a trace are not those of the environment";
+        fits.then_some(()).ok_or(wrong)
+    }
+}
+
 impl TryFrom<Written> for Trace {
     type Error = String;
 
     fn try_from(written: Written) -> Result<Self, String> {
         Ok(Self {
             observations: numbers(&written.observations, f32::from_le_bytes)?,
+            frames: numbers::<_, DIGEST_LEN>(&written.frames, |digest| digest)?,
             actions: numbers(&written.actions, f32::from_le_bytes)?,
             states: numbers(&written.states, f64::from_le_bytes)?,
             logits: numbers(&written.logits, f32::from_le_bytes)?,
@@ -231,8 +262,12 @@ pub struct Subject<'s> {
     pub environment_id: &'s str,
     /// Version of the environment.
     pub environment_version: &'s str,
-    /// Number of elements of an observation.
+    /// Number of elements of the environment's noise-free state.
+    pub state_len: usize,
+    /// Number of elements of the observed vector; 0 of a policy that sees by cameras alone.
     pub observation_len: usize,
+    /// Whether the policy has cameras.
+    pub sees: bool,
     /// Number of elements of an action.
     pub action_len: usize,
 }
@@ -369,26 +404,18 @@ impl Reference {
         };
         let purpose = purpose::sha256(&contract).unwrap_or_default();
         same("contract hash", &self.purpose_sha256, whose, &purpose)?;
-        let lens = (subject.observation_len, subject.action_len);
+        let content = |problem: &str| ReferenceError::Content {
+            path: self.path.clone(),
+            problem: problem.to_owned(),
+        };
         for episode in self.instructions.iter().flat_map(|row| &row.episodes) {
-            if episode.final_state.len() != lens.0 {
-                return Err(ReferenceError::Content {
-                    path: self.path.clone(),
-                    problem: "the length of a final state is not the environment's".to_owned(),
-                });
+            if episode.final_state.len() != subject.state_len {
+                return Err(content(
+                    "the length of a final state is not the environment's",
+                ));
             }
-            let Some(trace) = &episode.trace else {
-                continue;
-            };
-            if trace.observations.len() != episode.steps * lens.0
-                || trace.actions.len() != episode.steps * lens.1
-                || !trace.states.len().is_multiple_of(lens.0)
-                || trace.states.is_empty() != (episode.steps == 0)
-            {
-                return Err(ReferenceError::Content {
-                    path: self.path.clone(),
-                    problem: "the lengths of a trace are not those of the environment".to_owned(),
-                });
+            if let Some(trace) = &episode.trace {
+                trace.check(episode.steps, subject).map_err(content)?;
             }
         }
         Ok(())

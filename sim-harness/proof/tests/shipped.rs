@@ -30,7 +30,9 @@ fn shipped_references_are_whole() {
                 .collect(),
             environment_id: environment,
             environment_version: "1",
+            state_len: lens[0],
             observation_len: lens[0],
+            sees: false,
             action_len: lens[1],
         };
         reference.check(&subject).unwrap();

@@ -18,7 +18,7 @@ use crate::faults::Faults;
 use crate::plans::PlanBook;
 use crate::random::Stream;
 use crate::results::{self, Asked};
-use crate::rollout::{Actor, Driver, Episode, Observer, RolloutError, Task, Timing};
+use crate::rollout::{Actor, Driver, Episode, Observer, Pictures, RolloutError, Task, Timing};
 use crate::sight::{Sight, SightError};
 use crate::spoken::WordBook;
 use crate::trace::Trace;
@@ -54,6 +54,8 @@ pub struct Setup<'e> {
     pub stop_where_refused: bool,
     /// Number of each instruction's episodes, from the first, that keep every control step.
     pub traced: u32,
+    /// Which of these steps keep what the cameras showed.
+    pub pictures: Pictures,
     /// Observer of the policy's episodes.
     pub observer: Option<&'e dyn Observer>,
 }
@@ -94,6 +96,11 @@ pub enum EvaluationError {
     /// The policy's cameras cannot be drawn.
     #[error(transparent)]
     Sight(SightError),
+    /// Drawn frames cannot be kept.
+    #[error(
+        "frames cannot be kept in a temporary file: {0}; make room, or name another folder with TMPDIR"
+    )]
+    Frames(std::io::Error),
     /// An episode could not be finished.
     #[error("episode {episode} of instruction {instruction}: {source}")]
     Rollout {
@@ -246,7 +253,7 @@ impl Evaluation<'_> {
         let sight = sight.map_err(EvaluationError::Sight)?;
         let mut driver = Driver::new(controller, environment.as_mut(), sight);
         if self.setup.traced > 0 {
-            driver.record();
+            driver.record(self.setup.pictures);
         }
         driver.set_observer(self.setup.observer);
         let (mut episodes, mut refused_at) = (Vec::new(), Vec::new());

@@ -106,6 +106,18 @@ pub trait Observer: std::fmt::Debug + Sync {
     fn observe(&self, snapshot: Snapshot<'_>) -> Control;
 }
 
+/// Control steps of a recorded episode that keep what the cameras showed, as files.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Pictures {
+    /// None of them.
+    #[default]
+    None,
+    /// The first, and those that decide a plan.
+    Decisions,
+    /// All of them.
+    All,
+}
+
 /// Source of the actions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Actor {
@@ -183,6 +195,8 @@ pub struct Driver<'a, 'm, 'e> {
     plans: Vec<u32>,
     /// Control steps of the episode, if they are recorded.
     recording: Option<Vec<Step>>,
+    /// Which of them keep what the cameras showed.
+    pictures: Pictures,
     observer: Option<&'e dyn Observer>,
     /// Durations measured so far.
     pub timing: Timing,
@@ -215,14 +229,16 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             limits,
             plans: Vec::new(),
             recording: None,
+            pictures: Pictures::default(),
             observer: None,
             timing: Timing::default(),
         }
     }
 
     /// Records the control steps of the episodes that follow, for [`take_recording`](Self::take_recording).
-    pub fn record(&mut self) {
+    pub fn record(&mut self, pictures: Pictures) {
         self.recording = Some(Vec::new());
+        self.pictures = pictures;
     }
 
     /// Takes the recorded control steps of the last episode; empty unless [`record`](Self::record) was called.
@@ -296,7 +312,7 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
                     }
                     let before_cpu = cpu_time();
                     link.actuate(&self.action, &mut self.executed);
-                    self.keep(selected, elapsed_ns, task.plans.is_some());
+                    self.keep(step, (selected, elapsed_ns), task.plans.is_some())?;
                     self.execute(step)?;
                     self.timing.simulator_cpu += cpu_since(before_cpu);
                 }
@@ -417,11 +433,22 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
     }
 
     /// Records the control step, if steps are recorded.
-    fn keep(&mut self, selected: Option<Selected>, controller_ns: u64, commanded: bool) {
+    fn keep(
+        &mut self,
+        step: usize,
+        (selected, controller_ns): (Option<Selected>, u64),
+        commanded: bool,
+    ) -> Result<(), RolloutError> {
         let Some(recording) = &mut self.recording else {
-            return;
+            return Ok(());
         };
         let decided = selected.is_some_and(|selected| selected.fresh);
+        let pictures = match self.pictures {
+            Pictures::All => self.sight.pictures(),
+            Pictures::Decisions if decided || step == 0 => self.sight.pictures(),
+            Pictures::Decisions | Pictures::None => Ok(Vec::new()),
+        };
+        let pictures = pictures.map_err(|error| RolloutError::Sight { step, error })?;
         let scores = if decided && !commanded {
             self.controller.scores()
         } else {
@@ -440,7 +467,10 @@ impl<'a, 'm, 'e> Driver<'a, 'm, 'e> {
             scores: scores.to_vec(),
             controller_ns,
             gripper: self.environment.gripper(),
+            shown: self.sight.digest(),
+            pictures,
         });
+        Ok(())
     }
 }
 

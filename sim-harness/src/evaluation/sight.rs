@@ -7,10 +7,12 @@
 use lads_compiler::Contract;
 use lads_compiler::contract::{Channel, DType};
 use lads_core::{ChannelId, Data, Policy};
+use lads_proof::frames::{self, Digest};
 use thiserror::Error;
 
 use crate::environment::Environment;
 use crate::frames::Rendering;
+use crate::trace::Picture;
 
 /// Reason why a policy cannot be shown frames.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
@@ -69,9 +71,23 @@ pub fn is_image(channel: &Channel) -> bool {
 /// The cameras of a policy with what they show now.
 #[derive(Default)]
 pub struct Sight {
-    shown: Vec<(ChannelId, Vec<u8>)>,
+    shown: Vec<Shown>,
     #[cfg(feature = "camera")]
     frames: Vec<crate::frames::Frames>,
+}
+
+/// What a camera shows now.
+#[cfg_attr(
+    not(feature = "camera"),
+    expect(dead_code, reason = "nothing is drawn")
+)]
+struct Shown {
+    id: ChannelId,
+    /// Name of the channel.
+    name: String,
+    /// Rows and columns.
+    size: [u32; 2],
+    frame: Vec<u8>,
 }
 
 impl Sight {
@@ -88,7 +104,7 @@ impl Sight {
                 channel: channel.name.clone(),
                 wrong: "the image has no such channel".into(),
             })?;
-            sight.add(id, environment, &rendering)?;
+            sight.add((id, &channel.name), environment, &rendering)?;
         }
         Ok(sight)
     }
@@ -96,27 +112,37 @@ impl Sight {
     #[cfg(feature = "camera")]
     fn add(
         &mut self,
-        id: ChannelId,
+        (id, name): (ChannelId, &str),
         environment: &dyn Environment,
         rendering: &Rendering,
     ) -> Result<(), SightError> {
         let frames = crate::frames::Frames::new(environment, rendering);
         self.frames
             .push(frames.map_err(|error| SightError::Draw(error.to_string()))?);
-        self.shown.push((id, vec![0; rendering.frame_len()]));
+        self.shown.push(Shown {
+            id,
+            name: name.to_owned(),
+            size: rendering.size,
+            frame: vec![0; rendering.frame_len()],
+        });
         Ok(())
     }
 
     #[cfg(not(feature = "camera"))]
     #[expect(clippy::unused_self, reason = "nothing can be added")]
-    fn add(&mut self, _: ChannelId, _: &dyn Environment, _: &Rendering) -> Result<(), SightError> {
+    fn add(
+        &mut self,
+        _: (ChannelId, &str),
+        _: &dyn Environment,
+        _: &Rendering,
+    ) -> Result<(), SightError> {
         Err(SightError::NoCamera)
     }
 
     /// Looks at a state of the scene.
     #[cfg(feature = "camera")]
     pub fn look(&mut self, positions: &[f64]) -> Result<(), SightError> {
-        for ((_, shown), frames) in self.shown.iter_mut().zip(&mut self.frames) {
+        for (Shown { frame: shown, .. }, frames) in self.shown.iter_mut().zip(&mut self.frames) {
             let frame = frames.draw(positions);
             let frame = frame.map_err(|error| SightError::Draw(error.to_string()))?;
             if frame.len() != shown.len() {
@@ -138,8 +164,36 @@ impl Sight {
         Ok(())
     }
 
-    /// Returns the frames that the cameras show, by channel.
+    /// Returns the frames that the cameras show, by channel, in the contract's order; none without cameras.
+    pub fn shown(&self) -> impl Iterator<Item = (ChannelId, &[u8])> {
+        self.shown.iter().map(|it| (it.id, it.frame.as_slice()))
+    }
+
+    /// Returns the frames as a control step takes them.
     pub fn given(&self) -> impl Iterator<Item = (ChannelId, Data<'_>)> {
-        self.shown.iter().map(|(id, shown)| (*id, Data::U8(shown)))
+        self.shown().map(|(id, shown)| (id, Data::U8(shown)))
+    }
+
+    /// Returns the frames as PNG files.
+    #[cfg(feature = "camera")]
+    pub fn pictures(&self) -> Result<Vec<Picture>, SightError> {
+        let picture = |it: &Shown| {
+            let png = crate::frames::png::encode(&it.frame, it.size).map_err(SightError::Draw)?;
+            let channel = it.name.clone();
+            Ok(Picture { channel, png })
+        };
+        self.shown.iter().map(picture).collect()
+    }
+
+    /// Returns no files: there is no camera.
+    #[cfg(not(feature = "camera"))]
+    pub fn pictures(&self) -> Result<Vec<Picture>, SightError> {
+        Ok(Vec::new())
+    }
+
+    /// Returns the digest of the frames; `None` without cameras.
+    pub fn digest(&self) -> Option<Digest> {
+        let any = !self.shown.is_empty();
+        any.then(|| frames::digest(self.shown().map(|(_, shown)| shown)))
     }
 }

@@ -194,16 +194,9 @@ pub fn shown_s(period_s: f64) -> f64 {
 
 /// Encodes a picture as PNG.
 pub fn png(canvas: &Canvas) -> Result<Vec<u8>, FilmError> {
-    let mut bytes = Vec::new();
     let [width, height] = canvas.size();
-    let mut encoder = png::Encoder::new(&mut bytes, width, height);
-    encoder.set_color(png::ColorType::Rgb);
-    encoder.set_depth(png::BitDepth::Eight);
-    let written = encoder
-        .write_header()
-        .and_then(|mut writer| writer.write_image_data(canvas.rgb()));
-    written.map_err(|error| FilmError::Draw(error.to_string()))?;
-    Ok(bytes)
+    let file = crate::frames::png::encode(canvas.rgb(), [height, width]);
+    file.map_err(FilmError::Draw)
 }
 
 #[cfg(test)]

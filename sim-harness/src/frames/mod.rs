@@ -2,7 +2,8 @@
 //!
 //! A frame is a function of the simulator's positions alone, so states are stored and frames are made of them, in a scene of their own that
 //! nothing else reads or moves. [`Rendering`] is everything that a frame depends on besides; a bundle's image channel and a cache of frames
-//! carry it. [`thin`] takes detail out of meshes that no pixel shows, [`cache`] makes the frames of a dataset. What can fail: a
+//! carry it. [`thin`] takes detail out of meshes that no pixel shows, [`cache`] makes the frames of a dataset, [`stream`]
+//! those of states as they come. What can fail: a
 //! machine without EGL, a camera or body that the scene does not have, another number of positions.
 
 #[cfg(feature = "camera")]
@@ -10,7 +11,11 @@ pub mod cache;
 #[cfg(feature = "camera")]
 mod draw;
 #[cfg(feature = "camera")]
+pub mod png;
+#[cfg(feature = "camera")]
 mod squeeze;
+#[cfg(feature = "camera")]
+pub mod stream;
 pub mod thin;
 
 use serde::{Deserialize, Serialize};

@@ -1,12 +1,12 @@
 //! Replays recorded episodes: the same observations through a policy, and its actions and plans compared with the recorded ones.
 //!
 //! Equal means bit for bit: the runtime promises the same bits on every target, so any difference is another policy, another runtime or a
-//! damaged log. What can fail: a log of a policy with other sizes, an instruction that this policy does not know, an observation that it
-//! refuses.
+//! damaged log. What can fail: a log of a policy with other sizes or without its frames, an instruction that this policy does not know, an
+//! observation that it refuses.
 
 use lads_core::{
-    Channel, Contract, DType, Data, Decision, FollowError, Instruction, InstructionError, Isa,
-    Noise, Policy, StepError,
+    Channel, ChannelId, Contract, DType, Data, Decision, FollowError, Instruction,
+    InstructionError, Isa, Noise, Policy, StepError,
 };
 use lads_host::{Memory, MemoryError};
 use thiserror::Error;
@@ -27,9 +27,32 @@ pub enum ReplayError {
         /// The value in the policy.
         policy: String,
     },
-    /// A log has no frames.
-    #[error("the policy sees images, which a log does not hold")]
-    Images,
+    /// A log holds no frame of a camera.
+    #[error(
+        "{episode}: control step {step} has no frame of camera {camera}; record it again with --log"
+    )]
+    NoFrame {
+        /// Name of the episode.
+        episode: String,
+        /// Control step, from 0.
+        step: usize,
+        /// Name of the channel.
+        camera: String,
+    },
+    /// A log's frame cannot be read.
+    #[error(
+        "{episode}: the frame of camera {camera} at control step {step} cannot be read: {wrong}"
+    )]
+    Frame {
+        /// Name of the episode.
+        episode: String,
+        /// Control step, from 0.
+        step: usize,
+        /// Name of the channel.
+        camera: String,
+        /// What is wrong.
+        wrong: String,
+    },
     /// The policy does not know a recorded instruction.
     #[error("the policy does not know the recorded instruction '{0}'")]
     Instruction(String),
@@ -102,7 +125,6 @@ pub fn replay(
     let mut controller = memory
         .controller_with(policy, isa)
         .map_err(ReplayError::Memory)?;
-    let channel = contract.observation().id();
     let mut replayed = Replayed::default();
     let mut action = vec![0.0; contract.action_len()];
     for flight in &log.flights {
@@ -122,8 +144,9 @@ pub fn replay(
         let episode = || format!("{} episode {}", flight.instruction_id, flight.trace.episode);
         let mut first = None;
         for (number, step) in flight.trace.steps.iter().enumerate() {
+            let images = images(contract, step).map_err(|wrong| wrong.at(episode(), number))?;
+            let seen = seen(contract, step, &images);
             let plan = if let Some(plan) = step.plan.filter(|_| flight.trace.commanded) {
-                let seen = [(channel, Data::F32(&step.observation))];
                 let acted = controller.follow(&seen, plan, &mut action);
                 acted.map_err(|error| ReplayError::Follow {
                     episode: episode(),
@@ -132,7 +155,7 @@ pub fn replay(
                 })?;
                 Some(plan)
             } else {
-                let stepped = controller.step(&step.observation, &mut action);
+                let stepped = controller.step_with(&seen, &mut action);
                 let report = stepped.map_err(|error| ReplayError::Step {
                     episode: episode(),
                     step: number,
@@ -152,6 +175,79 @@ pub fn replay(
     Ok(replayed)
 }
 
+/// What is wrong with a step's frames.
+struct BadFrame {
+    camera: String,
+    /// `None` where there is no frame.
+    wrong: Option<String>,
+}
+
+impl BadFrame {
+    fn at(self, episode: String, step: usize) -> ReplayError {
+        let camera = self.camera;
+        match self.wrong {
+            None => ReplayError::NoFrame {
+                episode,
+                step,
+                camera,
+            },
+            Some(wrong) => ReplayError::Frame {
+                episode,
+                step,
+                camera,
+                wrong,
+            },
+        }
+    }
+}
+
+/// Frames of the cameras at a control step, in the contract's order.
+fn images(contract: &Contract<'_>, step: &Step) -> Result<Vec<(ChannelId, Vec<u8>)>, BadFrame> {
+    let cameras = contract
+        .observations()
+        .filter(|channel| channel.dtype() == DType::U8);
+    cameras
+        .map(|camera| {
+            let bad = |wrong| BadFrame {
+                camera: camera.name().to_owned(),
+                wrong,
+            };
+            let mut pictures = step.pictures.iter();
+            let picture = pictures.find(|picture| picture.channel == camera.name());
+            let picture = picture.ok_or_else(|| bad(None))?;
+            let frame = pixels(&picture.png).map_err(|wrong| bad(Some(wrong)))?;
+            if frame.len() != camera.len() {
+                let (got, wanted) = (frame.len(), camera.len());
+                return Err(bad(Some(format!("{got} bytes instead of {wanted}"))));
+            }
+            Ok((camera.id(), frame))
+        })
+        .collect()
+}
+
+#[cfg(feature = "camera")]
+fn pixels(png: &[u8]) -> Result<Vec<u8>, String> {
+    crate::frames::png::decode(png).map(|(pixels, _)| pixels)
+}
+
+#[cfg(not(feature = "camera"))]
+fn pixels(_: &[u8]) -> Result<Vec<u8>, String> {
+    Err("this program was built without cameras; build it with --features camera".to_owned())
+}
+
+/// What the controller was given at a control step.
+fn seen<'s>(
+    contract: &Contract<'_>,
+    step: &'s Step,
+    images: &'s [(ChannelId, Vec<u8>)],
+) -> Vec<(ChannelId, Data<'s>)> {
+    let mut vectors = contract.observations();
+    let vector = vectors.find(|channel| channel.dtype() == DType::F32);
+    let vector = vector.map(|channel| (channel.id(), Data::F32(&step.observation)));
+    let images = images.iter().map(|(id, frame)| (*id, Data::U8(frame)));
+    vector.into_iter().chain(images).collect()
+}
+
 fn fits(contract: &Contract<'_>, period: Option<usize>, log: &Log) -> Result<(), ReplayError> {
     let origin = &log.origin;
     let sizes = |what, log: String, policy: String| {
@@ -160,9 +256,6 @@ fn fits(contract: &Contract<'_>, period: Option<usize>, log: &Log) -> Result<(),
         }
         Err(ReplayError::Sizes { what, log, policy })
     };
-    if contract.observations().any(|it| it.dtype() != DType::F32) {
-        return Err(ReplayError::Images);
-    }
     elements(
         "observation",
         &origin.observation_names,

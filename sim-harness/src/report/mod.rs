@@ -1,6 +1,6 @@
 //! Renders `--report`: one self-contained HTML file about what a policy did, with nothing to fetch.
 //!
-//! The charts are SVG inside the page, film strips are JPEG inside it. Everything comes from the results and the traces; an episode's trace is needed for all but the success
+//! The charts are SVG inside the page, film strips are JPEG and the policy's own frames PNG inside it. Everything comes from the results and the traces; an episode's trace is needed for all but the success
 //! table and the K-rates. What can fail: the template, which is compiled in.
 
 mod charts;
@@ -107,6 +107,12 @@ struct Film<'r> {
     stills: Vec<(&'r str, String)>,
 }
 
+/// What the cameras showed in an episode: caption and file of each frame, as text.
+struct Sight {
+    title: String,
+    frames: Vec<(String, String)>,
+}
+
 #[derive(Template)]
 #[template(path = "report.html")]
 struct Page<'r> {
@@ -117,6 +123,8 @@ struct Page<'r> {
     figures: Vec<Figure>,
     films: Vec<Film<'r>>,
     no_films: &'r str,
+    /// None for a policy without cameras.
+    sights: Vec<Sight>,
     /// Why the intervals of single instructions are wide, where they are.
     few: Option<Few>,
 }
@@ -147,6 +155,7 @@ impl Report<'_> {
             figures: self.figures(),
             films: self.films(),
             no_films: self.strips.as_ref().err().map_or("", String::as_str),
+            sights: self.sights(),
             few: self.few(),
         };
         page.render()
@@ -202,6 +211,31 @@ impl Report<'_> {
                     .collect(),
             })
             .collect()
+    }
+
+    fn sights(&self) -> Vec<Sight> {
+        let sight = |trace: &Trace| Sight {
+            title: title(self.contract, trace),
+            frames: (0..)
+                .zip(&trace.steps)
+                .flat_map(|(number, step)| {
+                    let pictures = step
+                        .pictures
+                        .iter()
+                        .filter(move |_| number == 0 || step.decided);
+                    pictures.map(move |picture| {
+                        let plan = step
+                            .plan
+                            .map_or(String::new(), |plan| format!(", plan {plan}"));
+                        let caption = format!("{}, step {number}{plan}", picture.channel);
+                        (caption, STANDARD.encode(&picture.png))
+                    })
+                })
+                .collect(),
+        };
+        let mut sights: Vec<_> = chosen(self.traces).into_iter().map(sight).collect();
+        sights.retain(|sight| !sight.frames.is_empty());
+        sights
     }
 
     fn figures(&self) -> Vec<Figure> {

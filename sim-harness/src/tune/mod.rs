@@ -18,6 +18,7 @@ use lads_proof::rounding::{Allowed, Rounding};
 
 use crate::evaluate::{Assignment, EvaluationError};
 use crate::verify::policy::{self, Questions};
+use crate::verify::shown::Shown;
 use groups::Groups;
 use search::{Found, Parts, search};
 
@@ -51,6 +52,8 @@ pub struct Tuning<'t> {
     pub reference: &'t Reference,
     /// Instructions whose episodes are asked about.
     pub assignments: &'t [Assignment],
+    /// What the cameras show in its traced episodes; `None` for a policy without.
+    pub shown: Option<&'t Shown>,
     /// Instruction set that the kernels run on; the answers have the same bits on all.
     pub isa: Isa,
 }
@@ -151,6 +154,7 @@ impl Tuning<'_> {
             reference: self.reference,
             assignments: self.assignments,
             episodes: self.reference.traced_episodes,
+            shown: self.shown,
         };
         // The likeliest index, whatever the contract's rule: margins say nothing of a draw.
         let how = (self.isa, Decision::Argmax);

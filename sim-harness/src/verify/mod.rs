@@ -1,13 +1,14 @@
 //! Verifies that an exported policy is the policy that was trained: the reference's questions, its actions and its episodes, run again.
 //!
 //! Three comparisons, each of which can fail where the others cannot see: the policy alone ([`policy`]: open loop on the reference's
-//! observations), the environment alone ([`physics`]: open loop on the reference's actions), and both together ([`lads_proof::pairs`]: the reference's
+//! observations, or on frames drawn of its states, see [`shown`]), the environment alone ([`physics`]: open loop on the reference's actions), and both together ([`lads_proof::pairs`]: the reference's
 //! episodes in closed loop). [`certificate`] has the rules of the verdict. What can fail: a reference that cannot be read or is of something
 //! else ([`mod@reference`]), an episode that cannot be finished.
 
 pub mod contract;
 pub mod physics;
 pub mod policy;
+pub mod shown;
 
 pub use lads_proof::{certificate, page, reference};
 
@@ -15,18 +16,21 @@ use std::collections::BTreeMap;
 use std::sync::atomic::AtomicBool;
 
 use lads_compiler::Bundle;
+use lads_core::DType;
 use lads_proof::answers::Answers;
 use lads_proof::contract::Compared;
 use lads_proof::numbering::Numbering;
-use lads_proof::pairs::{Episodes, Paired, Traced};
+use lads_proof::pairs::{Done, Episodes, Paired, Traced};
 use lads_proof::reference::Subject;
 
 use crate::environment::Environment;
 use crate::evaluate::{Evaluated, Evaluation, EvaluationError};
 use crate::registry::Opener;
+use crate::sight;
 use certificate::{Certificate, ReferenceUsed, Setting};
 use policy::Questions;
 use reference::Reference;
+use shown::Shown;
 
 /// Number of calls that [`run`] makes to `finished`: both open-loop comparisons replay the traced episodes, one of them twice if the image has fewer bits than
 /// 32, then all run in closed loop.
@@ -48,14 +52,21 @@ pub fn run(
 ) -> Result<Certificate, EvaluationError> {
     let contract = evaluation.policy.contract();
     let traced = evaluation.setup.traced;
+    let mut environment = open();
+    let shown = Shown::draw(
+        (evaluation.contract, &evaluation.policy),
+        environment.as_ref(),
+        (reference, evaluation.assignments, traced),
+        stop,
+    )?;
     let questions = Questions {
         reference,
         assignments: evaluation.assignments,
         episodes: traced,
+        shown: shown.as_ref(),
     };
     let image = (&evaluation.policy, evaluation.isa);
     let (asked, numbering) = policy::judge(image, bundle, questions, stop, finished)?;
-    let mut environment = open();
     let physics = physics::replay(
         environment.as_mut(),
         reference,
@@ -118,7 +129,7 @@ pub fn run(
         used,
         compared,
         asked,
-        physics,
+        (physics, shown.map(|shown| shown.compared)),
         rollouts,
         not_covered,
     ))
@@ -126,13 +137,17 @@ pub fn run(
 
 /// Describes a bundle, as far as its reference must agree with it.
 pub fn subject<'s>(bundle: &'s Bundle, environment: &'s dyn Environment) -> Subject<'s> {
-    let known = &bundle.contract().instructions;
+    let contract = bundle.contract();
+    let known = &contract.instructions;
+    let mut vectors = contract.observations().filter(|it| !sight::is_image(it));
     Subject {
         contract: bundle.metadata("lads.contract").unwrap_or_default(),
         instructions: known.iter().map(|row| row.text.as_str()).collect(),
         environment_id: environment.id(),
         environment_version: environment.version(),
-        observation_len: environment.observation_len(),
+        state_len: environment.state().len(),
+        observation_len: vectors.next().map_or(0, |_| environment.observation_len()),
+        sees: contract.observations().any(sight::is_image),
         action_len: environment.action_len(),
     }
 }
@@ -177,9 +192,18 @@ fn compared(
         steps: trace
             .steps
             .iter()
-            .map(|step| [step.observation.as_slice(), &step.action])
+            .map(|step| Done {
+                observation: &step.observation,
+                shown: step.shown,
+                action: &step.action,
+            })
             .collect(),
     });
-    let lens = [contract.observation_len(), contract.action_len()];
+    let mut vectors = contract.observations();
+    let vector = vectors.find(|channel| channel.dtype() == DType::F32);
+    let lens = [
+        vector.map_or(0, |channel| channel.len()),
+        contract.action_len(),
+    ];
     Paired::new(reference, sub_tasks, episodes, traces, lens)
 }

@@ -48,7 +48,7 @@ pub fn replay(
                 episode: number as u64,
             };
             environment.reset(seed, &assignment.commanded);
-            let states = trace.states.chunks_exact(environment.observation_len());
+            let states = trace.states.chunks_exact(environment.state().len());
             let actions = trace.actions.chunks_exact(environment.action_len());
             for (step, (expected, action)) in states.zip(actions).enumerate() {
                 physics.compare(environment.state(), expected, || Answer {

@@ -1,13 +1,13 @@
 //! Asks the compiled policy what the reference policy was asked; [`lads_proof::answers`] and [`lads_proof::rounding`] judge.
 //!
 //! Open loop: at each control step of a traced episode the controller gets the observation that the reference saw, and its history holds
-//! the actions that the reference executed. What can fail: a workspace that is too small for the policy, a bundle that does not compile with
+//! the actions that the reference executed. A policy with cameras is asked up to the first frame that is not the reference's. What can fail: a workspace that is too small for the policy, a bundle that does not compile with
 //! 32 bits; it can be told to stop.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use lads_compiler::{Bundle, Options};
-use lads_core::{Controller, Decision, Instruction, Isa, Policy};
+use lads_core::{Controller, DType, Data, Decision, Instruction, Isa, Policy};
 use lads_host::Memory;
 use lads_proof::answers::{Replay, Reply};
 use lads_proof::numbering::Numbering;
@@ -16,6 +16,7 @@ use lads_proof::rounding::Asked;
 
 use crate::evaluate::{Assignment, EvaluationError};
 use crate::plans::Segment;
+use crate::verify::shown::Shown;
 
 /// Questions to a policy: the first traced episodes of each assigned instruction.
 #[derive(Debug, Clone, Copy)]
@@ -26,6 +27,8 @@ pub struct Questions<'q> {
     pub assignments: &'q [Assignment],
     /// Largest number of episodes of each instruction.
     pub episodes: u32,
+    /// What the cameras show in them; `None` for a policy without.
+    pub shown: Option<&'q Shown>,
 }
 
 /// Returns how many times [`judge`] asks the questions: a second time with 32 bits if the image has fewer and selects the largest logit.
@@ -70,6 +73,7 @@ pub fn ask(
         reference,
         assignments,
         episodes,
+        shown,
     } = questions;
     let mut memory = Memory::of(policy).map_err(EvaluationError::Memory)?;
     let mut controller = memory
@@ -91,10 +95,15 @@ pub fn ask(
                 return Err(EvaluationError::Interrupted);
             }
             if let Some(trace) = &recorded.trace {
+                let seen = Seen {
+                    trace,
+                    shown,
+                    place: [index as usize, episode],
+                };
                 replays.push(Replay {
                     episode,
                     encoded: encoder.map(|encoder| encode(&mut controller, trace, encoder)),
-                    ..replay(&mut controller, index, trace)
+                    ..replay(&mut controller, index, seen)?
                 });
             }
             finished();
@@ -103,22 +112,60 @@ pub fn ask(
     Ok(replays)
 }
 
+/// What a policy sees in a traced episode.
+#[derive(Clone, Copy)]
+struct Seen<'q> {
+    trace: &'q Trace,
+    shown: Option<&'q Shown>,
+    /// Index of the instruction and number of the episode.
+    place: [usize; 2],
+}
+
+impl Seen<'_> {
+    /// Number of steps that can be asked about.
+    fn steps(&self, action_len: usize) -> usize {
+        let [instruction, episode] = self.place;
+        let all = self.trace.actions.len() / action_len.max(1);
+        self.shown
+            .map_or(all, |shown| shown.same(instruction, episode))
+    }
+}
+
 /// Replays one episode; a refusal ends it.
-fn replay(controller: &mut Controller<'_, '_>, instruction: u32, trace: &Trace) -> Replay {
+fn replay(
+    controller: &mut Controller<'_, '_>,
+    instruction: u32,
+    seen: Seen<'_>,
+) -> Result<Replay, EvaluationError> {
     let mut replay = Replay {
         instruction: instruction as usize,
         ..Replay::default()
     };
     if let Err(error) = controller.set_instruction(Instruction::Id(instruction)) {
         replay.refused = Some(format!("the instruction is refused: {error}"));
-        return replay;
+        return Ok(replay);
     }
     let contract = controller.policy().contract();
-    let lens = [contract.observation_len(), contract.action_len()];
-    let mut action = vec![0.0; lens[1]];
-    let observations = trace.observations.chunks_exact(lens[0]);
-    for (seen, done) in observations.zip(trace.actions.chunks_exact(lens[1])) {
-        let report = match controller.step(seen, &mut action) {
+    let vector = contract
+        .observations()
+        .find(|channel| channel.dtype() == DType::F32);
+    let mut action = vec![0.0; contract.action_len()];
+    let mut images = Vec::new();
+    let actions = seen.trace.actions.chunks_exact(action.len());
+    let asked = actions.take(seen.steps(action.len()));
+    for (step, done) in asked.enumerate() {
+        let rows = vector.and_then(|channel| {
+            let mut rows = seen.trace.observations.chunks_exact(channel.len());
+            Some((channel.id(), Data::F32(rows.nth(step)?)))
+        });
+        let mut given: Vec<_> = rows.into_iter().collect();
+        if let Some(shown) = seen.shown {
+            let [instruction, episode] = seen.place;
+            let read = shown.read((instruction, episode, step), &mut images);
+            read.map_err(EvaluationError::Frames)?;
+            given.extend(shown.channels(&images));
+        }
+        let report = match controller.step_with(&given, &mut action) {
             Ok(report) => report,
             Err(error) => {
                 replay.refused = Some(format!("the observation is refused: {error}"));
@@ -143,7 +190,7 @@ fn replay(controller: &mut Controller<'_, '_>, instruction: u32, trace: &Trace) 
             break;
         }
     }
-    replay
+    Ok(replay)
 }
 
 /// Plans that the policy's trajectory encoder sees in each full segment of a trace, up to the first that it refuses.

@@ -255,6 +255,7 @@ pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usi
         reference,
         assignments: &assignments,
         episodes: 1,
+        shown: None,
     };
     let stop = AtomicBool::new(false);
     let image = (&policy, Isa::detect());

@@ -36,6 +36,11 @@ fn alone(policy: Answers) -> Asked {
 }
 
 fn judged(asked: Asked, environment: Physics, outcome: [usize; 4]) -> Certificate {
+    seeing(asked, (environment, None), outcome)
+}
+
+/// Makes the same of a policy with cameras.
+fn seeing(asked: Asked, seen: (Physics, Option<Frames>), outcome: [usize; 4]) -> Certificate {
     let [n, both, run_only, reference_only] = outcome;
     let mut pairs = Pairs::default();
     let mut counts = Counts::default();
@@ -96,15 +101,7 @@ fn judged(asked: Asked, environment: Physics, outcome: [usize; 4]) -> Certificat
         fields: vec!["decision".to_owned()],
         ..Compared::default()
     };
-    Certificate::new(
-        setting,
-        used,
-        contract,
-        asked,
-        environment,
-        rollouts,
-        Vec::new(),
-    )
+    Certificate::new(setting, used, contract, asked, seen, rollouts, Vec::new())
 }
 
 fn reason(certificate: &Certificate, part: &str) {
@@ -123,6 +120,29 @@ fn enough_equal_episodes_are_equivalent() {
     reason(&found, "100.0 % of 500 episodes");
     // A few that fell out otherwise, either way, do not matter.
     assert_eq!(certificate(500, 397, 2, 1).verdict, Verdict::Equivalent);
+}
+
+/// Tests that frames of other bytes decide nothing, however much agrees, and that a difference which is shown stands beside them.
+#[test]
+fn other_frames_decide_nothing() {
+    let found = |theirs: u8, reference_only: usize| {
+        let mut frames = Frames::default();
+        frames.compare(("kbls", 0), &[[7; 16]], &[[theirs; 16]]);
+        let policy = certificate(500, 400, 0, 0).policy;
+        let environment = certificate(500, 400, 0, 0).environment;
+        let outcome = [500, 400 - reference_only, 0, reference_only];
+        seeing(alone(policy), (environment, Some(frames)), outcome)
+    };
+    let same = found(7, 0);
+    assert_eq!(same.verdict, Verdict::Equivalent);
+    reason(&same, "the same bytes in 1 frames");
+    let other = found(8, 0);
+    assert_eq!(other.verdict, Verdict::Inconclusive);
+    assert_eq!(other.more_episodes_per_instruction, None);
+    reason(&other, "draws 1 of 1 frames otherwise");
+    let lost = found(8, 200);
+    assert_eq!(lost.verdict, Verdict::Different);
+    assert!(lost.notes.iter().any(|note| note.contains("1 of 1 frames")));
 }
 
 #[test]

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{ArgMatches, Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 use lads_sim::faults::Faults;
+use lads_sim::rollout::Pictures;
 
 /// The job to do: the main job, or a subcommand.
 #[derive(Debug)]
@@ -323,10 +324,20 @@ pub struct Record {
 #[derive(Debug, Args)]
 pub struct Frames {
     /// The dataset, made by lads-collect
-    pub data: PathBuf,
+    #[arg(required_unless_present = "stream", conflicts_with = "stream")]
+    pub data: Option<PathBuf>,
     /// The frames, a safetensors file: a cache, which the dataset makes again
-    #[arg(short, long, value_name = "FILE")]
-    pub output: PathBuf,
+    #[arg(
+        short,
+        long,
+        value_name = "FILE",
+        required_unless_present = "stream",
+        conflicts_with = "stream"
+    )]
+    pub output: Option<PathBuf>,
+    /// Draw states that come on the standard input, for another program, to the standard output: sim-harness/src/frames/stream.rs has the form
+    #[arg(long, value_name = "ENVIRONMENT", conflicts_with = "threads")]
+    pub stream: Option<String>,
     /// Rendering of the frames, as JSON (its form: the `rendering` of a bundle's image channel); left out, as the environment's benchmark has it
     #[arg(long, value_name = "FILE")]
     pub rendering: Option<PathBuf>,
@@ -349,6 +360,8 @@ pub struct Wanted<'a> {
     pub plans: Option<&'a Path>,
     /// Number of episodes per instruction whose control steps are kept.
     pub traced: u32,
+    /// Which of these keep what the cameras showed.
+    pub pictures: Pictures,
     pub threads: usize,
     /// The job or option that excludes a sentence outside the bundle's table, if there is one.
     pub of_table: Option<&'static str>,

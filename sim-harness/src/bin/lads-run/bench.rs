@@ -110,6 +110,7 @@ pub fn with<R>(
             plans: book.as_ref(),
             stop_where_refused: false,
             traced: wanted.traced,
+            pictures: wanted.pictures,
             words: Some(&heard.words),
             observer: None,
         },

@@ -7,6 +7,7 @@ use std::time::Instant;
 
 use lads_sim::evaluate::Evaluated;
 use lads_sim::results::Results;
+use lads_sim::rollout::Pictures;
 use lads_sim::table::Table;
 use lads_sim::{output, plans};
 
@@ -44,6 +45,11 @@ pub fn run(asked: &Rollouts, extra: &Extra<'_>, stop: &AtomicBool) -> Result<Exi
         faults: asked.faults.faults(),
         plans: files.plans.as_deref(),
         traced: traced(asked, extra),
+        pictures: match (&asked.files.log, extra.report) {
+            (Some(_), _) => Pictures::All,
+            (None, Some(_)) => Pictures::Decisions,
+            (None, None) => Pictures::None,
+        },
         threads,
         of_table: match (&files.plans, extra.report) {
             (Some(_), _) => Some("--plans"),

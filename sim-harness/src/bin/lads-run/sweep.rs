@@ -14,6 +14,7 @@ use std::sync::atomic::AtomicBool;
 
 use lads_sim::evaluate::Setup;
 use lads_sim::output;
+use lads_sim::rollout::Pictures;
 use lads_sim::sight::is_image;
 
 use crate::arguments::{Sweep as Asked, Wanted};
@@ -106,6 +107,7 @@ pub fn run(asked: &Asked, stop: &AtomicBool) -> Result<ExitCode, End> {
         faults: Faults::default(),
         plans: None,
         traced: 0,
+        pictures: Pictures::None,
         threads,
         of_table: None,
         judged: true,

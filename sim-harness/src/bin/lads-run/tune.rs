@@ -9,8 +9,10 @@ use lads_compiler::{Evidence, Tuned as Record, sha256};
 use lads_host::input;
 use lads_sim::faults::Faults;
 use lads_sim::output;
+use lads_sim::rollout::Pictures;
 use lads_sim::tune::{TuneError, Tuned, Tuning};
 use lads_sim::verify::reference::{Reference, ReferenceError};
+use lads_sim::verify::shown::Shown;
 
 use crate::arguments::{LanguageArguments, PolicyArguments, Tune, Wanted};
 use crate::bench;
@@ -54,6 +56,7 @@ pub fn run(asked: &Tune, stop: &AtomicBool) -> Result<ExitCode, End> {
         faults: Faults::default(),
         plans: None,
         traced: reference.traced_episodes,
+        pictures: Pictures::None,
         threads: 1,
         of_table: Some("tune"),
         judged: false,
@@ -67,10 +70,23 @@ pub fn run(asked: &Tune, stop: &AtomicBool) -> Result<ExitCode, End> {
                 model.display()
             )));
         }
+        let (evaluation, traced) = (&bench.evaluation, reference.traced_episodes);
+        let shown = Shown::draw(
+            (evaluation.contract, &evaluation.policy),
+            bench.environment,
+            (&reference, evaluation.assignments, traced),
+            stop,
+        );
+        let shown = shown.map_err(unfinished)?;
+        let unlike = shown.as_ref().and_then(|it| it.compared.undecided());
+        if let Some(why) = unlike {
+            return Err(refused(format_args!("{}: {why}", model.display())));
+        }
         let tuning = Tuning {
             bundle: bench.bundle,
             reference: &reference,
-            assignments: bench.evaluation.assignments,
+            assignments: evaluation.assignments,
+            shown: shown.as_ref(),
             isa: bench.evaluation.isa,
         };
         let bar = ProgressBar::new_spinner();

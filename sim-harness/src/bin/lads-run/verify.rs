@@ -11,6 +11,7 @@ use lads_proof::rounding::Rounding;
 use lads_sim::faults::Faults;
 use lads_sim::output;
 use lads_sim::results::versions;
+use lads_sim::rollout::Pictures;
 use lads_sim::verify::certificate::Certificate;
 use lads_sim::verify::page::Page;
 use lads_sim::verify::reference::Reference;
@@ -55,6 +56,7 @@ pub fn run(asked: &Verify, stop: &AtomicBool) -> Result<ExitCode, End> {
         faults: Faults::default(),
         plans: None,
         traced: reference.traced_episodes.min(episodes),
+        pictures: Pictures::None,
         threads,
         of_table: Some("verify"),
         judged: false,
@@ -136,6 +138,7 @@ impl fmt::Display for Summary<'_> {
             exact,
             rounding,
             environment,
+            frames,
             rollouts,
             ..
         } = self.0;
@@ -162,6 +165,13 @@ impl fmt::Display for Summary<'_> {
             "environment alone  states within {:.1e} (allowed {:.1e}) over {} states{bits}",
             environment.largest_state_difference, environment.state_tolerance, environment.states
         )?;
+        if let Some(frames) = frames {
+            writeln!(
+                f,
+                "frames             {} of {} are other bytes than the reference's; {} questions left out",
+                frames.differing, frames.steps, frames.left_out
+            )?;
+        }
         writeln!(
             f,
             "both together      {} pairs of episodes: completions identical in {:.1} %, plans in {:.1} %, steps in {:.1} %; actions within {:.1e} \
