@@ -1,6 +1,7 @@
 //! The `tune` subcommand: finds the smallest formats that keep every plan of a reference's questions, and writes them into the bundle.
 
 use std::fmt;
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::atomic::AtomicBool;
 
@@ -15,7 +16,7 @@ use lads_sim::verify::reference::{Reference, ReferenceError};
 use lads_sim::verify::shown::Shown;
 
 use crate::arguments::{LanguageArguments, PolicyArguments, Tune, Wanted};
-use crate::bench;
+use crate::bench::{self, Bench};
 use crate::end::{End, print, refused, unwritable};
 use crate::{given, unfinished};
 
@@ -70,18 +71,8 @@ pub fn run(asked: &Tune, stop: &AtomicBool) -> Result<ExitCode, End> {
                 model.display()
             )));
         }
-        let (evaluation, traced) = (&bench.evaluation, reference.traced_episodes);
-        let shown = Shown::draw(
-            (evaluation.contract, &evaluation.policy),
-            bench.environment,
-            (&reference, evaluation.assignments, traced),
-            stop,
-        );
-        let shown = shown.map_err(unfinished)?;
-        let unlike = shown.as_ref().and_then(|it| it.compared.undecided());
-        if let Some(why) = unlike {
-            return Err(refused(format_args!("{}: {why}", model.display())));
-        }
+        let evaluation = &bench.evaluation;
+        let shown = shown(bench, &reference, model, stop)?;
         let tuning = Tuning {
             bundle: bench.bundle,
             reference: &reference,
@@ -124,6 +115,28 @@ pub fn run(asked: &Tune, stop: &AtomicBool) -> Result<ExitCode, End> {
         sha256(&written)
     ))?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// Draws what the cameras show in the reference's episodes, which has to be what they showed it.
+fn shown(
+    bench: &Bench<'_>,
+    reference: &Reference,
+    model: &Path,
+    stop: &AtomicBool,
+) -> Result<Option<Shown>, End> {
+    let evaluation = &bench.evaluation;
+    let shown = Shown::draw(
+        (evaluation.contract, &evaluation.policy),
+        bench.environment,
+        (reference, evaluation.assignments, reference.traced_episodes),
+        stop,
+    );
+    let shown = shown.map_err(unfinished)?;
+    let unlike = shown.as_ref().and_then(|it| it.compared.undecided());
+    match unlike {
+        Some(why) => Err(refused(format_args!("{}: {why}", model.display()))),
+        None => Ok(shown),
+    }
 }
 
 /// Prints the chosen formats on a terminal.

@@ -7,6 +7,7 @@ use std::sync::atomic::AtomicBool;
 
 use askama::Template as _;
 use lads_proof::answers::Answers;
+use lads_proof::frames::Frames;
 use lads_proof::rounding::Rounding;
 use lads_sim::faults::Faults;
 use lads_sim::output;
@@ -127,6 +128,15 @@ fn fewer_bits(f: &mut fmt::Formatter<'_>, rounding: &Rounding) -> fmt::Result {
     )
 }
 
+/// Prints the summary of what the cameras show.
+fn cameras(f: &mut fmt::Formatter<'_>, frames: &Frames) -> fmt::Result {
+    writeln!(
+        f,
+        "frames             {} of {} are other bytes than the reference's; {} questions left out",
+        frames.differing, frames.steps, frames.left_out
+    )
+}
+
 /// Prints the certificate on a terminal.
 struct Summary<'c>(&'c Certificate);
 
@@ -166,11 +176,7 @@ impl fmt::Display for Summary<'_> {
             environment.largest_state_difference, environment.state_tolerance, environment.states
         )?;
         if let Some(frames) = frames {
-            writeln!(
-                f,
-                "frames             {} of {} are other bytes than the reference's; {} questions left out",
-                frames.differing, frames.steps, frames.left_out
-            )?;
+            cameras(f, frames)?;
         }
         writeln!(
             f,
