@@ -8,6 +8,7 @@ use std::sync::atomic::AtomicBool;
 use indicatif::ProgressBar;
 use lads_compiler::{Evidence, Tuned as Record, sha256};
 use lads_host::input;
+use lads_proof::rounding::Rounding;
 use lads_sim::faults::Faults;
 use lads_sim::output;
 use lads_sim::rollout::Pictures;
@@ -91,20 +92,7 @@ pub fn run(asked: &Tune, stop: &AtomicBool) -> Result<ExitCode, End> {
             error => refused(format_args!("{}: {error}", model.display())),
         })
     })?;
-    let seen = &tuned.found.judged;
-    let evidence = Evidence {
-        reference_sha256: sha256(&questions),
-        episodes: seen.episodes,
-        steps: seen.steps,
-        decisions: seen.decisions,
-        smallest_margin: seen.smallest_margin,
-        largest_logit_error: seen.largest_logit_difference,
-        segments: seen.segments,
-        clear_share: seen.clear_share,
-        margin_factor: seen.margin_factor,
-        largest_action_error: seen.largest_action_difference,
-        action_tolerance: seen.action_tolerance,
-    };
+    let evidence = evidence(&tuned.found.judged, &questions);
     let record = Record::new(tuned.found.storage.clone(), evidence);
     let written = record.written_into(&bytes).map_err(refused)?;
     output::write(target, &written).map_err(|error| unwritable("-o", target, &error))?;
@@ -115,6 +103,23 @@ pub fn run(asked: &Tune, stop: &AtomicBool) -> Result<ExitCode, End> {
         sha256(&written)
     ))?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// Collects what the bundle keeps of the search: the numbers that its choice rests on.
+fn evidence(seen: &Rounding, questions: &[u8]) -> Evidence {
+    Evidence {
+        reference_sha256: sha256(questions),
+        episodes: seen.episodes,
+        steps: seen.steps,
+        decisions: seen.decisions,
+        smallest_margin: seen.smallest_margin,
+        largest_logit_error: seen.largest_logit_difference,
+        segments: seen.segments,
+        clear_share: seen.clear_share,
+        margin_factor: seen.margin_factor,
+        largest_action_error: seen.largest_action_difference,
+        action_tolerance: seen.action_tolerance,
+    }
 }
 
 /// Draws what the cameras show in the reference's episodes, which has to be what they showed it.

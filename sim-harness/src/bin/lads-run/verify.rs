@@ -8,6 +8,7 @@ use std::sync::atomic::AtomicBool;
 use askama::Template as _;
 use lads_proof::answers::Answers;
 use lads_proof::frames::Frames;
+use lads_proof::pairs::Paired;
 use lads_proof::rounding::Rounding;
 use lads_sim::faults::Faults;
 use lads_sim::output;
@@ -137,6 +138,41 @@ fn cameras(f: &mut fmt::Formatter<'_>, frames: &Frames) -> fmt::Result {
     )
 }
 
+/// Prints the table of rates: those of the run beside the reference's.
+fn rates(f: &mut fmt::Formatter<'_>, rollouts: &Paired) -> fmt::Result {
+    writeln!(
+        f,
+        "{:<16} {:>7} {:>9}   {:>25}   {:>10} {:>11}",
+        "rate", "run", "reference", "paired difference (95 %)", "equivalent", "McNemar's p"
+    )?;
+    let n_rate = &rollouts.n_rate;
+    let rates = rollouts.rates.iter().map(|rate| {
+        let [run, reference] = rate.shares();
+        (
+            rate.name.as_str(),
+            run,
+            reference,
+            &rate.paired,
+            Some(rate.mcnemar_p),
+        )
+    });
+    for (name, run, reference, paired, p) in
+        rates.chain([("N-rate", n_rate.run, n_rate.reference, &n_rate.paired, None)])
+    {
+        let interval = format!(
+            "{:+.3} ({:+.3} to {:+.3})",
+            paired.estimate, paired.interval.0, paired.interval.1
+        );
+        let equivalent = if paired.equivalent { "yes" } else { "no" };
+        let p = p.map_or_else(String::new, |p| format!("{p:.3}"));
+        writeln!(
+            f,
+            "{name:<16} {run:>7.3} {reference:>9.3}   {interval:>25}   {equivalent:>10} {p:>11}"
+        )?;
+    }
+    Ok(())
+}
+
 /// Prints the certificate on a terminal.
 struct Summary<'c>(&'c Certificate);
 
@@ -190,36 +226,7 @@ impl fmt::Display for Summary<'_> {
             rollouts.agreeing_steps[0],
             rollouts.agreeing_steps[1]
         )?;
-        writeln!(
-            f,
-            "{:<16} {:>7} {:>9}   {:>25}   {:>10} {:>11}",
-            "rate", "run", "reference", "paired difference (95 %)", "equivalent", "McNemar's p"
-        )?;
-        let n_rate = &rollouts.n_rate;
-        let rates = rollouts.rates.iter().map(|rate| {
-            let [run, reference] = rate.shares();
-            (
-                rate.name.as_str(),
-                run,
-                reference,
-                &rate.paired,
-                Some(rate.mcnemar_p),
-            )
-        });
-        for (name, run, reference, paired, p) in
-            rates.chain([("N-rate", n_rate.run, n_rate.reference, &n_rate.paired, None)])
-        {
-            let interval = format!(
-                "{:+.3} ({:+.3} to {:+.3})",
-                paired.estimate, paired.interval.0, paired.interval.1
-            );
-            let equivalent = if paired.equivalent { "yes" } else { "no" };
-            let p = p.map_or_else(String::new, |p| format!("{p:.3}"));
-            writeln!(
-                f,
-                "{name:<16} {run:>7.3} {reference:>9.3}   {interval:>25}   {equivalent:>10} {p:>11}"
-            )?;
-        }
+        rates(f, rollouts)?;
         writeln!(f, "\n{}", self.0.verdict.word())?;
         for reason in &self.0.reasons {
             writeln!(f, "- {reason}")?;
