@@ -47,31 +47,6 @@ pub fn images() -> Vec<Op> {
         bias: weight(200, 3),
         activation: Activation::LeakyRelu(0.1),
     };
-    let integers = ImageIntegers {
-        x,
-        size: Pair { rows: 4, cols: 5 },
-        c: 3,
-        y: span(200, 32),
-    };
-    // One of two groups of channels of four rows of five pixels; each pixel is a run of three.
-    let integer_conv = |format: WeightFormat, accumulate| {
-        let words = conv_integers_len([2, 3], 3) * format.bytes() / 4;
-        IntegerConv {
-            x: span(100, 1 + 4 * 5 * 6 / 2 + 1),
-            first: 3,
-            row: 30,
-            pixel: 6,
-            y,
-            window,
-            c: 3,
-            n: 3,
-            format,
-            w: weight(4, words as u32),
-            columns: weight(200, 6),
-            activation: Activation::Relu,
-            accumulate,
-        }
-    };
     let border = |value, after: u16| Border {
         y: span(30, 4 * (3 + u32::from(after)) * 2),
         inside: Pair { rows: 2, cols: 2 },
@@ -103,10 +78,7 @@ pub fn images() -> Vec<Op> {
         rows: weight(7, 6),
         cols: weight(20, 9),
     };
-    vec![
-        integers.into(),
-        integer_conv(WeightFormat::Int16, false).into(),
-        integer_conv(WeightFormat::Int8, true).into(),
+    let others: [Op; 8] = [
         conv(false).into(),
         conv(true).into(),
         depthwise.into(),
@@ -115,5 +87,40 @@ pub fn images() -> Vec<Op> {
         pool(PoolKind::Max).into(),
         pool(PoolKind::PaddedMean).into(),
         resize.into(),
+    ];
+    [of_integers(x, y, window).as_slice(), &others].concat()
+}
+
+/// Returns the conversion of an image to integers, and convolutions of them.
+fn of_integers(x: Picture, y: Picture, window: Window) -> [Op; 3] {
+    let integers = ImageIntegers {
+        x,
+        size: Pair { rows: 4, cols: 5 },
+        c: 3,
+        y: span(200, 32),
+    };
+    // One of two groups of channels of four rows of five pixels; each pixel is a run of three.
+    let integer_conv = |format: WeightFormat, accumulate| {
+        let words = conv_integers_len([2, 3], 3) * format.bytes() / 4;
+        IntegerConv {
+            x: span(100, 1 + 4 * 5 * 6 / 2 + 1),
+            first: 3,
+            row: 30,
+            pixel: 6,
+            y,
+            window,
+            c: 3,
+            n: 3,
+            format,
+            w: weight(4, words as u32),
+            columns: weight(200, 6),
+            activation: Activation::Relu,
+            accumulate,
+        }
+    };
+    [
+        integers.into(),
+        integer_conv(WeightFormat::Int16, false).into(),
+        integer_conv(WeightFormat::Int8, true).into(),
     ]
 }
