@@ -10,6 +10,7 @@
 use crate::conv::Sweep;
 use crate::dispatch::{Isa, Kernel};
 use crate::elementwise::assign;
+use crate::integers::scales;
 use crate::lanes::LANES;
 use crate::linear::INTEGERS;
 use crate::simd::Simd;
@@ -102,11 +103,6 @@ struct Converted<'a> {
 impl Kernel for Converted<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        const INFINITE: u32 = f32::INFINITY.to_bits();
-        /// Bits of 2^-100, below which magnitudes are read as zero.
-        const SMALLEST: u32 = (127 - 100) << 23;
-        // All ones, for masks: a selection may be compiled to a branch.
-        let all = |condition: bool| u32::from(condition).wrapping_neg();
         let [rows, cols] = self.lines.times;
         let mut largest = [simd.zeros(); 4];
         for row in 0..rows {
@@ -130,13 +126,8 @@ impl Kernel for Converted<'_> {
             }
         }
         let [a, b, c, d] = largest.map(|largest| simd.largest(largest));
-        let largest = a.max(b).max(c.max(d));
-        let (usable, finite) = (all(largest >= SMALLEST), all(largest < INFINITE));
-        let magnitude = f32::from_bits(largest);
-        let inverse = f32::from_bits((LARGEST / magnitude).to_bits() & usable & finite);
-        // Ones all through are not a number.
-        let scale = (magnitude / LARGEST).to_bits() & usable;
-        *self.scale = f32::from_bits(scale | !finite);
+        let (inverse, scale) = scales(a.max(b).max(c.max(d)), LARGEST);
+        *self.scale = scale;
         let inverse = simd.splat(inverse);
         let mut y = self.y;
         for row in 0..rows {

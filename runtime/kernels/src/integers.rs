@@ -107,7 +107,7 @@ impl Part {
         for block in blocks {
             largest = simd.larger(largest, simd.load(block));
         }
-        let (per_input, per_unit) = scales(simd.largest(largest));
+        let (per_input, per_unit) = scales(simd.largest(largest), LARGEST);
         self.scale = per_unit;
         let per_input = simd.splat(per_input);
         let (integers, _) = self.pairs.as_flattened_mut().as_chunks_mut::<LANES>();
@@ -120,21 +120,21 @@ impl Part {
     }
 }
 
-/// Returns the factors from inputs to integers and back, from the bits of the largest magnitude of
-/// a part.
+/// Returns the factors from inputs to integers and back, from the bits of the largest magnitude of the
+/// inputs and the integer that it becomes.
 #[inline(always)]
-fn scales(largest: u32) -> (f32, f32) {
+pub(crate) fn scales(largest: u32, integer: f32) -> (f32, f32) {
     const INFINITE: u32 = f32::INFINITY.to_bits();
     /// Bits of 2^-100, below which magnitudes are read as zero.
     const SMALLEST: u32 = (127 - 100) << 23;
-    // All ones, for masks: a selection may be compiled to a branch.
+    // Masks, and before the divisions: a selection may be compiled to a branch, also one around a division.
     let all = |condition: bool| u32::from(condition).wrapping_neg();
     let (usable, finite) = (all(largest >= SMALLEST), all(largest < INFINITE));
-    let magnitude = f32::from_bits(largest);
-    let per_input = (LARGEST / magnitude).to_bits() & usable & finite;
+    let (both, some) = (usable & finite, integer.to_bits());
+    let per_input = f32::from_bits(some & both) / f32::from_bits(largest & both | some & !both);
     // All ones are NaN.
-    let per_unit = (magnitude / LARGEST).to_bits() & usable | !finite;
-    (f32::from_bits(per_input), f32::from_bits(per_unit))
+    let per_unit = f32::from_bits(largest & both | !finite) / integer;
+    (per_input, per_unit)
 }
 
 /// Adds the sums of one part of `R` rows with one panel to those of the parts before, of which there
