@@ -21,7 +21,7 @@ from . import config, contract as contracts, frames
 from .bundle import write_atomically
 
 # Relative size of the noise: some rounding errors of 32-bit floats, and what another order of sums makes of them.
-NOISE, DRAWS = 1e-6, 12
+NOISE, DRAWS = 1e-6, 3
 # A recorded action or plan that the weights do not give is another policy's.
 SAME_ACTION, SAME_PLAN = 1e-4, 1e-3
 

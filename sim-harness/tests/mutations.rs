@@ -137,11 +137,11 @@ fn damaged_weights_are_different() {
 /// Tests that the bounds of a certificate are where it states them: a change a little smaller is allowed, a little larger is DIFFERENT.
 #[test]
 fn changes_are_different_from_the_bounds_on() {
-    use lads_proof::answers::{ACTION_TOLERANCE, LOGIT_TOLERANCE};
+    use lads_proof::answers::{ACTION_TOLERANCE, LOGIT_TOLERANCE, NOISE_FACTOR};
     type Moved = fn(&Judged) -> f64;
     let (model, reference) = shipped();
     let noise = reference.float_noise.unwrap();
-    assert!(2.0 * noise.logit < LOGIT_TOLERANCE);
+    assert!(NOISE_FACTOR * noise.logit < LOGIT_TOLERANCE);
     // Adds to one logit, or to one element of the action, so much.
     let cases: [(&str, f64, Moved); 2] = [
         ("high_level.head.bias", LOGIT_TOLERANCE, |found| {
@@ -149,7 +149,7 @@ fn changes_are_different_from_the_bounds_on() {
         }),
         (
             LAST_BIAS,
-            ACTION_TOLERANCE.max(2.0 * noise.action),
+            ACTION_TOLERANCE.max(NOISE_FACTOR * noise.action),
             |found| found.asked.policy.largest_action_difference,
         ),
     ];

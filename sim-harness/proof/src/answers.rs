@@ -25,8 +25,9 @@ pub const CLOSE_CALL: f64 = 1e-3;
 /// Largest allowed difference of an action element, whatever tolerance a bundle states: what is judged does not set the bar.
 pub const ACTION_TOLERANCE: f64 = 1e-4;
 
-/// Factor on the reference's own float noise that is allowed too: noise of one size does not always have the same effect.
-pub const NOISE_FACTOR: f64 = 2.0;
+/// Factor on the reference's own float noise that is allowed too: noise of one size does not always have the same effect. A reference measures three
+/// draws; of ten others on each shipped policy one moved an action by 2.1 times as much as the largest of the three, in both kitchens.
+pub const NOISE_FACTOR: f64 = 3.0;
 
 /// Relative gap of squared distances up to which a segment's two nearest codes are a close call, so that either may be its encoding.
 pub const ENCODER_CLOSE_CALL: f64 = 1e-3;
