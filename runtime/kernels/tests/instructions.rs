@@ -1,7 +1,7 @@
 //! Counts the instructions of kernels that convert their inputs to integers: whatever the inputs are, they are as many.
 //!
 //! Each case is this program again, under valgrind, which counts one function of it.
-#![cfg(target_os = "linux")]
+#![cfg(all(target_os = "linux", target_arch = "x86_64"))]
 
 use std::hint::black_box;
 use std::process::Command;
