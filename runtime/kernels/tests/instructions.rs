@@ -17,8 +17,11 @@ const K: usize = 300;
 const N: usize = 20;
 const M: usize = 3;
 
+/// Value of an input by its number.
+type Value = fn(usize) -> f32;
+
 /// Inputs by what is extreme about them.
-const INPUTS: [(&str, fn(usize) -> f32); 6] = [
+const INPUTS: [(&str, Value); 6] = [
     ("ordinary", |i| (i * 31 % 101) as f32 / 50.0 - 1.0),
     ("zero", |_| 0.0),
     ("one part zero", |i| if i < 256 { 0.0 } else { 1.5 }),
