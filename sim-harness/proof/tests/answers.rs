@@ -4,7 +4,7 @@ use std::path::Path;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use lads_proof::answers::{Answers, Replay, Reply};
+use lads_proof::answers::{Answers, NOISE_FACTOR, Replay, Reply};
 use lads_proof::reference::Reference;
 use serde_json::{Value, json};
 
@@ -210,7 +210,7 @@ fn float_noise_that_the_reference_shows_is_allowed() {
     assert_eq!(answers.first_difference, None);
     assert_eq!(
         (answers.action_tolerance, answers.logit_tolerance),
-        (4e-4, Some(2e-2))
+        (NOISE_FACTOR * 2e-4, Some(NOISE_FACTOR * 1e-2))
     );
 }
 
