@@ -13,7 +13,7 @@ from onnx import numpy_helper
 from torch import nn
 
 from . import contract as contracts
-from .config import HighLevel, Images, LowLevel, UserError
+from .config import NO_STAGE, HighLevel, Images, LowLevel, Stage, UserError
 from .kinds.sighted import FrameEncoder
 from .model import HighLevelPolicy, LowLevelPolicy, Normalizer
 
@@ -71,7 +71,7 @@ def _frame_encoder(tensors, contract):
     convolutions = list(zip(numbered(channel, "weight"), numbered(channel, "bias"), strict=True))
     dense = list(zip(numbered("observation_encoder.dense", "weight"), numbered("observation_encoder.dense", "bias"), strict=True))
     widths, hidden = ([len(bias) for _, bias in layers] for layers in (convolutions, dense))
-    encoder = FrameEncoder(Images(channel, widths, hidden[:-1], hidden[-1], 0.0, 0.0, 0.0, 0.0, 0.0), size)
+    encoder = FrameEncoder(Images(channel, widths, hidden[:-1], hidden[-1], 0.0, 0.0, 0.0, 0.0, 0.0, Stage(**NO_STAGE)), size)
     state = {}
     for stem, layers in ((lambda n: f"convolutions.layers.{n}.conv", convolutions), (lambda n: f"dense.{n}", dense)):
         for number, (weight, bias) in enumerate(layers):
