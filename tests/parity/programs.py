@@ -2,6 +2,7 @@
 
 import os
 import pathlib
+import re
 import shutil
 import subprocess
 
@@ -10,7 +11,10 @@ import pytest
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
 # Packages and features of the whole suite: cargo builds nothing twice for another selection.
-SELECTION = ("--workspace", "--features", "lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language")
+FEATURES = re.search(r"^FEATURES := (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[1]
+SELECTION = ("--workspace", "--features", FEATURES)
+# With an example, cargo counts in the dependencies of tests, whose features are those of their build.
+AS_TESTS = ("--example", "controller")
 
 
 def newest(name):
@@ -25,5 +29,5 @@ def built(name):
     """Builds a program as the suite does -> its path; skips the test where cargo is missing."""
     if not shutil.which("cargo"):
         pytest.skip("cargo is not installed")
-    subprocess.run(["cargo", "build", "--quiet", *SELECTION, "--bin", name], cwd=ROOT, check=True)
+    subprocess.run(["cargo", "build", "--quiet", *SELECTION, "--bin", name, *AS_TESTS], cwd=ROOT, check=True)
     return TARGET / "debug" / name

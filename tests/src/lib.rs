@@ -7,12 +7,43 @@ pub mod hostile;
 mod wire;
 
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use lads_compiler::{Bundle, Image, compile};
 
 /// Returns a file or folder of the project, by its path from the root.
 pub fn project_path(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
+}
+
+/// Builds programs, as `["--bin", "lads"]` or `["--example", "biped"]` name them; returns the folder of the build that this test belongs to.
+///
+/// With the features of the whole suite: another selection would be a build of its own, of minutes.
+///
+/// # Panics
+///
+/// When they do not build.
+pub fn built(programs: &[&str]) -> PathBuf {
+    let makefile = std::fs::read_to_string(project_path("Makefile")).expect("it can be read");
+    let features = makefile
+        .lines()
+        .find_map(|line| line.strip_prefix("FEATURES := "))
+        .expect("the Makefile says what tests are built with");
+    let test = std::env::current_exe().expect("a test is a file");
+    let folder = test.ancestors().nth(2).expect("it lies in deps/");
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    let built = Command::new(cargo)
+        .args(["build", "--quiet", "--workspace", "--features", features])
+        // With an example, cargo counts in the dependencies of tests, whose features are those of this build.
+        .args(["--example", "controller"])
+        .args(programs)
+        .arg("--target-dir")
+        .arg(folder.parent().expect("it is a profile's"))
+        .current_dir(project_path("."))
+        .status()
+        .expect("cargo runs");
+    assert!(built.success(), "{programs:?} do not build");
+    folder.to_owned()
 }
 
 /// Lists the small bundle of the compiler's tests and every bundle that ships.

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use lads_tests::{compiled, project_path};
+use lads_tests::{built, compiled, project_path};
 
 const STRICT: [&str; 5] = ["-O2", "-Wall", "-Wextra", "-Werror", "-pedantic"];
 
@@ -148,20 +148,10 @@ fn the_cpp_loop_allocates_nothing() {
 
 #[test]
 fn the_rust_loop_runs() {
-    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    let text = run(Command::new(cargo)
-        .args([
-            "run",
-            "--quiet",
-            "-p",
-            "lads-ffi",
-            "--example",
-            "controller",
-            "--",
-        ])
+    let program = built(&["--example", "controller"]).join("examples/controller");
+    let text = run(Command::new(program)
         .arg(project_path("models/kitchen.onnx"))
-        .args(["kbls", "25"])
-        .current_dir(project_path(".")));
+        .args(["kbls", "25"]));
     assert!(
         text.contains("25 cycles") && text.contains("periods: 25"),
         "{text}"
@@ -194,23 +184,8 @@ fn the_biped_stands_and_walks_alike_in_rust_and_in_c() {
         let image = compiled(&bundle);
         fs::write(scratch(&format!("{name}.lads")), image.as_bytes()).expect("it can be written");
     }
-    let target = Path::new(env!("CARGO_TARGET_TMPDIR"))
-        .parent()
-        .expect("it lies in the target folder");
-    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    run(Command::new(cargo)
-        .args([
-            "build",
-            "--quiet",
-            "-p",
-            "lads-host",
-            "--example",
-            "biped",
-            "--target-dir",
-        ])
-        .arg(target)
-        .current_dir(project_path(".")));
-    let rust = run(Command::new(target.join("debug/examples/biped"))
+    let biped = built(&["--example", "biped"]).join("examples/biped");
+    let rust = run(Command::new(biped)
         .args([scratch("stand.lads.onnx"), scratch("walk.lads.onnx")])
         .args(["150", "--fast"]));
     let c = run(build("cc", "-std=c11", "c/biped.c", &[])

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use lads_tests::documents::{Block, When, documents};
-use lads_tests::project_path;
+use lads_tests::{built, project_path};
 
 /// Languages of blocks that hold no commands.
 const QUIET: [&str; 7] = ["rust", "c", "cpp", "json", "toml", "text", "python"];
@@ -122,20 +122,7 @@ const BUILT: [&str; 2] = ["lads", "examples/biped"];
 
 /// Makes a folder that looks like the project and takes what commands write; with the programs of an up-to-date build.
 fn folder() -> tempfile::TempDir {
-    let target = Path::new(env!("CARGO_TARGET_TMPDIR"))
-        .parent()
-        .expect("it lies in the target folder");
-    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    let mut build = Command::new(cargo);
-    build
-        .args(["build", "--quiet", "-p", "lads-cli", "-p", "lads-host"])
-        .args(["--bins", "--example", "biped", "--target-dir"])
-        .arg(target);
-    let built = build
-        .current_dir(project_path("."))
-        .status()
-        .expect("cargo runs");
-    assert!(built.success(), "lads builds");
+    let built = built(&["--bin", "lads", "--example", "biped"]);
     let folder = tempfile::tempdir().expect("there is room");
     let root = project_path(".").canonicalize().expect("it is there");
     for entry in fs::read_dir(&root).expect("it can be read") {
@@ -147,8 +134,7 @@ fn folder() -> tempfile::TempDir {
     let release = folder.path().join("target/release");
     fs::create_dir_all(release.join("examples")).expect("there is room");
     for program in BUILT {
-        symlink(target.join("debug").join(program), release.join(program))
-            .expect("links can be made");
+        symlink(built.join(program), release.join(program)).expect("links can be made");
     }
     folder
 }
