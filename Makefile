@@ -159,9 +159,13 @@ lock: $(VENV)/stamp
 	(sed -n '1,/^[^#]/{/^#/p}' exporter/requirements.lock; cat target/requirements.txt) > target/requirements.lock
 	mv target/requirements.lock exporter/requirements.lock
 
+# One process a core, up to what memory bears; who is done first takes tests of the others.
+WORKERS = -n auto --maxprocesses 6 --dist worksteal
+
 test-exporter: setup $(VENV)/stamp
-	cargo build $(ALL) --bins
-	$(TALLY) $(PY) -m pytest -rs exporter/tests tests/parity
+	# With the examples, cargo counts in the dependencies of tests, and what `make test` has built serves here.
+	cargo build $(ALL) --bins --examples
+	$(TALLY) $(PY) -m pytest -rs $(WORKERS) exporter/tests tests/parity
 
 # An environment of its own: a wheel needs no PyTorch. The pin is that of runtime/python/pyproject.toml.
 MATURIN := target/maturin
@@ -185,7 +189,7 @@ test-python: setup wheel $(VENV)/stamp
 	$(PIP) --no-deps --force-reinstall target/wheels/lads-*.whl
 	# What the tests and the examples need besides, by the installed wheel's own pins.
 	$(PIP) 'lads[test,examples]'
-	$(TALLY) $(PY) -m pytest -rs runtime/python/tests
+	$(TALLY) $(PY) -m pytest -rs $(WORKERS) runtime/python/tests
 
 ## collect: demonstrations into data/ENV.safetensors; ENV=kitchen (scripted, of the 22 seen instructions) or ENV=lorel (random, labelled)
 collect: setup
