@@ -6,7 +6,7 @@ mod bench;
 use std::io::Cursor;
 use std::sync::atomic::AtomicBool;
 
-use bench::{Bench, Spec, tiny_contract, tiny_policy};
+use bench::{Bench, DESCRIPTION, tiny_contract, tiny_policy};
 use lads_core::{Channel, Decision, Isa, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Setup};
@@ -37,7 +37,7 @@ fn try_evaluate(
     threads: usize,
     setup: Setup<'_>,
 ) -> Result<Evaluated, EvaluationError> {
-    let commanded = fit::check(tiny_contract(), &Bench::new(Spec::default())).unwrap();
+    let commanded = fit::check(tiny_contract(), &Bench::new(DESCRIPTION)).unwrap();
     let assignments: Vec<_> = (0..)
         .zip(commanded)
         .map(|(instruction, commanded)| Assignment {
@@ -61,7 +61,7 @@ fn try_evaluate(
             ..setup
         },
     };
-    let open = || -> Box<dyn Environment> { Box::new(Bench::new(Spec::default())) };
+    let open = || -> Box<dyn Environment> { Box::new(Bench::new(DESCRIPTION)) };
     evaluation.run(&open, &AtomicBool::new(false), &|| {})
 }
 
@@ -75,7 +75,7 @@ fn log(policy: &Policy<'_>, evaluated: &Evaluated) -> Log {
         let done = &mut trace.outcome.completions;
         let completed = done
             .iter()
-            .map(|c| Spec::default().sub_tasks[c.sub_task].to_owned());
+            .map(|c| DESCRIPTION.sub_tasks[c.sub_task].to_owned());
         let completed: Vec<_> = completed.collect();
         // As a log has it: its place among the completed.
         done.iter_mut()

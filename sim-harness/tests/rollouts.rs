@@ -6,9 +6,9 @@ mod bench;
 
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
-use bench::{Bench, Spec, tiny_contract, tiny_policy};
+use bench::{Bench, DESCRIPTION, tiny_contract, tiny_policy};
 use lads_core::{Decision, Isa, Policy};
-use lads_sim::environment::Environment;
+use lads_sim::environment::{Description, Environment};
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, EvaluationError, Setup};
 use lads_sim::fit;
 use lads_sim::rollout::{Actor, Control, Episode, Observer, Phase, Snapshot};
@@ -20,11 +20,11 @@ const SAMPLE: Decision = Decision::Sample {
 };
 
 fn open() -> Box<dyn Environment> {
-    Box::new(Bench::new(Spec::default()))
+    Box::new(Bench::new(DESCRIPTION))
 }
 
 fn assignments() -> Vec<Assignment> {
-    let commanded = fit::check(tiny_contract(), &Bench::new(Spec::default())).unwrap();
+    let commanded = fit::check(tiny_contract(), &Bench::new(DESCRIPTION)).unwrap();
     (0..)
         .zip(commanded)
         .map(|(instruction, commanded)| Assignment {
@@ -239,59 +239,58 @@ fn a_stop_ends_the_work_without_a_result() {
 
 #[test]
 fn a_contract_that_does_not_fit_is_refused_by_name() {
-    let refusal = |spec: Spec| {
-        fit::check(tiny_contract(), &Bench::new(spec))
+    let refusal = |description: Description| {
+        fit::check(tiny_contract(), &Bench::new(description))
             .unwrap_err()
             .to_string()
     };
-    let spec = Spec::default;
     let cases = [
         (
-            refusal(Spec {
+            refusal(Description {
                 id: "other",
-                ..spec()
+                ..DESCRIPTION
             }),
             ["environment.id", "'tiny-bench'", "'other'"],
         ),
         (
-            refusal(Spec {
+            refusal(Description {
                 version: "2",
-                ..spec()
+                ..DESCRIPTION
             }),
             ["environment.version", "'1'", "'2'"],
         ),
         (
-            refusal(Spec {
+            refusal(Description {
                 control_period_s: 0.04,
-                ..spec()
+                ..DESCRIPTION
             }),
             ["control_period_s", "0.05", "0.04"],
         ),
         (
-            refusal(Spec {
+            refusal(Description {
                 observation_names: &["joint1"],
-                ..spec()
+                ..DESCRIPTION
             }),
             ["observation", "5 elements", "has 1"],
         ),
         (
-            refusal(Spec {
+            refusal(Description {
                 action_names: &[],
-                ..spec()
+                ..DESCRIPTION
             }),
             ["action", "3 elements", "has 0"],
         ),
         (
-            refusal(Spec {
+            refusal(Description {
                 observation_names: &["joint2", "joint1", "drawer", "lamp", "lever"],
-                ..spec()
+                ..DESCRIPTION
             }),
             ["element 0", "'joint1'", "'joint2'"],
         ),
         (
-            refusal(Spec {
+            refusal(Description {
                 sub_tasks: &["drawer", "lamp"],
-                ..spec()
+                ..DESCRIPTION
             }),
             ["'lv'", "'lever'", "does not know"],
         ),
@@ -311,7 +310,7 @@ fn a_policy_with_a_camera_may_observe_the_first_elements_only() {
     let own = all.find(|it| it.name == "observation").unwrap();
     own.elements.truncate(2);
     own.shape = vec![2];
-    let bench = Bench::new(Spec::default());
+    let bench = Bench::new(DESCRIPTION);
     let line = fit::check(&contract, &bench).unwrap_err().to_string();
     assert!(line.contains("2 elements"), "{line}");
     let camera = serde_json::json!({

@@ -5,7 +5,7 @@ mod bench;
 
 use std::sync::atomic::AtomicBool;
 
-use bench::{Bench, Spec, tiny_contract, tiny_policy};
+use bench::{Bench, DESCRIPTION, tiny_contract, tiny_policy};
 use lads_core::{Decision, Isa, Policy};
 use lads_sim::evaluate::{Assignment, Evaluated, Evaluation, Setup};
 use lads_sim::results;
@@ -28,13 +28,13 @@ fn run(policy: &Policy<'_>, assignments: &[Assignment], words: Option<&WordBook>
             ..Setup::default()
         },
     };
-    let open = || Box::new(Bench::new(Spec::default())) as _;
+    let open = || Box::new(Bench::new(DESCRIPTION)) as _;
     let stop = AtomicBool::new(false);
     evaluation.run(&open, &stop, &|| {}).unwrap()
 }
 
 fn sentence(sub_tasks: Option<&str>) -> Result<Sentence, SubTaskError> {
-    Sentence::new("say it", sub_tasks, &Bench::new(Spec::default()))
+    Sentence::new("say it", sub_tasks, &Bench::new(DESCRIPTION))
 }
 
 #[test]
@@ -59,7 +59,7 @@ fn the_words_of_the_book_are_heard_instead_of_the_tables() {
 #[test]
 fn a_sentence_that_commands_nothing_lasts_its_full_time_and_has_no_rates() {
     let policy = tiny_policy();
-    let (contract, environment) = (policy.contract(), Bench::new(Spec::default()));
+    let (contract, environment) = (policy.contract(), Bench::new(DESCRIPTION));
     let known = contract.instruction(1).unwrap();
     let mut book = WordBook::default();
     book.set(contract.instruction_count() as u32, known.words.to_vec());
@@ -72,7 +72,7 @@ fn a_sentence_that_commands_nothing_lasts_its_full_time_and_has_no_rates() {
     let assignments = [assignment];
     let episodes = run(&policy, &assignments, Some(&book)).episodes;
     assert!(episodes[0].iter().all(|e| e.steps == 40 && !e.success));
-    let watched = Spec::default().sub_tasks;
+    let watched = DESCRIPTION.sub_tasks;
     let result = results::of_instruction(&silent.asked(), watched, &episodes[0]);
     assert_eq!((result.id.as_str(), result.text.as_str()), (FREE, "say it"));
     assert_eq!(result.score.episodes, 3);
@@ -85,7 +85,7 @@ fn a_sentence_that_commands_nothing_lasts_its_full_time_and_has_no_rates() {
 
 #[test]
 fn a_sentence_is_judged_by_the_sub_tasks_that_are_named() {
-    let environment = Bench::new(Spec::default());
+    let environment = Bench::new(DESCRIPTION);
     let judged = sentence(Some(" lamp, drawer,lamp ")).unwrap();
     assert_eq!(judged.asked().sub_tasks, ["lamp", "drawer"]);
     assert_eq!(

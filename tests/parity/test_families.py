@@ -8,23 +8,17 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 
 import pytest
 from programs import ROOT, SELECTION
 
 pytest.importorskip("onnxruntime")
 pytest.importorskip("lads_exporter.episode")
+from lads_exporter import bundle, episode, kinds  # noqa: E402
 
 # The Makefile's: with another one cargo would build its dependencies once more.
 KINDS = ("lads", "lang_dt", "lisa", "vae", "lcsd", "skilldiffuser", "history", "plain", "recurrent", "stacked", "camera", "images", "sighted", "sighted_history")
 STEPS = 200
-
-
-def exporter(*arguments):
-    command = [sys.executable, "-m", "lads_exporter", *map(str, arguments)]
-    done = subprocess.run(command, cwd=ROOT / "exporter", capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +26,9 @@ def families(tmp_path_factory):
     """Makes the folder with a bundle and an episode of each kind."""
     folder = tmp_path_factory.mktemp("families")
     for kind in KINDS:
-        exporter("random", "--kind", kind, "-o", folder / f"{kind}.onnx")
-        exporter("episode", folder / f"{kind}.onnx", "--steps", STEPS, "-o", folder / f"{kind}.safetensors")
+        _, model = kinds.export(kind, seed=0)
+        bundle.save(model, folder / f"{kind}.onnx")
+        episode.write(folder / f"{kind}.onnx", folder / f"{kind}.safetensors", STEPS, seed=0)
     return folder
 
 

@@ -21,7 +21,7 @@ fn work(controller: &mut Controller<'_, '_>, action: &mut [f32]) {
             .flatten()
             .take(count)
         {
-            controller.step(step.observation(), action).unwrap();
+            controller.step_with(step.observations(), action).unwrap();
         }
     };
     controller.set_instruction(Instruction::Id(0)).unwrap();

@@ -1,6 +1,6 @@
 //! Tests every bundle that ships, compiled and run on this machine.
 
-use lads_core::{Instruction, Policy, Workspace, WorkspaceTooSmall};
+use lads_core::{GoldenStep, Instruction, Policy, Workspace, WorkspaceTooSmall};
 use lads_host::Memory;
 use lads_tests::{bundles, compiled};
 
@@ -23,7 +23,9 @@ fn golden_episodes_replay() {
         let decisions = golden
             .steps()
             .filter(|step| {
-                let report = controller.step(step.observation(), &mut action).unwrap();
+                let report = controller
+                    .step_with(step.observations(), &mut action)
+                    .unwrap();
                 report.selected.is_some_and(|selected| selected.fresh)
             })
             .count();
@@ -50,7 +52,9 @@ fn the_plans_of_a_golden_episode_differ_by_instruction() {
             controller
                 .set_instruction(Instruction::Id(instruction))
                 .unwrap();
-            controller.step(first.observation(), &mut action).unwrap();
+            controller
+                .step_with(first.observations(), &mut action)
+                .unwrap();
             logits.push(controller.scores().to_vec());
         }
         let words: Vec<_> = policy
@@ -76,25 +80,19 @@ fn a_controller_that_was_used_answers_like_a_fresh_one() {
     for path in bundles() {
         let image = compiled(&path);
         let policy = Policy::new_checked(image.as_bytes()).unwrap();
-        let observations: Vec<_> = policy
-            .golden()
-            .unwrap()
-            .steps()
-            .map(|step| step.observation())
-            .collect();
+        let steps: Vec<_> = policy.golden().unwrap().steps().collect();
         let mut action = vec![0.0; policy.contract().action_len()];
         let mut episode = |controller: &mut lads_core::Controller<'_, '_>| {
-            let step = |observation: &&[f32]| {
-                let report = controller.step(observation, &mut action).unwrap();
+            let step = |seen: &GoldenStep| {
+                let report = controller
+                    .step_with(seen.observations(), &mut action)
+                    .unwrap();
                 (
                     report.selected.map(|selected| selected.index),
                     action.clone(),
                 )
             };
-            observations[..50.min(observations.len())]
-                .iter()
-                .map(step)
-                .collect::<Vec<_>>()
+            steps.iter().take(50).map(step).collect::<Vec<_>>()
         };
         let mut memory = Memory::of(&policy).expect("there is memory");
         let mut controller = memory.controller(&policy).unwrap();

@@ -28,7 +28,7 @@ fn episode(policy: &Policy<'_>, warm: bool) -> Vec<(Option<u32>, Vec<f32>, Vec<f
                 pause(&mut controller);
             }
             let report = controller
-                .step(recorded.observation(), &mut action)
+                .step_with(recorded.observations(), &mut action)
                 .unwrap();
             let index = report.selected.map(|selected| selected.index);
             seen.push((index, action.clone(), controller.scores().to_vec()));

@@ -6,10 +6,11 @@ use lads_proof::reference::{Reference, Subject};
 
 #[test]
 fn shipped_references_are_whole() {
-    for (name, environment) in [
-        ("kitchen", "franka-kitchen"),
-        ("kitchen-small", "franka-kitchen"),
-        ("lorel", "lorel-table"),
+    for (name, environment, state_len) in [
+        ("kitchen", "franka-kitchen", 30),
+        ("kitchen-small", "franka-kitchen", 30),
+        ("lorel", "lorel-table", 15),
+        ("lorel-image", "lorel-table", 15),
     ] {
         let path = Path::new(env!("CARGO_MANIFEST_DIR"))
             .join("../../models")
@@ -17,10 +18,17 @@ fn shipped_references_are_whole() {
         let reference = Reference::open(&path).unwrap();
         let contract = reference.contract.as_ref().unwrap();
         let channels = contract["channels"].as_array().unwrap();
-        let lens = ["observation", "action"].map(|role| {
-            let channel = channels.iter().find(|channel| channel["role"] == role);
-            channel.unwrap()["shape"][0].as_u64().unwrap() as usize
-        });
+        // A camera's frame has three dimensions.
+        let shapes = |role: &'static str, dimensions: usize| {
+            let own = channels.iter().filter(move |row| row["role"] == role);
+            let shapes = own.map(|row| row["shape"].as_array().unwrap());
+            shapes.filter(move |shape| shape.len() == dimensions)
+        };
+        let len = |role| {
+            shapes(role, 1)
+                .next()
+                .map_or(0, |shape| shape[0].as_u64().unwrap() as usize)
+        };
         let subject = Subject {
             contract: "",
             instructions: reference
@@ -30,10 +38,10 @@ fn shipped_references_are_whole() {
                 .collect(),
             environment_id: environment,
             environment_version: "1",
-            state_len: lens[0],
-            observation_len: lens[0],
-            sees: false,
-            action_len: lens[1],
+            state_len,
+            observation_len: len("observation"),
+            sees: shapes("observation", 3).next().is_some(),
+            action_len: len("action"),
         };
         reference.check(&subject).unwrap();
         assert!(reference.float_noise.is_some());

@@ -80,22 +80,29 @@ pub enum ActionError {
     },
 }
 
+/// What an environment is, and what its observations and actions consist of.
+#[derive(Clone, Copy, Debug)]
+pub struct Description {
+    /// Name as in a bundle's contract, for example `franka-kitchen`.
+    pub id: &'static str,
+    /// Version of the environment's behaviour, as in a bundle's contract.
+    pub version: &'static str,
+    /// Time between two control steps, in seconds.
+    pub control_period_s: f64,
+    /// Name of every element of an observation.
+    pub observation_names: &'static [&'static str],
+    /// Name of every element of an action.
+    pub action_names: &'static [&'static str],
+    /// Names of the sub-tasks that are watched, in a fixed order.
+    pub sub_tasks: &'static [&'static str],
+}
+
 /// A simulated environment that runs in control steps.
 ///
 /// Observations and states are in the simulator's own precision; a policy takes them as `f32`.
 pub trait Environment: Send {
-    /// Name as in a bundle's contract, for example `franka-kitchen`.
-    fn id(&self) -> &'static str;
-    /// Version of the environment's behaviour, as in a bundle's contract.
-    fn version(&self) -> &'static str;
-    /// Name of every element of an observation; its length is the observation's.
-    fn observation_names(&self) -> &'static [&'static str];
-    /// Name of every element of an action; its length is the action's.
-    fn action_names(&self) -> &'static [&'static str];
-    /// Names of the sub-tasks that are watched, in a fixed order.
-    fn sub_tasks(&self) -> &'static [&'static str];
-    /// Time between two control steps, in seconds.
-    fn control_period_s(&self) -> f64;
+    /// What it is, and what its observations and actions consist of.
+    fn description(&self) -> &Description;
     /// Control steps of a full episode of an instruction in `split`. The caller ends the episode; stepping on is allowed.
     fn max_steps(&self, split: &str) -> usize;
 
@@ -144,6 +151,30 @@ pub trait Environment: Send {
         None
     }
 
+    /// Name as in a bundle's contract.
+    fn id(&self) -> &'static str {
+        self.description().id
+    }
+    /// Version of the environment's behaviour.
+    fn version(&self) -> &'static str {
+        self.description().version
+    }
+    /// Time between two control steps, in seconds.
+    fn control_period_s(&self) -> f64 {
+        self.description().control_period_s
+    }
+    /// Name of every element of an observation.
+    fn observation_names(&self) -> &'static [&'static str] {
+        self.description().observation_names
+    }
+    /// Name of every element of an action.
+    fn action_names(&self) -> &'static [&'static str] {
+        self.description().action_names
+    }
+    /// Names of the sub-tasks that are watched, in a fixed order.
+    fn sub_tasks(&self) -> &'static [&'static str] {
+        self.description().sub_tasks
+    }
     /// Elements of an observation.
     fn observation_len(&self) -> usize {
         self.observation_names().len()

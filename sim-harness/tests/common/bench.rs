@@ -6,7 +6,9 @@ use std::sync::LazyLock;
 use lads_compiler::Contract;
 use lads_core::Policy;
 use lads_host::Opened;
-use lads_sim::environment::{ActionError, Completion, Environment, EpisodeSeed, latch};
+use lads_sim::environment::{
+    ActionError, Completion, Description, Environment, EpisodeSeed, latch,
+};
 use lads_sim::random::Stream;
 
 static TINY: LazyLock<Opened> = LazyLock::new(|| {
@@ -25,33 +27,19 @@ pub fn tiny_contract() -> &'static Contract {
     TINY.bundle().unwrap().contract()
 }
 
-/// Identity and shape of the environment; tests change one field at a time.
-#[derive(Clone)]
-pub struct Spec {
-    pub id: &'static str,
-    pub version: &'static str,
-    pub control_period_s: f64,
-    pub observation_names: &'static [&'static str],
-    pub action_names: &'static [&'static str],
-    pub sub_tasks: &'static [&'static str],
-}
-
-impl Default for Spec {
-    fn default() -> Self {
-        Self {
-            id: "tiny-bench",
-            version: "1",
-            control_period_s: 0.05,
-            observation_names: &["joint1", "joint2", "drawer", "lamp", "lever"],
-            action_names: &["joint1_velocity", "joint2_velocity", "gripper"],
-            sub_tasks: &["drawer", "lamp", "lever"],
-        }
-    }
-}
+/// Describes the environment; tests change one field at a time.
+pub const DESCRIPTION: Description = Description {
+    id: "tiny-bench",
+    version: "1",
+    control_period_s: 0.05,
+    observation_names: &["joint1", "joint2", "drawer", "lamp", "lever"],
+    action_names: &["joint1_velocity", "joint2_velocity", "gripper"],
+    sub_tasks: &["drawer", "lamp", "lever"],
+};
 
 /// Five numbers that drift with the actions and with noise, inside the contract's limits; a sub-task is done once its number is high.
 pub struct Bench {
-    spec: Spec,
+    description: Description,
     stream: Stream,
     state: [f64; 5],
     observation: [f64; 5],
@@ -60,10 +48,10 @@ pub struct Bench {
 }
 
 impl Bench {
-    pub fn new(spec: Spec) -> Self {
+    pub fn new(description: Description) -> Self {
         let (state, observation) = ([0.0; 5], [0.0; 5]);
         Self {
-            spec,
+            description,
             stream: Stream::new(&[]),
             state,
             observation,
@@ -80,23 +68,8 @@ impl Bench {
 }
 
 impl Environment for Bench {
-    fn id(&self) -> &'static str {
-        self.spec.id
-    }
-    fn version(&self) -> &'static str {
-        self.spec.version
-    }
-    fn observation_names(&self) -> &'static [&'static str] {
-        self.spec.observation_names
-    }
-    fn action_names(&self) -> &'static [&'static str] {
-        self.spec.action_names
-    }
-    fn sub_tasks(&self) -> &'static [&'static str] {
-        self.spec.sub_tasks
-    }
-    fn control_period_s(&self) -> f64 {
-        self.spec.control_period_s
+    fn description(&self) -> &Description {
+        &self.description
     }
     fn max_steps(&self, _split: &str) -> usize {
         40

@@ -15,7 +15,8 @@ use thiserror::Error;
 
 use crate::assets::{MissingAssets, OtherMujoco, asset, check_mujoco, remedy};
 use crate::environment::{
-    ActionError, Completion, Environment, EpisodeSeed, Stage, View, check_action, latch,
+    ActionError, Completion, Description, Environment, EpisodeSeed, Stage, View, check_action,
+    latch,
 };
 use crate::frames::{Rendering, thin};
 use crate::random::Stream;
@@ -30,6 +31,15 @@ use spec::{
 pub const ID: &str = "franka-kitchen";
 /// Version of the environment's behaviour.
 pub const VERSION: &str = "1";
+
+const DESCRIPTION: Description = Description {
+    id: ID,
+    version: VERSION,
+    control_period_s: CONTROL_PERIOD_S,
+    observation_names: &OBSERVATION_NAMES,
+    action_names: &ACTION_NAMES,
+    sub_tasks: &SUB_TASK_NAMES,
+};
 
 /// Site that marks the gripper in pictures.
 const GRIPPER: &str = "end_effector";
@@ -151,28 +161,8 @@ impl Kitchen {
 }
 
 impl Environment for Kitchen {
-    fn id(&self) -> &'static str {
-        ID
-    }
-
-    fn version(&self) -> &'static str {
-        VERSION
-    }
-
-    fn observation_names(&self) -> &'static [&'static str] {
-        &OBSERVATION_NAMES
-    }
-
-    fn action_names(&self) -> &'static [&'static str] {
-        &ACTION_NAMES
-    }
-
-    fn sub_tasks(&self) -> &'static [&'static str] {
-        &SUB_TASK_NAMES
-    }
-
-    fn control_period_s(&self) -> f64 {
-        CONTROL_PERIOD_S
+    fn description(&self) -> &Description {
+        &DESCRIPTION
     }
 
     fn max_steps(&self, _split: &str) -> usize {

@@ -21,7 +21,8 @@ use thiserror::Error;
 
 use crate::assets::{MissingAssets, OtherMujoco, asset, check_mujoco, remedy};
 use crate::environment::{
-    ActionError, Completion, Environment, EpisodeSeed, Stage, View, check_action, latch,
+    ActionError, Completion, Description, Environment, EpisodeSeed, Stage, View, check_action,
+    latch,
 };
 use crate::frames::{Rendering, thin};
 use crate::random::Stream;
@@ -38,6 +39,15 @@ use spec::{
 pub const ID: &str = "lorel-table";
 /// Version of the environment's behaviour.
 pub const VERSION: &str = "1";
+
+const DESCRIPTION: Description = Description {
+    id: ID,
+    version: VERSION,
+    control_period_s: CONTROL_PERIOD_S,
+    observation_names: &OBSERVATION_NAMES,
+    action_names: &ACTION_NAMES,
+    sub_tasks: &SUB_TASK_NAMES,
+};
 /// Name of the only noise level, which has no noise.
 pub const NOISE: &str = "none";
 /// Number of settled postures above the mugs.
@@ -253,28 +263,8 @@ fn place_mug(position: &mut [f64], spread: f64, stream: &mut Stream) {
 }
 
 impl Environment for Lorel {
-    fn id(&self) -> &'static str {
-        ID
-    }
-
-    fn version(&self) -> &'static str {
-        VERSION
-    }
-
-    fn observation_names(&self) -> &'static [&'static str] {
-        &OBSERVATION_NAMES
-    }
-
-    fn action_names(&self) -> &'static [&'static str] {
-        &ACTION_NAMES
-    }
-
-    fn sub_tasks(&self) -> &'static [&'static str] {
-        &SUB_TASK_NAMES
-    }
-
-    fn control_period_s(&self) -> f64 {
-        CONTROL_PERIOD_S
+    fn description(&self) -> &Description {
+        &DESCRIPTION
     }
 
     fn max_steps(&self, split: &str) -> usize {
