@@ -2,12 +2,10 @@
 //! calls clear, repeated calls, noise, rings as windows and row by row, queues, recurrent states,
 //! images and integers. Without attention, the results agree bit for bit.
 
-mod support;
-
+use crate::support::shapes::{self, CODES, GEAR, LEANS, MEMORY, NOISE, PASSES, STEPS, WORDS};
+use crate::support::{Random, attend, wide, with_controller};
 use lads_core::{ChannelId, Data, Instruction, InstructionError, Noise, StepError};
 use lads_image::records::Fill;
-use support::shapes::{self, CODES, GEAR, LEANS, MEMORY, NOISE, PASSES, STEPS, WORDS};
-use support::{Random, attend, wide, with_controller};
 
 /// Returns random actions that nothing clips.
 fn small(random: &mut Random) -> [f32; 2] {
@@ -128,7 +126,7 @@ fn denoised(observation: &[f32], noise: &[f32]) -> [f32; 2] {
 /// tested against.
 fn normals(seed: u64) -> Vec<f32> {
     let head = format!("draws {seed} ");
-    let row = include_str!("normals.txt")
+    let row = include_str!("../normals.txt")
         .lines()
         .find_map(|line| line.strip_prefix(&head))
         .expect("it is in the table");

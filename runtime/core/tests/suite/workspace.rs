@@ -1,10 +1,8 @@
 //! Tests of a controller's memory: its size, its owner, and its contents beforehand.
 
-mod support;
-
+use crate::support::assemble::parts;
+use crate::support::{Memory, Model, Random, Spec};
 use lads_core::{Controller, Instruction, Isa, Workspace};
-use support::assemble::parts;
-use support::{Memory, Model, Random, Spec};
 
 fn tiny() -> Model {
     Model::random(Spec::TINY, 11)

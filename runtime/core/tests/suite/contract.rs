@@ -1,16 +1,15 @@
 //! Tests of every rule about the frame of an image, its contract and its recorded episode, violated
 //! once.
 
-mod support;
-
+use crate::support;
+use crate::support::assemble::{self, ACTION, ACTIONS, OBSERVATION, WORDS};
+use crate::support::layout::section_row;
+use crate::support::writer::Parts;
+use crate::support::{Image, Model, Spec, shapes};
 use lads_core::{ChannelId, ContractError, Policy, PolicyError};
 use lads_image::format::{CRC_WORD, FormatError, Tag};
 use lads_image::records::{self, DType, Role};
 use lads_image::tables::TablesError;
-use support::assemble::{self, ACTION, ACTIONS, OBSERVATION, WORDS};
-use support::layout::section_row;
-use support::writer::Parts;
-use support::{Image, Model, Spec, shapes};
 
 fn lads() -> Parts {
     assemble::parts(&Model::random(Spec::TINY, 11)).with_golden(4)

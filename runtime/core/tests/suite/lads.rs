@@ -1,10 +1,8 @@
 //! Compares the controller with the naive model, which computes everything anew in 64 bits.
 
-mod support;
-
+use crate::support::assemble::parts;
+use crate::support::{Memory, Model, Random, Spec};
 use lads_core::{Controller, Instruction};
-use support::assemble::parts;
-use support::{Memory, Model, Random, Spec};
 
 fn tiny() -> Model {
     Model::random(Spec::TINY, 11)

@@ -1,16 +1,14 @@
 //! Tests that another policy takes the place of the running one: it has to fit, and no action
 //! jumps.
 
-mod support;
-
+use crate::support::assemble::{ACTION, parts};
+use crate::support::writer::Parts;
+use crate::support::{Image, Memory, Model, Random, Spec, given, observe, shapes};
 use lads_core::{
     Controller, Fallback, GuardConfig, GuardedController, Instruction, Intervention, Limits,
     Policy, SwapError, Workspace,
 };
 use lads_image::records;
-use support::assemble::{ACTION, parts};
-use support::writer::Parts;
-use support::{Image, Memory, Model, Random, Spec, given, observe, shapes};
 
 fn lads(seed: u64) -> Parts {
     parts(&Model::random(Spec::TINY, seed)).with_golden(12)

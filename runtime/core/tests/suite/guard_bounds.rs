@@ -1,12 +1,10 @@
 //! Tests that a guard's output is finite, inside the limits and no faster than allowed, whatever
 //! comes in.
 
-mod support;
-
+use crate::support::Memory;
+use crate::support::guarding::{PERIOD, guarded, image};
 use lads_core::{Fallback, GuardConfig, GuardError, GuardedController, Instruction, Limits, Tick};
 use proptest::prelude::*;
-use support::Memory;
-use support::guarding::{PERIOD, guarded, image};
 
 #[test]
 fn configurations_that_contradict_the_contract_are_refused() {

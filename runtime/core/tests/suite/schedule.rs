@@ -5,15 +5,13 @@
     reason = "what is refused is compared with nothing or an error"
 )]
 
-mod support;
-
+use crate::support::assemble::{self, ACT, CONTEXT, DECIDE, ENCODE, INSTRUCT, LOGITS, PLAN, START};
+use crate::support::draft::Draft;
+use crate::support::shapes::{self, MEMORY};
+use crate::support::writer::{Call, Parts, counted_work};
+use crate::support::{Model, Spec};
 use lads_core::{PolicyError, ScheduleError};
 use lads_image::records::{self, Event, Fill, Repeat, Scope, When};
-use support::assemble::{self, ACT, CONTEXT, DECIDE, ENCODE, INSTRUCT, LOGITS, PLAN, START};
-use support::draft::Draft;
-use support::shapes::{self, MEMORY};
-use support::writer::{Call, Parts, counted_work};
-use support::{Model, Spec};
 
 fn lads() -> Parts {
     assemble::parts(&Model::random(Spec::TINY, 11))

@@ -1,18 +1,17 @@
 //! Tests that a refused call leaves the controller unchanged: its answers are, bit for bit, those
 //! of a controller that was never asked.
 
-mod support;
-
+use crate::support;
+use crate::support::assemble::parts;
+use crate::support::draft::Draft;
+use crate::support::writer::{Call, Parts};
+use crate::support::{Image, Memory, Model, Random, Spec, given, observe, shapes};
 use lads_core::{
     ChannelId, Controller, Data, Decision, InputError, Instruction, InstructionError, Noise,
     Policy, RunError, StepError, StepReport,
 };
 use lads_image::op::{self, UnaryKind};
 use lads_image::records::{Event, Scope};
-use support::assemble::parts;
-use support::draft::Draft;
-use support::writer::{Call, Parts};
-use support::{Image, Memory, Model, Random, Spec, given, observe, shapes};
 
 const STEPS: usize = 30;
 

@@ -1,14 +1,13 @@
 //! Tests of the rules of a controller's calls.
 
-mod support;
-
+use crate::support;
+use crate::support::assemble::{ACTIONS, OBSERVATION, OBSERVATIONS, parts};
+use crate::support::{Image, Memory, Model, Random, Spec, with_controller};
 use lads_core::{
     ChannelId, Controller, DType, Data, Decision, EncodeError, FollowError, InputError,
     Instruction, Interval, Noise, Role, StepError,
 };
 use lads_image::records::{Beyond, NoiseRule, SelectionRule};
-use support::assemble::{ACTIONS, OBSERVATION, OBSERVATIONS, parts};
-use support::{Image, Memory, Model, Random, Spec, with_controller};
 
 fn tiny() -> Model {
     Model::random(Spec::TINY, 11)

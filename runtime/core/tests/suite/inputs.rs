@@ -1,9 +1,8 @@
 //! Tests that values given for the channels of a step match the contract, or the step is refused.
 
-mod support;
-
+use crate::support;
+use crate::support::with_controller;
 use lads_core::{ChannelId, Data, InputError, StepError};
-use support::with_controller;
 
 #[test]
 fn what_is_given_has_to_be_what_the_contract_says() {

@@ -1,12 +1,10 @@
 //! Tests that the self-test passes on a sound image and names the first step that differs on one
 //! that is not.
 
-mod support;
-
+use crate::support::assemble::parts;
+use crate::support::writer::Parts;
+use crate::support::{Memory, Model, Spec, shapes, with_controller};
 use lads_core::{Decision, InputError, Instruction, SelfTestError, StepError};
-use support::assemble::parts;
-use support::writer::Parts;
-use support::{Memory, Model, Spec, shapes, with_controller};
 
 fn recorded() -> Parts {
     parts(&Model::random(Spec::TINY, 11)).with_golden(20)

@@ -1,13 +1,11 @@
 //! Runs a million guarded steps with random instructions, resets and faults: every output is
 //! finite, and no memory is taken.
 //!
-//! `cargo test --release -p lads-core --test soak -- --ignored`
+//! `cargo test --release -p lads-core --test suite -- --ignored`
 
-mod support;
-
+use crate::support::assemble::parts;
+use crate::support::{Memory, Model, Random, Spec};
 use lads_core::{Fallback, GuardConfig, GuardedController, Instruction, Tick};
-use support::assemble::parts;
-use support::{Memory, Model, Random, Spec};
 
 const STEPS: u64 = 1_000_000;
 

@@ -1,8 +1,11 @@
 //! Tests that opening images that are broken, by accident or on purpose, and running those that
 //! open, gives `Ok` or `Err`, never a panic.
 
-mod support;
-
+use crate::support;
+use crate::support::assemble::{self, RECORD};
+use crate::support::layout::section_row;
+use crate::support::writer::Parts;
+use crate::support::{Image, Model, Random, Spec, given, observe, shapes};
 use lads_core::{
     ChannelId, Controller, Data, Instruction, Noise, Policy, PolicyError, Role, RunError,
     StepError, Workspace,
@@ -12,10 +15,6 @@ use lads_image::format::{FormatError, Tag};
 use lads_image::op::Op;
 use lads_image::tables::TablesError;
 use proptest::prelude::*;
-use support::assemble::{self, RECORD};
-use support::layout::section_row;
-use support::writer::Parts;
-use support::{Image, Model, Random, Spec, given, observe, shapes};
 
 /// Makes a LADS policy even smaller than the small one, because every byte of it is flipped.
 fn lads() -> Parts {

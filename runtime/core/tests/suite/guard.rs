@@ -1,15 +1,13 @@
 //! Tests that a guard outputs only actions that are finite, inside the limits and slow enough,
 //! whatever comes in, and that it reports and counts what it did.
 
-mod support;
-
+use crate::support::assemble::parts;
+use crate::support::guarding::{PERIOD, guarded, image};
+use crate::support::{Memory, Model, Spec};
 use lads_core::{
     ActionLength, Counters, Fallback, GuardConfig, GuardReport, GuardedController, InputError,
     Instruction, Intervention, Limits, StepError, Tick,
 };
-use support::assemble::parts;
-use support::guarding::{PERIOD, guarded, image};
-use support::{Memory, Model, Spec};
 
 /// Runs `f` on a guarded controller that is armed and has an instruction.
 fn ready<T>(config: &GuardConfig, f: impl FnOnce(&mut GuardedController) -> T) -> T {

@@ -5,19 +5,17 @@
     reason = "what is refused is compared with nothing or an error"
 )]
 
-mod support;
-
+use crate::support::assemble::{
+    self, ACT, ACTION, CONTEXT, ENCODE, INSTRUCT, LOGITS, LOOKUP, OBSERVATION, PLAN, START,
+};
+use crate::support::draft::{Draft, bound};
+use crate::support::shapes;
+use crate::support::writer::Parts;
+use crate::support::{Model, Spec};
 use lads_core::ScheduleError;
 use lads_image::Fault;
 use lads_image::op::{Copy, IntSlot, Op, Place, Span};
 use lads_image::records::{self, Fill, Scope, SourceKind};
-use support::assemble::{
-    self, ACT, ACTION, CONTEXT, ENCODE, INSTRUCT, LOGITS, LOOKUP, OBSERVATION, PLAN, START,
-};
-use support::draft::{Draft, bound};
-use support::shapes;
-use support::writer::Parts;
-use support::{Model, Spec};
 
 fn lads() -> Parts {
     assemble::parts(&Model::random(Spec::TINY, 11))

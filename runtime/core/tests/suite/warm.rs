@@ -1,13 +1,12 @@
 //! Tests that warming changes nothing, whatever the state of the context, and runs code that only
 //! later steps run.
 
-mod support;
-
+use crate::support;
+use crate::support::assemble::parts;
+use crate::support::draft::kv_len;
+use crate::support::{Image, Memory, Model, Random, Spec, given, observe, shapes};
 use lads_core::Instruction;
 use lads_image::records::Beyond;
-use support::assemble::parts;
-use support::draft::kv_len;
-use support::{Image, Memory, Model, Random, Spec, given, observe, shapes};
 
 /// Returns the bits of an episode's results, with or without warming before every step.
 fn episode(image: &Image, warms: bool) -> Vec<u32> {
