@@ -99,7 +99,7 @@ HOST = $(shell rustc --print host-tuple)
 SANITIZED = --target $(HOST) --tests -p lads-kernels -p lads-image -p lads-core
 # Runs its own binary under valgrind, to count instructions.
 COUNTED = --skip every_number_takes_the_same --skip inputs_take_the_same
-BOUNDARY = --target $(HOST) -p lads-ffi --test abi --test refusals
+BOUNDARY = --target $(HOST) -p lads-ffi --test boundary
 MEMCHECK = CARGO_TARGET_$(shell echo $(HOST) | tr a-z- A-Z_)_RUNNER="valgrind --quiet --error-exitcode=99" PROPTEST_CASES=8
 
 ## sanitize: the tests of kernels, core and C boundary with AddressSanitizer, then under valgrind; some minutes

@@ -1,12 +1,10 @@
 //! Tests that another image takes the place of the running one, through C.
 
-mod host;
-
 use core::ptr::null_mut;
 
-use host::support::assemble::ACTION;
-use host::support::{Image, Random, shapes};
-use host::*;
+use crate::host::support::assemble::ACTION;
+use crate::host::support::{Image, Random, shapes};
+use crate::host::*;
 use lads_ffi::*;
 
 /// Largest change per second; a control period takes 0.08 s.

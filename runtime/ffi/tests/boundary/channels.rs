@@ -1,13 +1,11 @@
 //! Tests of policies with any channels through C: images, integers, noise, no instruction, chunks
 //! without a selection.
 
-mod host;
-
 use core::ptr::null_mut;
 
-use host::support::shapes::{self, CAMERA, GEAR, NOISE, TICKS};
-use host::support::{Memory, Random, Values, given, observe};
-use host::*;
+use crate::host::support::shapes::{self, CAMERA, GEAR, NOISE, TICKS};
+use crate::host::support::{Memory, Random, Values, given, observe};
+use crate::host::*;
 use lads_ffi::*;
 
 fn inputs(values: &[(lads_core::ChannelId, Values)]) -> Vec<LadsInput> {

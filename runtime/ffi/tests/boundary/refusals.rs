@@ -1,12 +1,10 @@
 //! Tests that every wrong pointer, length, image or order of calls is refused with its number.
 
-mod host;
-
 use core::ffi::c_void;
 use core::ptr::{null, null_mut};
 
-use host::support::assemble::ACTION;
-use host::*;
+use crate::host::support::assemble::ACTION;
+use crate::host::*;
 use lads_ffi::*;
 
 #[test]

@@ -1,10 +1,8 @@
 //! Tests of structs that begin with their size: older and newer callers, and invalid sizes.
 
-mod host;
-
 use core::ptr::{null, null_mut};
 
-use host::*;
+use crate::host::*;
 use lads_ffi::*;
 
 /// A struct as a newer header might have it: with fields that this library does not know.

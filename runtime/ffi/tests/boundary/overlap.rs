@@ -6,11 +6,9 @@
     reason = "the places are aligned to eight bytes, which is what is tried"
 )]
 
-mod host;
-
 use core::ptr::{null, null_mut};
 
-use host::*;
+use crate::host::*;
 use lads_ffi::*;
 
 const OBSERVATION: [f32; 3] = [0.3, -0.2, 0.7];

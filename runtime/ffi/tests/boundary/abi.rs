@@ -1,14 +1,12 @@
 //! Tests of the C functions, called from Rust as C would call them: their results equal the
 //! controller's.
 
-mod host;
-
 use core::ffi::CStr;
 use core::ptr::{null, null_mut};
 use core::slice;
 
-use host::support::{Memory, Random};
-use host::*;
+use crate::host::support::{Memory, Random};
+use crate::host::*;
 use lads_core::Instruction;
 use lads_ffi::*;
 

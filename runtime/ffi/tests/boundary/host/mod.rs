@@ -1,7 +1,6 @@
 //! Memory and helpers of a C program around the library, for tests that call it as C does.
-#![allow(dead_code, reason = "each suite uses its part")]
 
-#[path = "../../../core/tests/support/mod.rs"]
+#[path = "../../../../core/tests/support/mod.rs"]
 pub mod support;
 
 use core::ffi::c_void;
