@@ -3,7 +3,13 @@
 //! What the reference renderer draws of the same states is compared in `tests/parity/test_rendering.py`.
 #![cfg(feature = "camera")]
 
+#[path = "common/lads_run.rs"]
+mod program;
+
+use std::fs;
+use std::io::{BufRead, BufReader};
 use std::path::Path;
+use std::process::{Command, Stdio};
 use std::sync::atomic::AtomicBool;
 
 use lads_sim::assets::vendor_dir;
@@ -14,6 +20,7 @@ use lads_sim::frames::{Frames, Rendering};
 use lads_sim::kitchen::{self, Kitchen, Noise};
 use lads_sim::lorel::collect::{Settings, collect};
 use lads_sim::lorel::{Lorel, Scene};
+use program::lads_run;
 use safetensors::SafeTensors;
 
 fn scene() -> Scene {
@@ -152,4 +159,55 @@ fn a_cache_goes_on_where_it_stopped_and_is_the_same() {
     let all = (&states, &other);
     let refused = cache::make(all, &path("again"), (&open, 1), &go, &mut |_| {});
     assert!(matches!(refused, Err(CacheError::Other(_))));
+}
+
+#[test]
+fn the_shipped_policy_of_a_camera_does_what_it_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let json = folder.path().join("results.json");
+    let told = ["--instruction", "turn faucet right", "--episodes", "8"];
+    let output = lads_run("lorel-image.onnx", &told)
+        .arg("--json")
+        .arg(&json)
+        .output()
+        .unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{errors}");
+    let results: serde_json::Value = serde_json::from_slice(&fs::read(&json).unwrap()).unwrap();
+    let done = results["splits"]["atomic"]["full_success_count"].as_u64();
+    // Of some five; a policy that is told something else turns it once in sixteen times.
+    assert!(done.unwrap() >= 2, "{done:?} of 8 episodes");
+}
+
+/// Names of the threads of `lads-run` while it waits for states to draw, started with a number of Mesa's threads or none.
+#[cfg(target_os = "linux")]
+fn threads(of_mesa: Option<&str>) -> Vec<String> {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_lads-run"));
+    command.args(["frames", "--stream", "lorel-table"]);
+    match of_mesa {
+        Some(count) => command.env("LP_NUM_THREADS", count),
+        None => command.env_remove("LP_NUM_THREADS"),
+    };
+    let (stdin, stdout) = (Stdio::piped(), Stdio::piped());
+    let mut running = command.stdin(stdin).stdout(stdout).spawn().unwrap();
+    let mut heading = String::new();
+    let mut answers = BufReader::new(running.stdout.take().unwrap());
+    answers.read_line(&mut heading).unwrap();
+    assert!(heading.contains("positions"), "{heading}");
+    let tasks = fs::read_dir(format!("/proc/{}/task", running.id())).unwrap();
+    let names = tasks.map(|task| fs::read_to_string(task.unwrap().path().join("comm")).unwrap());
+    let names = names.collect();
+    drop(running.stdin.take());
+    assert!(running.wait().unwrap().success());
+    names
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn the_renderer_has_no_threads_of_its_own_unless_it_is_told_to() {
+    let mesa = |names: &[String]| names.iter().any(|name| name.starts_with("llvmpipe"));
+    assert!(!mesa(&threads(None)));
+    if !mesa(&threads(Some("2"))) {
+        println!("skipped: this machine draws with other than Mesa's software renderer");
+    }
 }

@@ -13,6 +13,7 @@ import re
 import sys
 
 os.environ["MUJOCO_GL"] = "egl"
+os.environ["LP_NUM_THREADS"] = "0"  # as lads-run draws: sim-harness/src/film/driver.rs
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 from safetensors.numpy import load_file  # noqa: E402

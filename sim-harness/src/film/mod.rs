@@ -10,6 +10,8 @@ pub mod camera;
 pub mod canvas;
 #[cfg(feature = "record")]
 pub mod caption;
+#[cfg(unix)]
+pub mod driver;
 #[cfg(feature = "record")]
 pub mod file;
 #[cfg(feature = "record")]

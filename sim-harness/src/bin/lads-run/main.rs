@@ -39,6 +39,8 @@ use rollouts::Extra;
 const INTERRUPTED: u8 = 130;
 
 fn main() -> ExitCode {
+    #[cfg(all(unix, feature = "camera"))]
+    lads_sim::film::driver::draw_on_own_thread();
     let arguments: Arguments = match command::arguments_moved("lads-run", &MOVED) {
         Ok(arguments) => arguments,
         Err(code) => return code,
