@@ -37,6 +37,7 @@ pub fn built(programs: &[&str]) -> PathBuf {
         // With an example, cargo counts in the dependencies of tests, whose features are those of this build.
         .args(["--example", "controller"])
         .args(programs)
+        .args(folder.ends_with("release").then_some("--release"))
         .arg("--target-dir")
         .arg(folder.parent().expect("it is a profile's"))
         .current_dir(project_path("."))

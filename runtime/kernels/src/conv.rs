@@ -18,9 +18,9 @@
 use core::hint::black_box;
 
 use crate::dispatch::{Isa, Kernel};
-use crate::elementwise::assign;
+use crate::ending::Ending;
 use crate::lanes::{Block, LANES};
-use crate::linear::{Activation, block};
+use crate::linear::Activation;
 use crate::simd::{Simd, prefetch_ahead};
 
 /// Number of words of weights that are used for one tile of pixels before the next: a third of a
@@ -225,7 +225,7 @@ type Sums = [[Block; MOST[1]]; MOST[0]];
 
 impl Kernel for Pixels<'_> {
     #[inline(always)]
-    fn run<S: Simd>(mut self, simd: S) {
+    fn run<S: Simd>(self, simd: S) {
         let conv = self.conv;
         let runs = Runs::of(&conv.sweep, conv.c);
         let pixels = conv.sweep.out[0] * conv.sweep.out[1];
@@ -233,6 +233,12 @@ impl Kernel for Pixels<'_> {
         let near = (NEAR / (self.k * LANES).max(1)).min(panels);
         let near = near.next_multiple_of(S::PANELS).max(S::PANELS);
         let mut sums = [[[0.0; LANES]; MOST[1]]; MOST[0]];
+        let ending = Ending {
+            n: conv.n,
+            bias: conv.bias,
+            activation: conv.activation,
+            accumulate: conv.accumulate,
+        };
         for first_panel in (0..panels).step_by(near) {
             let end = panels.min(first_panel + near);
             let mut first = 0;
@@ -242,12 +248,16 @@ impl Kernel for Pixels<'_> {
                 let at = conv.sweep.pixels(first);
                 for panel in (first_panel..end).step_by(S::PANELS) {
                     let w = (conv.w, self.k, panel);
-                    if S::PANELS == 2 && end - panel >= 2 {
+                    let taken = if S::PANELS == 2 && end - panel >= 2 {
                         some::<S, 2>(simd, size, &runs, w, self.x, &at, &mut sums);
-                        self.finish(simd, &sums, &at, [size, panel, 2]);
+                        2
                     } else {
                         some::<S, 1>(simd, size, &runs, w, self.x, &at, &mut sums);
-                        self.finish(simd, &sums, &at, [size, panel, 1]);
+                        1
+                    };
+                    for (b, sums) in sums.iter().enumerate().take(black_box(taken)) {
+                        let place = [size, (panel + b) * LANES];
+                        ending.end(simd, (sums, None), &at, place, self.y);
                     }
                 }
                 first += size;
@@ -275,69 +285,6 @@ fn some<S: Simd, const B: usize>(
         2 => sums::<S, 2, B>(simd, runs, w, x, at, out),
         _ => sums::<S, 1, B>(simd, runs, w, x, at, out),
     }
-}
-
-impl Pixels<'_> {
-    /// Applies bias, accumulation and activation to `size` pixels and the panels from `panel` on,
-    /// and stores them. Compiled once for all sizes and not unrolled for each, because activations
-    /// are long.
-    #[inline(always)]
-    fn finish<S: Simd>(
-        &mut self,
-        simd: S,
-        sums: &Sums,
-        at: &[[usize; 2]; MOST[1]],
-        [size, panel, panels]: [usize; 3],
-    ) {
-        let mut spare = [0.0; LANES];
-        for (b, sums) in sums.iter().enumerate().take(black_box(panels)) {
-            let first = (panel + b) * LANES;
-            let bias = simd.load(block(self.conv.bias, first, &mut spare));
-            let width = LANES.min(self.conv.n - first);
-            for (sum, [_, at]) in sums.iter().zip(at).take(black_box(size)) {
-                let y = self
-                    .y
-                    .get_mut(at.saturating_add(first)..)
-                    .unwrap_or(&mut []);
-                let v = simd.add(simd.load(sum), bias);
-                let Conv {
-                    activation,
-                    accumulate,
-                    ..
-                } = *self.conv;
-                store(simd, (activation, accumulate), v, y, width);
-            }
-        }
-    }
-}
-
-/// Adds what is there if asked to, applies the activation to the first `width` of sixteen outputs,
-/// and stores them.
-#[inline(always)]
-pub(crate) fn store<S: Simd>(
-    simd: S,
-    (activation, accumulate): (Activation, bool),
-    mut v: S::V,
-    y: &mut [f32],
-    width: usize,
-) {
-    if width == LANES
-        && let Some(y) = y.first_chunk_mut()
-    {
-        if accumulate {
-            v = simd.add(v, simd.load(y));
-        }
-        simd.store(activation.apply(simd, v), y);
-        return;
-    }
-    let mut spare = [0.0; LANES];
-    let y = y.get_mut(..width).unwrap_or(&mut []);
-    if accumulate {
-        assign(&mut spare, y);
-        v = simd.add(v, simd.load(&spare));
-    }
-    simd.store(activation.apply(simd, v), &mut spare);
-    assign(y, &spare);
 }
 
 /// Computes the sums of `P` pixels with `B` panels of `k` weights each, starting at panel `first`.

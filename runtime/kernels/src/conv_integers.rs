@@ -18,8 +18,9 @@
 
 use core::hint::black_box;
 
-use crate::conv::{NEAR, Runs, Sweep, store};
+use crate::conv::{NEAR, Runs, Sweep};
 use crate::dispatch::{Isa, Kernel};
+use crate::ending::Ending;
 use crate::integers::Integer;
 use crate::lanes::{Block, LANES};
 use crate::linear::{Activation, INTEGERS, block};
@@ -199,7 +200,7 @@ type Sums = [[Block; MOST[1]]; MOST[0]];
 
 impl<W: Integer> Kernel for Pixels<'_, W> {
     #[inline(always)]
-    fn run<S: Simd>(mut self, simd: S) {
+    fn run<S: Simd>(self, simd: S) {
         let conv = self.conv;
         let [wide, high] = S::INTEGER_TILE;
         let pixels = conv.sweep.out[0] * conv.sweep.out[1];
@@ -208,6 +209,13 @@ impl<W: Integer> Kernel for Pixels<'_, W> {
             .min(panels);
         let near = near.next_multiple_of(wide).max(wide);
         let mut sums = [[[0.0; LANES]; MOST[1]]; MOST[0]];
+        let ending = Ending {
+            n: conv.n,
+            bias: conv.bias,
+            activation: conv.activation,
+            accumulate: conv.accumulate,
+        };
+        let (whole, mut spare) = (simd.splat(self.scale), [0.0; LANES]);
         for first_panel in (0..panels).step_by(near) {
             let end = panels.min(first_panel + near);
             let mut first = 0;
@@ -222,7 +230,12 @@ impl<W: Integer> Kernel for Pixels<'_, W> {
                         2.. if wide >= 2 => self.some::<S, 2>(simd, size, panel, &at, &mut sums),
                         _ => self.some::<S, 1>(simd, size, panel, &at, &mut sums),
                     };
-                    self.finish(simd, &sums, &at, [size, panel, taken]);
+                    for (b, sums) in sums.iter().enumerate().take(black_box(taken)) {
+                        let first = (panel + b) * LANES;
+                        let scales = simd.load(block(self.scales, first, &mut spare));
+                        let scales = Some(simd.mul(whole, scales));
+                        ending.end(simd, (sums, scales), &at, [size, first], self.y);
+                    }
                     panel += taken;
                 }
                 first += size;
@@ -251,40 +264,6 @@ impl<W: Integer> Pixels<'_, W> {
             _ => self.sums::<S, 1, B>(simd, panel, at, out),
         }
         B
-    }
-
-    /// Applies scales, bias, accumulation and activation to `size` pixels and the panels from `panel`
-    /// on, and stores them. Compiled once for all sizes and not unrolled for each, because
-    /// activations are long.
-    #[inline(always)]
-    fn finish<S: Simd>(
-        &mut self,
-        simd: S,
-        sums: &Sums,
-        at: &[[usize; 2]; MOST[1]],
-        [size, panel, panels]: [usize; 3],
-    ) {
-        let (mut spare, mut other) = ([0.0; LANES], [0.0; LANES]);
-        let whole = simd.splat(self.scale);
-        for (b, sums) in sums.iter().enumerate().take(black_box(panels)) {
-            let first = (panel + b) * LANES;
-            let scales = simd.mul(whole, simd.load(block(self.scales, first, &mut spare)));
-            let bias = simd.load(block(self.conv.bias, first, &mut other));
-            let width = LANES.min(self.conv.n - first);
-            for (sum, [_, at]) in sums.iter().zip(at).take(black_box(size)) {
-                let y = self
-                    .y
-                    .get_mut(at.saturating_add(first)..)
-                    .unwrap_or(&mut []);
-                let v = simd.mul(simd.load(sum), scales);
-                let IntegerConv {
-                    activation,
-                    accumulate,
-                    ..
-                } = *self.conv;
-                store(simd, (activation, accumulate), simd.add(v, bias), y, width);
-            }
-        }
     }
 
     /// Computes the sums of `P` pixels with the `B` panels from `first` on. Missing runs add nothing.

@@ -10,7 +10,7 @@
 //! lanes; a few pixels at a time share the weights that are read. Each output is one sum in the
 //! order of the kernel.
 
-use core::hint::black_box;
+use crate::ending::Ending;
 
 use crate::conv::Sweep;
 use crate::dispatch::{Isa, Kernel};
@@ -87,10 +87,16 @@ const MOST: usize = 4;
 
 impl Kernel for Channels<'_> {
     #[inline(always)]
-    fn run<S: Simd>(mut self, simd: S) {
+    fn run<S: Simd>(self, simd: S) {
         let layer = self.layer;
         let pixels = layer.sweep.out[0] * layer.sweep.out[1];
         let mut out = [[0.0; LANES]; MOST];
+        let ending = Ending {
+            n: layer.c,
+            bias: layer.bias,
+            activation: layer.activation,
+            accumulate: false,
+        };
         let mut first = 0;
         while first < pixels {
             let at = layer.sweep.pixels(first);
@@ -107,42 +113,9 @@ impl Kernel for Channels<'_> {
                     2 => sums::<S, 2>(simd, layer, self.x, &at, channel, &mut out),
                     _ => sums::<S, 1>(simd, layer, self.x, &at, channel, &mut out),
                 }
-                self.finish(simd, &out, &at, [size, channel]);
+                ending.end(simd, (&out, None), &at, [size, channel], self.y);
             }
             first += size;
-        }
-    }
-}
-
-impl Channels<'_> {
-    /// Applies bias and activation to sixteen channels of `size` pixels and stores them. Compiled
-    /// once for all sizes and not unrolled for each, because activations are long.
-    #[inline(always)]
-    fn finish<S: Simd>(
-        &mut self,
-        simd: S,
-        sums: &[Block; MOST],
-        at: &[[usize; 2]; MOST],
-        [size, channel]: [usize; 2],
-    ) {
-        let layer = self.layer;
-        let mut spare = [0.0; LANES];
-        let bias = simd.load(block(layer.bias, channel, &mut spare));
-        let width = LANES.min(layer.c - channel);
-        for (sum, [_, at]) in sums.iter().zip(at).take(black_box(size)) {
-            let v = layer.activation.apply(simd, simd.add(simd.load(sum), bias));
-            let y = self
-                .y
-                .get_mut(at.saturating_add(channel)..)
-                .unwrap_or(&mut []);
-            if width == LANES
-                && let Some(y) = y.first_chunk_mut()
-            {
-                simd.store(v, y);
-            } else {
-                simd.store(v, &mut spare);
-                assign(y.get_mut(..width).unwrap_or(&mut []), &spare);
-            }
         }
     }
 }

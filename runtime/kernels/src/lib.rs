@@ -39,6 +39,7 @@ mod conv_integers;
 mod depthwise;
 mod dispatch;
 mod elementwise;
+mod ending;
 mod floats;
 mod image_integers;
 mod integers;
