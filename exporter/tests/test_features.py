@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import synthetic
 import torch
+from resuming import assert_same_weights, interrupt
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 from test_training import setting_for
@@ -278,18 +279,10 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, files):
     whole, _, _ = trainer_for(tmp_path / "whole", files)
     assert whole.run(quiet=True)
     first, _, _ = trainer_for(tmp_path / "parts", files)
-    first.system.loss_of = first.system.loss
-
-    def stopping(stage, step):
-        first.stop = (stage, step) == ("low_level", 4)
-        return first.system.loss_of(stage, step)
-
-    first.system.loss = stopping
-    assert not first.run(quiet=True)
+    interrupt(first, ("low_level", 4))
     again, _, _ = trainer_for(tmp_path / "parts", files)
     assert again.run(resume=True, quiet=True)
-    for (name, one), two in zip(whole.networks.state_dict().items(), again.networks.state_dict().values(), strict=True):
-        assert torch.equal(one, two), name
+    assert_same_weights(whole, again)
 
 
 def test_weights_that_did_not_make_the_features_are_refused(tmp_path, files, monkeypatch):

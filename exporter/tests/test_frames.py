@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import synthetic
 import torch
+from resuming import assert_same_weights, interrupt
 from test_training import setting_for
 
 from lads_exporter import bundle, config, contract as contracts, dataset, frames, language, systems, training, twin
@@ -164,18 +165,10 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, files):
     whole, _, _ = trainer_for(tmp_path / "whole", files)
     assert whole.run(quiet=True)
     first, _, _ = trainer_for(tmp_path / "parts", files)
-    first.system.loss_of = first.system.loss
-
-    def stopping(stage, step):
-        first.stop = (stage, step) == ("low_level", 4)
-        return first.system.loss_of(stage, step)
-
-    first.system.loss = stopping
-    assert not first.run(quiet=True)
+    interrupt(first, ("low_level", 4))
     again, _, _ = trainer_for(tmp_path / "parts", files)
     assert again.run(resume=True, quiet=True)
-    for (name, one), two in zip(whole.networks.state_dict().items(), again.networks.state_dict().values(), strict=True):
-        assert torch.equal(one, two), name
+    assert_same_weights(whole, again)
 
 
 def test_an_encoder_that_learns_by_itself_stays_as_it_is_afterwards(tmp_path, files):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import synthetic
 import torch
+from resuming import assert_same_weights, interrupt
 from test_training import setting_for
 
 from lads_exporter import bundle, config, contract as contracts, dataset, language, systems, twin
@@ -193,23 +194,10 @@ def test_a_resumed_diffusion_equals_an_uninterrupted_one(tmp_path):
     assert whole.run(quiet=True)
     (tmp_path / "run").rename(tmp_path / "whole")
     part, _ = trainer_of(tmp_path, setting)
-    original, done = Stage.advance, 0
-
-    def counted(stage, step):
-        nonlocal done
-        done += 1
-        part.stop = done == STEPS + 20
-        return original(stage, step)
-
-    Stage.advance = counted
-    try:
-        assert not part.run(quiet=True)
-    finally:
-        Stage.advance = original
+    interrupt(part, STEPS + 20)
     resumed, _ = trainer_of(tmp_path, setting)
     assert resumed.run(resume=True, quiet=True)
-    for (name, a), b in zip(whole.networks.state_dict().items(), resumed.networks.state_dict().values()):
-        assert torch.equal(a, b), name
+    assert_same_weights(whole, resumed)
 
 
 # Losses by hand.

@@ -13,6 +13,7 @@ import onnx
 import pytest
 import synthetic
 import torch
+from resuming import assert_same_weights, interrupt
 
 from lads_exporter import config, dataset, language
 from lads_exporter.config import UserError
@@ -131,28 +132,14 @@ def test_resumed_run_equals_an_uninterrupted_one(tmp_path, schedule, stop_at):
     whole = trainer_for(tmp_path / "whole", setting)
     assert whole.run(quiet=True)
     part = trainer_for(tmp_path / "part", setting)
-    done = 0
-    original = Stage.advance
-
-    def counted(stage, step):
-        nonlocal done
-        done += 1
-        part.stop = done == stop_at
-        return original(stage, step)
-
-    Stage.advance = counted
-    try:
-        assert not part.run(quiet=True)
-    finally:
-        Stage.advance = original
+    interrupt(part, stop_at)
     with pytest.raises(UserError, match="not finished"):
         load_run(tmp_path / "part")
     resumed = trainer_for(tmp_path / "part", setting)
     with pytest.raises(UserError, match="--resume"):
         resumed.run(quiet=True)
     assert resumed.run(resume=True, quiet=True)
-    for (name, a), b in zip(whole.networks.state_dict().items(), resumed.networks.state_dict().values()):
-        assert torch.equal(a, b), name
+    assert_same_weights(whole, resumed)
 
 
 def test_a_signal_ends_in_a_checkpoint(tmp_path):
