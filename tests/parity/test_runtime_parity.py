@@ -21,13 +21,14 @@ TOLERANCE = 1e-4
 
 
 def act(bundle, instruction, observations):
-    """Runs the runtime -> plans [T], actions [T, A]."""
-    lines = "".join(json.dumps([float(x) for x in row]) + "\n" for row in observations)
+    """Runs the runtime on the channels' values [T, ...], in the policy's order -> plans [T], actions [T, A]."""
+    rows = [np.concatenate([values[t].reshape(-1).astype(float) for values in observations.values()]) for t in range(steps(observations))]
+    lines = "".join(json.dumps(row.tolist()) + "\n" for row in rows)
     command = [newest("lads"), "act", "--model", bundle, "--instruction", instruction, "--plans"]
     done = subprocess.run(command, input=lines, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     rows = [json.loads(line) for line in done.stdout.splitlines()]
-    assert len(rows) == len(observations)
+    assert len(rows) == steps(observations)
     return np.array([row[-1] for row in rows]), np.array([row[:-1] for row in rows], np.float32)
 
 
@@ -38,16 +39,21 @@ def bundle(request):
     return request.param, twin.Twin(model), contracts.of(model), golden
 
 
-def open_loop(reference, instruction, golden):
-    """Runs ONNX Runtime on the golden observations under an instruction -> its rollout, and the observations."""
-    observations = golden["channel.observation"]
-    return twin.open_loop(reference, instruction, {"observation": observations}), observations
+def steps(observations):
+    return len(next(iter(observations.values())))
+
+
+def open_loop(reference, instruction, golden, contract):
+    """Runs ONNX Runtime on the golden observations under an instruction -> its rollout, and the observations by channel."""
+    names = [channel["name"] for channel in contract["channels"] if channel["role"] == "observation"]
+    observations = {name: golden[f"channel.{name}"] for name in names}
+    return twin.open_loop(reference, instruction, observations), observations
 
 
 def test_golden_episode(bundle):
     path, reference, contract, golden = bundle
     index = int(golden["instruction"][0])
-    rollout, observations = open_loop(reference, index, golden)
+    rollout, observations = open_loop(reference, index, golden, contract)
     ours, our_actions = act(path, contract["instructions"][index]["id"], observations)
     assert (ours == rollout.selected).all() and (ours == golden["selected"]).all()
     assert np.abs(our_actions - np.stack(rollout.actions)).max() <= TOLERANCE
@@ -63,10 +69,10 @@ def test_other_instructions_on_the_same_observations(bundle, offset):
     """
     path, reference, contract, golden = bundle
     index = (int(golden["instruction"][0]) + offset) % len(contract["instructions"])
-    rollout, observations = open_loop(reference, index, golden)
+    rollout, observations = open_loop(reference, index, golden, contract)
     close = np.flatnonzero(np.array(rollout.margins) < TOLERANCE)
     period = contracts.period(contract)
-    stop = close[0] * period if len(close) else len(observations)
+    stop = close[0] * period if len(close) else steps(observations)
     assert stop > period, "a comparison of nothing"
     ours, our_actions = act(path, contract["instructions"][index]["id"], observations)
     assert (ours[:stop] == rollout.selected[:stop]).all()
