@@ -100,6 +100,8 @@ SANITIZED = --target $(HOST) --tests -p lads-kernels -p lads-image -p lads-core
 # Runs its own binary under valgrind, to count instructions.
 COUNTED = --skip every_number_takes_the_same --skip inputs_take_the_same
 BOUNDARY = --target $(HOST) -p lads-ffi --test boundary
+# Compares a controller's memory byte by byte, with the padding that nothing writes.
+PADDED = --skip leaves_a_running_controller_alone
 MEMCHECK = CARGO_TARGET_$(shell echo $(HOST) | tr a-z- A-Z_)_RUNNER="valgrind --quiet --error-exitcode=99" PROPTEST_CASES=8
 
 ## sanitize: the tests of kernels, core and C boundary with AddressSanitizer, then under valgrind; some minutes
@@ -108,7 +110,7 @@ sanitize:
 	RUSTFLAGS=-Zsanitizer=address cargo test --target-dir target/sanitize $(SANITIZED) -- $(COUNTED)
 	RUSTFLAGS=-Zsanitizer=address cargo test --target-dir target/sanitize $(BOUNDARY)
 	$(MEMCHECK) cargo test --target-dir target/sanitize/plain $(SANITIZED) -- $(COUNTED) --skip subnormal_numbers_are_zero --skip as_exact_as
-	$(MEMCHECK) cargo test --target-dir target/sanitize/plain $(BOUNDARY)
+	$(MEMCHECK) cargo test --target-dir target/sanitize/plain $(BOUNDARY) -- $(PADDED)
 
 # cargo-fuzz and a nightly toolchain are needed; what is found lies in tests/fuzz/artifacts.
 FUZZ_SECONDS ?= 60
