@@ -101,7 +101,7 @@ SANITIZED = --target $(HOST) --tests -p lads-kernels -p lads-image -p lads-core
 COUNTED = --skip every_number_takes_the_same --skip inputs_take_the_same
 BOUNDARY = --target $(HOST) -p lads-ffi --test boundary
 # Compares a controller's memory byte by byte, with the padding that nothing writes.
-PADDED = --skip leaves_a_running_controller_alone
+PADDED = --skip touches_no_byte
 MEMCHECK = CARGO_TARGET_$(shell echo $(HOST) | tr a-z- A-Z_)_RUNNER="valgrind --quiet --error-exitcode=99" PROPTEST_CASES=8
 
 ## sanitize: the tests of kernels, core and C boundary with AddressSanitizer, then under valgrind; some minutes

@@ -24,7 +24,7 @@ const SPARSE: usize = 997;
 
 /// Largest number of bytes that are flipped outside weights and golden episode, evenly spread: where each of them is a step of many passes,
 /// all of them take minutes.
-const MOST: usize = 15_000;
+const MOST: usize = 30_000;
 
 fn image(kind: &str) -> Image {
     let bundle = Bundle::open(&folder().join(format!("{kind}.onnx")));

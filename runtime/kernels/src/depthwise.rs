@@ -10,11 +10,10 @@
 //! lanes; a few pixels at a time share the weights that are read. Each output is one sum in the
 //! order of the kernel.
 
-use crate::ending::Ending;
-
 use crate::conv::Sweep;
 use crate::dispatch::{Isa, Kernel};
 use crate::elementwise::assign;
+use crate::ending::Ending;
 use crate::lanes::{Block, LANES};
 use crate::linear::{Activation, block};
 use crate::simd::Simd;

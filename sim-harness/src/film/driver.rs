@@ -1,8 +1,8 @@
 //! How Mesa draws where there is no GPU: on the thread that asks, not on threads of its own.
 //!
-//! Mesa 22.3 looks through the resources of a picture while its own threads free them, which ended a process once in some hundred thousand
-//! pictures. Pictures are small here and episodes run on all cores, so that such threads gain nothing either: without them a picture takes a
-//! tenth less.
+//! With threads of its own, Mesa 22.3 ended an evaluation of 5,050 episodes by a segmentation fault, where it looks through the resources of a
+//! picture (by the fault's address), which its threads free. It came once and could not be brought again; without such threads the same
+//! evaluation ended well. Pictures are small here and episodes run on all cores, so nothing is lost: a picture takes no longer.
 
 use std::os::unix::process::CommandExt;
 use std::process::Command;

@@ -193,15 +193,9 @@ fn options_are_checked() {
     );
 }
 
-#[test]
-fn a_refused_set_up_names_the_element_and_leaves_a_running_controller_alone() {
-    let mut host = Host::new(image());
-    let c = host.controller();
-    instruct(c, 0);
-    let mut action = [7.0; 2];
-    assert_eq!(step(c, &[0.1; 3], &mut action).0, Status::Ok);
+/// Sets up a controller wrongly in memory in which one runs, in every way, and asserts what is said.
+fn refused_set_ups(host: &mut Host) {
     let (memory, bytes, policy) = (host.memory(), host.bytes(), &raw const *host.policy);
-    let before = host.workspace.iter().map(|line| line.0).collect::<Vec<_>>();
     let refused = |options: LadsOptions| {
         let mut report = LadsReport::default();
         let (options, report) = (&raw const options, &raw mut report);
@@ -248,9 +242,39 @@ fn a_refused_set_up_names_the_element_and_leaves_a_running_controller_alone() {
         assert_eq!(init(policy, bytes - 1), Status::WorkspaceTooSmall);
         assert_eq!(init(null(), bytes), Status::Null);
     }
-    let after = host.workspace.iter().map(|line| line.0).collect::<Vec<_>>();
-    assert!(before == after, "a refusal has touched the workspace");
-    assert_eq!(step(c, &[0.1; 3], &mut action).0, Status::Ok);
+}
+
+#[test]
+fn a_refused_set_up_names_the_element_and_the_controller_goes_on() {
+    let (mut host, mut other) = (Host::new(image()), Host::new(image()));
+    let both = [host.controller(), other.controller()];
+    for c in both {
+        instruct(c, 0);
+    }
+    for i in 0..12 {
+        let actions = both.map(|c| {
+            let mut action = [7.0; 2];
+            assert_eq!(step(c, &[0.1; 3], &mut action).0, Status::Ok);
+            action.map(f32::to_bits)
+        });
+        assert_eq!(actions[0], actions[1], "step {i}");
+        refused_set_ups(&mut host);
+    }
+}
+
+#[test]
+fn a_refused_set_up_touches_no_byte() {
+    let mut host = Host::new(image());
+    let c = host.controller();
+    instruct(c, 0);
+    assert_eq!(step(c, &[0.1; 3], &mut [7.0; 2]).0, Status::Ok);
+    let bytes = |host: &Host| host.workspace.iter().map(|line| line.0).collect::<Vec<_>>();
+    let before = bytes(&host);
+    refused_set_ups(&mut host);
+    assert!(
+        before == bytes(&host),
+        "a refusal has touched the workspace"
+    );
 }
 
 #[test]
