@@ -175,7 +175,7 @@ fn the_shipped_policy_of_a_camera_does_what_it_is_told() {
     assert!(output.status.success(), "{errors}");
     let results: serde_json::Value = serde_json::from_slice(&fs::read(&json).unwrap()).unwrap();
     let done = results["splits"]["atomic"]["full_success_count"].as_u64();
-    // Of some five; a policy that is told something else turns it once in sixteen times.
+    // Of some five; a policy that is told something else turns it in one of fifteen.
     assert!(done.unwrap() >= 2, "{done:?} of 8 episodes");
 }
 
