@@ -132,8 +132,19 @@ def test_a_table_from_nothing_again_and_from_its_middle(folder, capsys):
         play(folder)
 
 
-def test_an_interrupted_table_goes_on(folder):
-    command = [sys.executable, "-m", "lads_exporter", "table", folder / "table.toml", "--runs", folder / "runs", "--lads-run", folder / "lads-run", "--models", folder / "models"]
+# The command with an interrupt that no blocked main thread sees: the system hands it to another thread, as it may.
+ELSEWHERE = """
+import signal, sys, threading, time
+threading.Thread(target=time.sleep, args=(600,), daemon=True).start()
+signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+from lads_exporter.__main__ import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("program", [("-m", "lads_exporter"), ("-c", ELSEWHERE)], ids=["main thread", "another thread"])
+def test_an_interrupted_table_goes_on(folder, program):
+    command = [sys.executable, *program, "table", folder / "table.toml", "--runs", folder / "runs", "--lads-run", folder / "lads-run", "--models", folder / "models"]
     source = str(config.find("pyproject.toml").resolve().parent)
     process = subprocess.Popen([str(part) for part in command], env=os.environ | {"PYTHONPATH": source + os.pathsep + os.environ.get("PYTHONPATH", "")}, stderr=subprocess.PIPE, text=True)
     while not list(folder.glob("runs/tiny/paper/lads-seed0-*/log.txt")):

@@ -7,7 +7,7 @@ their checkpoints.
 import signal
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -102,8 +102,12 @@ def run(path, data=None, runs="runs/tables", lads_run="target/release/lads-run",
                 progress.say(f"{job.label}: {error}")
 
     with _stoppable(processes), ThreadPoolExecutor(at_once) as pool:
-        for outcome in [pool.submit(work, group) for group in groups.values()]:
-            outcome.result()
+        left = [pool.submit(work, group) for group in groups.values()]
+        while left:
+            # Python runs a handler in the main thread only, which the system may leave asleep: it may interrupt another thread instead.
+            done, left = wait(left, timeout=0.2)
+            for outcome in done:
+                outcome.result()
         if not processes.stopped:
             write()
     if failures:
