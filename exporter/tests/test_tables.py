@@ -18,12 +18,12 @@ from lads_exporter import config, dataset
 from lads_exporter.config import UserError
 from lads_exporter.tables import definition, jobs, render, run
 
-# Writes what lads-run would: every episode of `lads.onnx` succeeds, of others one in four.
+# Writes what lads-run would: every episode of `lads-HASH.onnx` succeeds, of others one in four.
 PROGRAM = """#!{python}
 import hashlib, json, sys
 options = dict(zip(sys.argv[1::2], sys.argv[2::2]))
 episodes, data = int(options["--episodes"]), open(options["--model"], "rb").read()
-full = 0.25 if not options["--model"].endswith("lads.onnx") or "--uniform" in sys.argv else 1.0
+full = 0.25 if "/lads-" not in options["--model"].removesuffix(".onnx")[-20:] or "--uniform" in sys.argv else 1.0
 split = {{"episodes": 4 * episodes, "n_rate": 4 * full, "n_rate_standard_error": 0.5, "k_rate": [full] * 4, "full_success": full,
          "full_success_count": int(4 * episodes * full), "full_success_interval": [0, 1], "un_instructed": 0}}
 found = {{"bundle_sha256": hashlib.sha256(data).hexdigest(), "seed": int(options["--seed"]), "noise": options["--noise"],
@@ -88,6 +88,27 @@ def play(folder, **changes):
     return run.run(folder / "table.toml", **places)
 
 
+def goes_on_elsewhere(folder):
+    """Checks that the numbers of finished jobs are taken from tables.json where no run is, and only those of the same inputs."""
+    file, runs = folder / "models/tables.json", folder / "elsewhere"
+    whole = file.read_text()
+    assert play(folder, runs=runs)
+    assert file.read_text() == whole and not runs.exists()
+
+    # A job that is missing is run, alone: its results are those that were there, the time of training aside.
+    found = json.loads(whole)
+    gone = found["tables"]["tiny"]["jobs"].pop(1)
+    file.write_text(json.dumps(found))
+    assert play(folder, runs=runs)
+    again = json.loads(file.read_text())["tables"]["tiny"]["jobs"][1]
+    assert again | {"training_s": 0} == gone | {"training_s": 0}
+    assert [path.name[: len("lads-seed1")] for path in runs.glob("tiny/paper/*")] == ["lads-seed1"]
+
+    (folder / "other.toml").write_text(TABLE.replace("episodes = 5", "episodes = 6"))
+    other = definition.load(folder / "other.toml")
+    assert render.recorded(folder / "models", other, jobs.all_jobs(other, place_of(folder))) == ({}, None, 3)
+
+
 def test_a_table_from_nothing_again_and_from_its_middle(folder, capsys):
     assert play(folder, at_once=2)
     found = json.loads((folder / "models/tables.json").read_text())["tables"]["tiny"]
@@ -106,24 +127,28 @@ def test_a_table_from_nothing_again_and_from_its_middle(folder, capsys):
     assert play(folder)
     assert before == {path: path.stat().st_mtime_ns for path in folder.glob("runs/**/*") if path.is_file()}
 
+    goes_on_elsewhere(folder)
+
     # Without its results and bundle a job exports and measures again: the same bundle.
     trained = next(folder.glob("runs/tiny/paper/lads-seed0-*"))
-    for path in (trained / "lads.onnx", trained / "lads.results.json"):
+    bundle = next(trained.glob("lads-*.onnx"))
+    results = bundle.with_suffix(".results.json")
+    for path in (bundle, results, folder / "models/tables.json"):
         path.unlink()
     assert play(folder)
     assert json.loads((folder / "models/tables.json").read_text())["tables"]["tiny"]["tracks"][0]["rows"][0]["bundle_sha256"] == lads["bundle_sha256"]
 
     # Results of another protocol and half a checkpoint are named and stay.
-    results = trained / "lads.results.json"
     other = json.loads(results.read_text()) | {"seed": 8}
     results.write_text(json.dumps(other))
-    with pytest.raises(UserError, match=r"lads\.results\.json: of another protocol \(seed is 8, not 3\); it stays as it is"):
+    with pytest.raises(UserError, match=r"lads-\w+\.results\.json: of another protocol \(seed is 8, not 3\); it stays as it is"):
         play(folder)
     assert json.loads(results.read_text()) == other
     results.unlink()
     (trained / "summary.json").unlink()
     half = (trained / "checkpoint.pt").read_bytes()[:5000]
     (trained / "checkpoint.pt").write_bytes(half)
+    (folder / "models/tables.json").unlink()
     with pytest.raises(UserError, match=r"1 of 3 jobs failed:\n  paper LADS seed 0: .*checkpoint\.pt: half written or damaged"):
         play(folder)
     assert (trained / "checkpoint.pt").read_bytes() == half

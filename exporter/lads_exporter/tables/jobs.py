@@ -1,10 +1,11 @@
 """Runs a job, one system and one seed in one track: train, export, evaluate, each by the command that a person would type.
 
-A job's folder carries the hash of all that its weights depend on (configuration, dataset, language encoder, seed), so other inputs mean another
-folder, and nothing is overwritten. What is finished is kept; an interrupted training goes on. What can fail: a command ends with an
-error, which is the job's; a checkpoint or a results file that is there is damaged or of another protocol, and is named.
+A job's folder carries the hash of all that its weights depend on (configuration, dataset, language encoder, seed) and its bundle's name that of
+what an export adds, so other inputs mean other files, and nothing is overwritten. What is finished is kept; an interrupted training goes on. What can
+fail: a command ends with an error, which is the job's; a checkpoint or a results file that is there is damaged or of another protocol, and is named.
 """
 
+import dataclasses
 import hashlib
 import json
 import subprocess
@@ -19,6 +20,10 @@ from ..config import UserError
 from ..training import CHECKPOINT, SUMMARY
 
 CHANGES_NOTHING = ("sampler", "passes", "guidance", "temperature", "clip", "rule")  # of [system]: what only an export depends on
+
+
+SUMMARISED = ("perplexity", "codebook_size", "plan_elements_in_use", "validation", "steps")  # of a training's summary, in the table's file
+SCORES = ("episodes", "n_rate", "n_rate_standard_error", "k_rate", "full_success", "full_success_count")  # of a split's results, in the same
 
 
 class Stopped(Exception):
@@ -96,16 +101,26 @@ class Job:
         tables[0]["system"] = {key: value for key, value in own.items() if key not in CHANGES_NOTHING}
         encoder = setting.config.language.encoder
         known = encoder if encoder.startswith("random-") else language.weights_sha256(encoder)
-        parts = [tables, self.place.data_sha256, known, self.seed, self.place.threads]
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+        return _hash([tables, self.place.data_sha256, known, self.seed, self.place.threads])
+
+    @cached_property
+    def exported(self):
+        """Hashes all that the bundle depends on."""
+        own = config.load(*self.table.configuration(self.track, self.system)).tables[0].get("system", {})
+        return _hash([self.inputs, own])
+
+    @property
+    def identity(self):
+        """Hashes all that the job's numbers depend on."""
+        return _hash([self.exported, dataclasses.asdict(self.table.evaluation)])
 
     @property
     def bundle(self):
-        return self.folder / f"{self.system.id}.onnx"
+        return self.folder / f"{self.system.id}-{self.exported[:12]}.onnx"
 
     @property
     def results(self):
-        return self.folder / f"{self.system.id}.results.json"
+        return self.bundle.with_suffix(".results.json")
 
     @property
     def finished(self):
@@ -129,15 +144,20 @@ class Job:
         self.numbers()
 
     def numbers(self):
-        """Returns results and training time of a finished job."""
+        """Returns what the table keeps of a finished job: its bundle's hash, training time and summary, and the scores of its splits."""
         sha256 = hashlib.sha256(self.bundle.read_bytes()).hexdigest()
-        found = checked_results(self.table, self.results, sha256)
+        splits = checked_results(self.table, self.results, sha256)
         try:
             summary = json.loads((self.folder / SUMMARY).read_text())
             seconds = sum(summary["seconds"].values())
+            kept = {key: summary.get(key) for key in SUMMARISED}
         except (OSError, ValueError, KeyError) as error:
             raise UserError(f"{self.folder / SUMMARY}: not a training's summary ({error!r}); move the folder away to train anew") from error
-        return {"results": found, "sha256": sha256, "training_s": seconds, "summary": summary}
+        return {"bundle_sha256": sha256, "training_s": seconds, "summary": kept, "splits": splits}
+
+
+def _hash(parts):
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
 def evaluate(table, bundle, results, place, processes, log, uniform=False):
@@ -150,7 +170,7 @@ def evaluate(table, bundle, results, place, processes, log, uniform=False):
 
 
 def checked_results(table, path, sha256=None):
-    """Reads a results file; refuses one that is not of this table's protocol or not of the bundle, with what differs."""
+    """Reads the scores of a table's splits; refuses results that are not of the table's protocol or not of the bundle, with what differs."""
     found = card.read_results(path)
     asked = table.evaluation
     pairs = [("seed", found.get("seed"), asked.seed), ("noise", found.get("noise"), asked.noise)]
@@ -158,10 +178,11 @@ def checked_results(table, path, sha256=None):
     if sha256:
         pairs.append(("bundle_sha256", found.get("bundle_sha256"), sha256))
     pairs += [(f"split {name}", "absent", "present") for name in table.splits if name not in found["splits"]]
+    pairs += [(f"{key} of split {name}", "absent", "present") for name in table.splits for key in SCORES if key not in found["splits"].get(name, SCORES)]
     wrong = [f"{name} is {got}, not {wanted}" for name, got, wanted in pairs if got != wanted]
     if wrong:
         raise UserError(f"{path}: of another protocol ({'; '.join(wrong)}); it stays as it is: move it away, and the same command measures anew")
-    return found
+    return {name: {key: found["splits"][name][key] for key in SCORES} for name in table.splits}
 
 
 def all_jobs(table, place):

@@ -1,7 +1,8 @@
 """Writes models/tables.json and models/TABLES.md: the paper's number, ours with mean and deviation over seeds, and the uncertainty within
 them.
 
-`tables.json` holds every table that was ever run, one key each; a run replaces its own only. TABLES.md is written from it alone.
+`tables.json` holds every table that was ever run, one key each; a run replaces its own only. It keeps the numbers of every finished job under
+the hash of all that they depend on, so that a table can be finished on another machine. TABLES.md is written from it alone.
 """
 
 import json
@@ -16,6 +17,7 @@ from ..output import write_atomically
 
 FORMAT, VERSION = "lads-tables", 1
 JSON, MARKDOWN = "tables.json", "TABLES.md"
+NUMBERS = ("identity", "bundle_sha256", "training_s", "summary", "splits")  # of a job
 Z = 1.959963984540054  # of 95 %
 
 
@@ -61,6 +63,20 @@ def expert(place):
     return {"attempts": attempts, "discarded": discarded, "success": 1 - discarded / attempts, "success_interval": wilson(attempts - discarded, attempts)}
 
 
+def _protocol(table):
+    asked = table.evaluation
+    return {"episodes_per_instruction": asked.episodes, "seed": asked.seed, "noise": asked.noise}
+
+
+def recorded(models, table, jobs):
+    """Finds what the file has of a table -> ({job: its numbers}, scores of uniform random actions or None, number of rows that are of no job)."""
+    entry = read(Path(models) / JSON)["tables"].get(table.name, {"jobs": []})
+    rows = {row["identity"]: row for row in entry["jobs"]}
+    found = {job: {part: rows[job.identity][part] for part in NUMBERS[1:]} for job in jobs if job.identity in rows}
+    uniform = entry["uniform_scores"] if entry.get("protocol") == _protocol(table) else None
+    return found, uniform, len(rows) - len(found)
+
+
 def entry(table, place, jobs, uniform):
     """Makes the entry of one table in tables.json. jobs: [(job, its numbers or None)]."""
     tracks = []
@@ -70,31 +86,27 @@ def entry(table, place, jobs, uniform):
             own = [(job.seed, found) for job, found in jobs if job.track == track and job.system == system]
             done = [(seed, found) for seed, found in own if found]
             row = {"id": system.id, "title": system.title, "published": system.published, "seeds_asked": [seed for seed, _ in own]}
-            row |= {"seeds": [seed for seed, _ in done], "bundle_sha256": [found["sha256"] for _, found in done]}
+            row |= {"seeds": [seed for seed, _ in done], "bundle_sha256": [found["bundle_sha256"] for _, found in done]}
             if done:
                 row["training_s"] = statistics.mean(found["training_s"] for _, found in done)
-                row["splits"] = {name: summarise([found["results"]["splits"][name] for _, found in done]) for name in table.splits}
-                row["summary"] = [{key: found["summary"].get(key) for key in ("perplexity", "codebook_size", "plan_elements_in_use", "validation", "steps")} for _, found in done]
+                row["splits"] = {name: summarise([found["splits"][name] for _, found in done]) for name in table.splits}
+                row["summary"] = [found["summary"] for _, found in done]
             rows.append(row)
         tracks.append({"name": track.name, "config": Path(track.config).name, "note": track.note, "rows": rows})
-    asked = table.evaluation
     found = {
         "title": table.title,
         "measure": table.measure,
         "splits": dict(zip(table.splits, table.headings)),
-        "protocol": {"episodes_per_instruction": asked.episodes, "seed": asked.seed, "noise": asked.noise},
+        "protocol": _protocol(table),
         "dataset_sha256": place.data_sha256,
         "threads": place.threads,
-        "uniform": {name: summarise([uniform["splits"][name]]) for name in table.splits} if uniform else None,
+        "uniform": {name: summarise([uniform[name]]) for name in table.splits} if uniform else None,
+        "uniform_scores": uniform,
         "expert": expert(place),
         "tracks": tracks,
+        "jobs": [{"track": job.track.name, "system": job.system.id, "seed": job.seed, "identity": job.identity} | found for job, found in jobs if found],
     }
     return found
-
-
-def check(models):
-    """Refuses a tables.json that is something else, before anything is run."""
-    read(Path(models) / JSON)
 
 
 def read(path):
@@ -102,8 +114,9 @@ def read(path):
         return {"format": FORMAT, "format_version": VERSION, "tables": {}}
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-        ours = found["format"] == FORMAT and found["format_version"] == VERSION and isinstance(found["tables"], dict)
-    except (ValueError, KeyError, TypeError):
+        rows = [row for table in found["tables"].values() for row in table["jobs"]]
+        ours = found["format"] == FORMAT and found["format_version"] == VERSION and all(set(NUMBERS) <= set(row) for row in rows)
+    except (ValueError, KeyError, TypeError, AttributeError):
         ours = False
     if not ours:
         raise UserError(f"{path}: not this exporter's tables; it stays as it is: name another folder with --models")

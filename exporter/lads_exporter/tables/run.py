@@ -1,7 +1,7 @@
 """Runs all jobs of a table, some at a time on this machine, and writes the numbers of those that are finished.
 
-After every job the tables are written anew, so that a reader always sees what is known. An interrupt stops trainings at their next step, in
-their checkpoints.
+A job is finished if its files are here, or if tables.json has its numbers from the same inputs. After every job the tables are written anew, so
+that a reader always sees what is known. An interrupt stops trainings at their next step, in their checkpoints.
 """
 
 import signal
@@ -54,7 +54,7 @@ def _stoppable(processes):
 
 
 def floor(table, place, jobs, processes):
-    """Evaluates uniform random actions in the same episodes: needs a bundle for its limits, whichever is finished."""
+    """Evaluates uniform random actions in the same episodes: needs a bundle for its limits, whichever is here."""
     path = place.runs / table.name / "uniform.results.json"
     if not path.is_file():
         job = next((job for job in jobs if job.finished), None)
@@ -70,19 +70,25 @@ def run(path, data=None, runs="runs/tables", lads_run="target/release/lads-run",
         raise UserError(f"--jobs {at_once}: must be at least 1")
     table = load(path)
     place = _place(table, data, runs, lads_run)
-    render.check(models)
     jobs, processes = all_jobs(table, place), Processes()
+    known, uniform, others = render.recorded(models, table, jobs)
     groups = {}
     for job in jobs:
         groups.setdefault(job.folder, []).append(job)
-    known = {job: job.numbers() for job in jobs if job.finished}
-    progress = Progress(len(jobs), len(known))
+    here = {job: job.numbers() for job in jobs if job.finished}
+    progress = Progress(len(jobs), len(known | here))
     progress.say(f"{table.title}: jobs in {place.runs / table.name}")
+    if known:
+        progress.say(f"{len(known)} jobs have their numbers in {models}/{render.JSON}, from the same inputs")
+    if others:
+        progress.say(f"{others} jobs in {models}/{render.JSON} had other inputs and leave the table")
+    known |= here
     failures, writing = [], threading.Lock()
 
     def write():
         with writing:
-            render.write(models, table, place, [(job, known.get(job)) for job in jobs], floor(table, place, jobs, processes))
+            scores = uniform or floor(table, place, jobs, processes)
+            render.write(models, table, place, [(job, known.get(job)) for job in jobs], scores)
 
     def work(group):
         for job in group:
