@@ -157,11 +157,11 @@ def _reference(arguments):
     if arguments.complete:
         from . import questions
 
-        questions.complete(arguments.model, arguments.output, arguments.run, arguments.lads_run)
+        questions.complete(arguments.model, arguments.output, arguments.run, arguments.system, arguments.lads_run)
         print(f"{arguments.output}: completed; next: lads-run verify --model {arguments.model} --reference {arguments.output}")
         return
     chosen = {key: getattr(arguments, key) for key in ("run", "episodes", "traced", "seed", "noise", "lads_run")}
-    reference.write(arguments.model, arguments.output, **chosen)
+    reference.write(arguments.model, arguments.output, over=arguments.system, **chosen)
     print(f"{arguments.output}: written; next: lads-run verify --model {arguments.model} --reference {arguments.output}")
 
 
@@ -260,7 +260,8 @@ def _parser():
     rollouts = commands.add_parser("reference", help="reference rollouts: PyTorch in the official environment, for lads-run verify")
     rollouts.add_argument("--model", required=True, help="the bundle whose policy is rolled out")
     rollouts.add_argument("-o", "--output", required=True)
-    rollouts.add_argument("--run", help="take the weights from this run's checkpoint, not from the bundle's initializers")
+    rollouts.add_argument("--run", help="take the weights from this run's checkpoint, not from the bundle's initializers; needed for systems other than LADS, whose layers are folded")
+    rollouts.add_argument("--system", action="append", default=[], metavar="FILE", help="what the bundle was exported with, as export has it")
     rollouts.add_argument("--episodes", type=int, default=20, help="of each instruction (20)")
     rollouts.add_argument("--traced", type=int, default=2, help="of these, so many with all actions and the first states (2)")
     rollouts.add_argument("--seed", type=int, default=0)

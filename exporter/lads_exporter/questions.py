@@ -6,7 +6,6 @@ answers, which is what a verification must allow. So a reference that was made w
 """
 
 import base64
-import copy
 import json
 import tempfile
 from pathlib import Path
@@ -17,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from onnx import numpy_helper
 
-from . import config, contract as contracts, frames
+from . import config, contract as contracts, frames, whole
 from .bundle import write_atomically
 
 # Relative size of the noise: some rounding errors of 32-bit floats, and what another order of sums makes of them.
@@ -76,23 +75,12 @@ def _states(episode):
 def _ask(policy, shown, index, episode):
     """Asks a policy what a trace's policy was asked -> logits per decision, actions [steps, A]."""
     trace = episode["trace"]
-    policy.start(index)
+    policy.start(index, episode.get("noise_seed"))
     actions = []
     for seen, done in zip(shown.of(index, episode), _numbers(trace["actions"], "<f4", len(policy.low)), strict=True):
         actions.append(policy.act(np.array(seen)))
         policy.actions[-1] = torch.from_numpy(done.copy())
     return policy.logits, np.stack(actions)
-
-
-def _disturbed(acting, generator):
-    """Copies the networks, with noise on each weight."""
-    other = copy.deepcopy(acting)
-    for module in (other.normalizer, other.high_level, other.low_level):
-        for value in module.state_dict().values():
-            if value.is_floating_point():
-                value.mul_(1 + NOISE * torch.randn(value.shape, generator=generator))
-    other.codes.mul_(1 + NOISE * torch.randn(other.codes.shape, generator=generator))
-    return other
 
 
 def _half_range(difference):
@@ -102,35 +90,36 @@ def _half_range(difference):
 
 @torch.no_grad()
 def float_noise(policy, shown, rows):
-    """Measures the effect of noise on all weights on a policy's answers -> the largest differences of an action and of a logit."""
+    """Measures the effect of noise on all weights on a policy's answers -> the largest differences of an action, of a logit, and of an element
+    of a plan that is a vector."""
     generator = torch.Generator().manual_seed(0)
     largest = {"relative": NOISE, "action": 0.0, "logit": 0.0}
-    answers = {id(episode): _ask(policy, shown, index, episode) for index, episode in _traced(rows)}
-    exact = policy.acting
+    answers = {id(episode): (*_ask(policy, shown, index, episode), policy.vectors) for index, episode in _traced(rows)}
     for _ in range(DRAWS):
-        policy.acting = _disturbed(exact, generator)
+        noisy = whole.disturbed(policy, NOISE, generator)
         for index, episode in _traced(rows):
-            logits, actions = answers[id(episode)]
-            noisy, others = _ask(policy, shown, index, episode)
-            plans = [int(row.argmax()) for row in logits], [int(row.argmax()) for row in noisy]
-            for a, b in zip(logits, noisy, strict=True):
+            logits, actions, vectors = answers[id(episode)]
+            other_logits, other_actions = _ask(noisy, shown, index, episode)
+            for a, b in zip(logits, other_logits, strict=True):
                 largest["logit"] = max(largest["logit"], _half_range(a - b))
+            if vectors:
+                difference = float((torch.stack(vectors) - torch.stack(noisy.vectors)).abs().max())
+                largest["plan_vector"] = max(largest.get("plan_vector", 0.0), difference)
             # Another plan has other actions; that is the logits' matter.
-            at = np.searchsorted(policy.decided_at, np.arange(len(actions)), side="right") - 1
-            same = np.array([plans[0][n] == plans[1][n] for n in range(len(logits))])[at]
+            kept = np.array([bool(a.argmax() == b.argmax()) for a, b in zip(logits, other_logits)] + [True])
+            same = kept[np.searchsorted(noisy.decided_at, np.arange(len(actions)), side="right") - 1]
             if same.any():
-                largest["action"] = max(largest["action"], float(np.abs(actions - others)[same].max()))
-    policy.acting = exact
+                largest["action"] = max(largest["action"], float(np.abs(actions - other_actions)[same].max()))
     return {key: float(f"{value:.3g}") for key, value in largest.items()}
 
 
 class Encoder:
     """Trajectory encoder of a bundle in PyTorch, made from its initializers."""
 
-    def __init__(self, model, acting):
+    def __init__(self, model, codes):
         named = {row.name.removeprefix("weights/"): torch.from_numpy(numpy_helper.to_array(row).copy()) for row in model.graph.initializer}
         self.relative = any(name.endswith("encoder.first") for name in named)
-        self.mean, self.codes = named["observation_mean"], acting.codes
+        self.mean, self.codes = named["observation_mean"], codes
         gates = lambda array: torch.cat([array.chunk(4)[gate] for gate in (0, 2, 3, 1)])  # ONNX: i, o, f, c; PyTorch: i, f, c, o
         inputs, recurrent = (gates(named[f"encoder.lstm.{part}"][0]) for part in ("input", "recurrent"))
         biases = [gates(half) for half in named["encoder.lstm.bias"][0].chunk(2)]
@@ -169,7 +158,7 @@ def add(head, rows, model, contract, policy, renderer=None):
     shown = Shown(rows, contract, renderer)
     horizon = head["horizon"]
     try:
-        encoder = Encoder(model, policy.acting)
+        encoder = Encoder(model, policy.codes) if policy.codes is not None else None
     except KeyError:
         encoder = None  # a bundle without one
     for index, episode in _traced(rows):
@@ -192,7 +181,7 @@ def add(head, rows, model, contract, policy, renderer=None):
     head["float_noise"] = float_noise(policy, shown, rows)
 
 
-def complete(bundle, path, run=None, lads_run="target/release/lads-run"):
+def complete(bundle, path, run=None, over=(), lads_run="target/release/lads-run"):
     """Adds to the reference at `path`, made by an earlier version, what it does not record; its rollouts stay as they are."""
     from . import reference
 
@@ -203,10 +192,9 @@ def complete(bundle, path, run=None, lads_run="target/release/lads-run"):
     if [row["text"] for row in rows] != [row["text"] for row in contract["instructions"]]:
         raise config.UserError(f"{path}: the instructions are not those of {bundle}; name the bundle that it is of")
     torch.set_num_threads(1)
-    acting, weights_from = reference._acting(model, contract, run)
-    words, _, _ = reference._words(model, contract)
+    policy, weights_from = whole.of(model, contract, reference._words(model, contract)[0], run, over)
     renderer = reference.renderer_of(contract, lads_run)
-    add(head, rows, model, contract, reference.FullSequencePolicy(acting, contract, words), renderer)
+    add(head, rows, model, contract, policy, renderer)
     if renderer:
         renderer.close()
     head["purpose_sha256"] = reference.purpose_sha256(contract)

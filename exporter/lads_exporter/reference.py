@@ -1,11 +1,11 @@
 """Makes reference rollouts: the PyTorch policy in the official environment, for `lads-run verify` to compare with.
 
 What is independent of what is verified: the network runs as in training, in PyTorch, as a full-sequence forward over the
-whole history at every decision (no KV cache, no ONNX graph, no compiler, no Rust); the physics, the observations and the
+whole history at every decision (`whole`: no KV cache, no ONNX graph, no compiler, no Rust); the physics, the observations and the
 task checks are the official environment's; the words are encoded anew from the instructions' texts where the language
-encoder is installed. What is not: the weights come from the bundle's initializers unless `--run` names the checkpoint, and
-then the normaliser's scale and batch norm are those that the exporter folded; the observation noise is numpy's stream, so
-that the runtime can run the very same episodes.
+encoder is installed. What is not: the weights of a LADS policy come from the bundle's initializers unless `--run` names the checkpoint, and
+then the normaliser's scale and batch norm are those that the exporter folded; the noise, of observations and of a policy that draws, is that of
+the runtime's streams, so that it can run the very same episodes.
 
 The policy sees observations as float32 and acts with float32, as the runtime does. Frames of a policy with a camera are drawn of the
 official environment's states by the harness's renderer, so that both sides see by the same one; a trace holds the states, and of
@@ -25,7 +25,7 @@ import onnx
 import torch
 from tqdm import tqdm
 
-from . import __version__, config, contract as contracts, frames, language, official, questions, weights
+from . import __version__, config, contract as contracts, frames, language, official, questions, whole
 from .output import write_atomically
 
 FORMAT, FORMAT_VERSION = "lads-reference", 2
@@ -73,52 +73,10 @@ def purpose_sha256(contract):
     return digest.hexdigest()
 
 
-class FullSequencePolicy:
-    """The policy as in training: at a decision the transformer reads the words and the whole history from its beginning."""
-
-    def __init__(self, acting, contract, words):
-        """Makes the policy; `words` is one tensor [L, E] per instruction."""
-        self.acting, self.contract, self.words = acting, contract, words
-        self.low, self.high = (torch.tensor(side, dtype=torch.float32) for side in contracts.limits(contracts.action(contract)))
-
-    def start(self, instruction):
-        self.instruction = instruction
-        self.observations, self.actions = [], []
-        self.plans, self.margins = [], []
-        self.logits, self.decided_at, self.steps = [], [], 0
-
-    @torch.no_grad()
-    def act(self, observation):
-        """Acts on observation [O] float32, or a frame [r, c, 3] of bytes -> action [A] float32, clipped to the contract's limits."""
-        if len(self.observations) == self.contract["context"]["steps"]:
-            if self.contract["context"]["beyond"] != "restart":
-                raise config.UserError("an episode is longer than the policy's context, and its contract says to refuse")
-            self.observations, self.actions = [], []
-        acting = self.acting
-        self.observations.append(acting.normalizer(torch.from_numpy(observation)))
-        if (len(self.observations) - 1) % contracts.period(self.contract) == 0:
-            logits = self._logits()
-            best = logits.topk(2).values
-            self.plans.append(int(logits.argmax()))
-            self.margins.append(float(best[0] - best[1]))
-            self.logits.append(logits)
-            self.decided_at.append(self.steps)
-        plan = acting.codes[self.plans[-1]]
-        action = acting.low_level(self.observations[-1][None], plan[None])[0]
-        action = torch.clamp(action, self.low, self.high)
-        self.actions.append(action)
-        self.steps += 1
-        return action.numpy()
-
-    def _logits(self):
-        nothing = torch.zeros(len(self.low))  # the forward pass drops the last action: it has not happened
-        observations, actions = torch.stack(self.observations)[None], torch.stack([*self.actions, nothing])[None]
-        return self.acting.high_level([self.words[self.instruction]], observations, actions)[0, -1]
-
-
 def episode(policy, environment, entropy, instruction, known, traced, renderer=None):
     """Runs one episode -> a JSON object; it ends when the instruction is carried out or its split's steps are up."""
-    policy.start(instruction)
+    seed = whole.noise_seed(entropy) if policy.seeded else None
+    policy.start(instruction, seed)
     commanded, most = known["sub_tasks"], environment.max_steps(known["split"])
     observation = environment.reset(entropy, commanded)
     states, observations, actions = [], [], []
@@ -148,7 +106,9 @@ def episode(policy, environment, entropy, instruction, known, traced, renderer=N
         # noise-free states that the environment's physics is compared by. Frames are made of the states of all steps.
         seen = {"observations": "", "frames": text(observations, "u1")} if renderer else {"observations": text(observations, "<f4")}
         row["trace"] = seen | {"actions": text(actions, "<f4"), "states": text(states, "<f8")}
-    return row
+        if policy.vectors:
+            row["trace"]["plan_vectors"] = text(policy.vectors, "<f4")
+    return row if seed is None else row | {"noise_seed": seed}
 
 
 def _words(model, contract):
@@ -166,26 +126,6 @@ def _words(model, contract):
     anew = [torch.from_numpy(row.words) for row in encoded.instructions]
     difference = max(float((a - b).abs().max()) for a, b in zip(anew, rows, strict=True))
     return anew, "the language encoder", difference
-
-
-def _acting(model, contract, run):
-    if run is None:
-        return weights.from_bundle(model, contract), "the bundle's initializers"
-    from . import systems, training
-
-    saved, setting = training.load_run(run)
-    if saved["identity"]["dataset_sha256"] != contract["provenance"]["dataset_sha256"]:
-        raise config.UserError(f"{run} was trained on other data than the bundle")
-    system = setting.config.system
-    if system.kind != "lads" or system.regressed:
-        raise config.UserError(f"{run}: its networks are folded when they are exported; leave --run out, the bundle has their weights")
-    encoded = language.encode(setting.config.language, [row["text"] for row in setting.instructions])
-    lads = systems.of(setting.config).Networks(setting, encoded)
-    lads.load_state_dict(saved["networks"])
-    trained, exported = weights.from_lads(lads), weights.from_bundle(model, contract)
-    if not all(torch.equal(a, b) for a, b in ((trained.codes, exported.codes), (trained.high_level.head.weight, exported.high_level.head.weight))):
-        raise config.UserError(f"{run} is not the run that the bundle was exported from; name that one, or leave --run out")
-    return trained, "the run's checkpoint"
 
 
 class Progress:
@@ -242,8 +182,12 @@ def renderer_of(contract, lads_run):
     return frames.Renderer(lads_run, contract["environment"]["id"], seen["rendering"])
 
 
-def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0", lads_run="target/release/lads-run"):
-    """Rolls out all instructions of `bundle` and writes the reference to `output`. `lads_run` draws what a policy with a camera sees."""
+def write(bundle, output, run=None, over=(), episodes=20, traced=2, seed=0, noise="v0", lads_run="target/release/lads-run"):
+    """Rolls out all instructions of `bundle` and writes the reference to `output`.
+
+    `run` is the training that the bundle was exported from, `over` the files of a system's values that it was exported with; `lads_run` draws
+    what a policy with a camera sees.
+    """
     if episodes < 1 or not 1 <= traced <= episodes:
         raise config.UserError(f"{episodes} episodes of which {traced} traced: give at least 1 of each, and no more traced than episodes")
     data = Path(bundle).read_bytes()
@@ -252,9 +196,7 @@ def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0", l
     except Exception as error:
         raise config.UserError(f"{bundle}: not a bundle with a contract ({type(error).__name__}); export one first") from error
     contract = contracts.of(model, bundle)
-    if contract["family"]["kind"] != "lads":
-        raise config.UserError(f"{bundle}: a {contract['family']['kind']} policy; a reference is made of lads policies")
-    if contracts.rule(contract) != "argmax":
+    if "codebook" in contract["family"] and contracts.rule(contract) != "argmax":
         raise config.UserError(f"{bundle}: plans are decided by {contracts.rule(contract)}; a reference needs argmax")
     make = official.ENVIRONMENTS.get(contract["environment"]["id"])
     if make is None:
@@ -262,9 +204,8 @@ def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0", l
     torch.set_num_threads(1)  # sums depend on their number
     renderer = renderer_of(contract, lads_run)
     environment = make(noise)
-    acting, weights_from = _acting(model, contract, run)
     words, words_from, words_difference = _words(model, contract)
-    policy = FullSequencePolicy(acting, contract, words)
+    policy, weights_from = whole.of(model, contract, words, run, over)
     known = contracts.splits(contract)
     head = {
         "format": FORMAT,
@@ -274,8 +215,8 @@ def write(bundle, output, run=None, episodes=20, traced=2, seed=0, noise="v0", l
         "environment": {"id": environment.ID, "version": environment.VERSION, "max_steps": max(environment.max_steps(row["split"]) for row in known)},
         "seed": seed,
         "noise": noise,
-        "decision": "argmax",
-        "horizon": contracts.period(contract),
+        "decision": contracts.rule(contract),
+        "horizon": contracts.period(contract) if "codebook" in contract["family"] else None,
         "episodes_per_instruction": episodes,
         "traced_episodes": traced,
         "weights_from": weights_from,

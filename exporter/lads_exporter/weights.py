@@ -6,8 +6,6 @@ that read observations) and batch norm (into the linear layer before it). Loaded
 Nothing else of the bundle is used: no node of its graphs but one attribute, the slope of LeakyReLU, is read.
 """
 
-from dataclasses import dataclass
-
 import torch
 from onnx import numpy_helper
 from torch import nn
@@ -29,21 +27,39 @@ class Eyes(nn.Module):
         return self.normalizer(self.frames(frame[None])[0])
 
 
-@dataclass(frozen=True)
-class Acting:
-    """Networks that act: what reads an observation (the normaliser, or `Eyes`), high level, codes [M, D], low level. All in eval mode."""
+class Acting(nn.Module):
+    """Networks that act: what reads an observation (the normaliser, or `Eyes`), high level, codes [M, D], low level. In eval mode."""
 
-    normalizer: nn.Module
-    high_level: nn.Module
-    codes: torch.Tensor
-    low_level: nn.Module
+    def __init__(self, normalizer, high_level, codes, low_level):
+        super().__init__()
+        self.normalizer, self.high_level, self.low_level = normalizer, high_level, low_level
+        self.register_buffer("codes", codes)
+        self.eval()
 
 
-def from_lads(lads):
-    """Takes the acting part of trained networks."""
-    lads.eval()
+class Nearest(nn.Module):
+    """High level that regresses a plan, with logits over the codes: the nearest is the largest."""
+
+    def __init__(self, high_level, codes):
+        super().__init__()
+        self.high_level = high_level
+        self.register_buffer("codes", codes)
+
+    def forward(self, *history):
+        return nearness(self.high_level(*history), self.codes)
+
+
+def nearness(regressed, codes):
+    """Computes how near plans [..., D] are to codes [M, D] -> [..., M]: squared distances, negative, in the unit of `systems.folding`."""
+    unit = (codes - codes.mean(0)).square().sum(1).mean().clamp(min=1e-12)
+    return -(regressed[..., None, :] - codes).square().sum(-1) / unit
+
+
+def from_lads(lads, regressed=False):
+    """Takes the acting part of trained networks; `regressed` says that the high level regresses its plans."""
     reads = Eyes(lads.frames, lads.normalizer) if hasattr(lads, "frames") else lads.normalizer
-    return Acting(reads, lads.high_level, lads.codebook.codes, lads.low_level)
+    high_level = Nearest(lads.high_level, lads.codebook.codes) if regressed else lads.high_level
+    return Acting(reads, high_level, lads.codebook.codes, lads.low_level)
 
 
 def _tensors(model):

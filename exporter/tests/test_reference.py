@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.numpy import load
 
-from lads_exporter import bundle as bundles, config, contract as contracts, frames, kinds, questions, reference, training, weights
+from lads_exporter import bundle as bundles, config, contract as contracts, frames, kinds, questions, reference, training, weights, whole
 
 
 def contract_of(model):
@@ -41,7 +41,7 @@ def test_the_full_sequence_gives_the_golden_episode(policy):
     _, encoded, _, model = policy
     contract = contracts.of(model)
     golden = load(base64.b64decode({row.key: row.value for row in model.metadata_props}["lads.golden"]))
-    acting = reference.FullSequencePolicy(weights.from_bundle(model, contract), contract, words(encoded))
+    acting = whole.of(model, contract, words(encoded))[0]
     acting.start(int(golden["instruction"][0]))
     actions = np.stack([acting.act(observation) for observation in golden["channel.observation"]])
     assert acting.plans == golden["selected"][:: contracts.period(contract)].tolist()
@@ -64,15 +64,15 @@ def test_only_the_bundles_own_run_is_rolled_out(policy, monkeypatch):
     setting, encoded, lads, model = policy
     contract = contracts.of(model)
     saved = {"identity": {"dataset_sha256": contract["provenance"]["dataset_sha256"]}, "networks": lads.state_dict()}
-    monkeypatch.setattr(training, "load_run", lambda folder: (saved, setting))
-    monkeypatch.setattr(reference.language, "encode", lambda language, texts: encoded)
-    acting, source = reference._acting(model, contract, "run")
+    monkeypatch.setattr(training, "load_run", lambda folder, *over: (saved, setting))
+    monkeypatch.setattr(whole.language, "encode", lambda language, texts: encoded)
+    acting, source = whole.of(model, contract, words(encoded), "run")
     assert source == "the run's checkpoint" and torch.equal(acting.codes, lads.codebook.codes)
     # The same plans with another high level are another run.
     saved["networks"] = {name: value.clone() for name, value in lads.state_dict().items()}
     saved["networks"]["high_level.head.weight"][0, 0] += 1
     with pytest.raises(config.UserError, match="run is not the run that the bundle was exported from"):
-        reference._acting(model, contract, "run")
+        whole.of(model, contract, words(encoded), "run")
 
 
 class Bench:

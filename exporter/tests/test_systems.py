@@ -11,7 +11,7 @@ import torch
 from resuming import assert_same_weights, interrupt
 from test_training import setting_for
 
-from lads_exporter import bundle, config, contract as contracts, dataset, language, systems, twin
+from lads_exporter import bundle, config, contract as contracts, dataset, language, twin, whole
 from lads_exporter.codebook import nearest
 from lads_exporter.kinds import denoising
 from lads_exporter.systems import averaging, cluster, folding, lisa, vae
@@ -72,21 +72,6 @@ class Trained:
         self.instruction, self.observations = self.raw[0]
         self.rollout = twin.open_loop(twin.Twin(self.model), self.instruction, {"observation": self.observations.numpy()})
         self.actions = torch.from_numpy(np.stack(self.rollout.actions))
-        self.normed = self.networks.normalizer(self.observations)
-        self.words = [torch.from_numpy(self.encoded.instructions[self.instruction].words)]
-        self.noise = [torch.from_numpy(row) for row in self.rollout.draws]
-        self.period = contracts.period(self.contract) or 1
-
-    def starts(self):
-        return range(0, len(self.observations), self.period)
-
-    def held(self, plans):
-        """Holds what is decided at the multiples of the period, at every step."""
-        return [plans[t - t % self.period] for t in range(len(self.observations))]
-
-    def clip(self, actions):
-        low, high = (torch.tensor(side) for side in contracts.limits(contracts.action(self.contract)))
-        return actions.clamp(low, high)
 
 
 @pytest.fixture(scope="module", params=list(VALUES))
@@ -106,70 +91,20 @@ def test_a_few_steps_lower_the_losses(trained):
                 assert mean(curve[-8:], name) < 0.85 * mean(curve[:8], name), (stage, name)
 
 
-def quantised(trained):
-    """Computes the codes of the unfolded high level at every step."""
-    networks = trained.networks
-    latents = networks.project_in(networks.high_level(trained.words, trained.normed[None])[0])
-    return nearest(latents, networks.codebook.codes).tolist()
-
-
-def lang_dt(trained):
-    return None, trained.networks.high_level(trained.words, trained.normed[None], trained.actions[None])[0]
-
-
-def lisa_whole(trained):
-    networks, plans = trained.networks, trained.held(quantised(trained))
-    parts = []
-    for start in trained.starts():
-        rows = slice(start, start + trained.period)
-        count = len(trained.normed[rows])
-        option = networks.low_level.embed_option(networks.project_out(networks.codebook.codes[plans[start]]))
-        parts.append(networks.low_level.chunks(option.expand(1, count, -1), torch.tensor([start]), trained.normed[None, rows], trained.actions[None, rows])[0])
-    return plans, torch.cat(parts)
-
-
-def vae_whole(trained):
-    networks = trained.networks
-    mean, log_std = vae.split(networks.high_level(trained.words, trained.normed[None], trained.actions[None])[0])
-    plans = torch.stack([mean[t] + log_std[t].exp() * trained.noise[t] for t in trained.starts()]).repeat_interleave(trained.period, 0)
-    return None, networks.low_level(trained.normed, plans[: len(trained.normed)])
-
-
-def coded(trained):
-    networks = trained.networks
-    out = networks.high_level(trained.words, trained.normed[None], trained.actions[None])[0]
-    known = networks.codebook.codes
-    plans = trained.held((nearest(out, known) if trained.name == "wo_cp" else out.argmax(-1)).tolist())
-    return plans, networks.low_level(trained.normed, known[plans])
-
-
-def acting(trained):
-    return systems.of(trained.setting.config).acting(trained.networks, trained.setting, trained.encoded)
-
-
-def lcsd_whole(trained):
-    policy, plans = acting(trained), quantised(trained)
-    act = lambda t: policy.denoise(trained.observations[t : t + 1], plans[t], trained.noise[t].view(-1, trained.actions.shape[1]))
-    return plans, torch.cat([act(t) for t in range(len(plans))])
-
-
-def skilldiffuser_whole(trained):
-    policy, plans = acting(trained), trained.held(quantised(trained))
-    parts = [policy.chunk(trained.observations[t : t + 1], plans[t], trained.noise[t]) for t in trained.starts()]
-    return plans, torch.cat(parts)[: len(plans)]
-
-
-WHOLE = {"lang_dt": lang_dt, "lisa": lisa_whole, "vae": vae_whole, "lcsd": lcsd_whole, "skilldiffuser": skilldiffuser_whole, "skilldiffuser_ddpm": skilldiffuser_whole}
-
-
 @torch.no_grad()
 def test_the_bundle_step_by_step_equals_the_networks_over_the_whole_sequence(trained):
-    trained.networks.eval()
-    plans, actions = WHOLE.get(trained.name, coded)(trained)
-    assert plans is None or trained.rollout.selected == plans
-    assert float((trained.clip(actions) - trained.actions).abs().max()) <= 1e-4
+    words = [torch.from_numpy(row.words) for row in trained.encoded.instructions]
+    policy = whole.of_networks(trained.networks, trained.setting, trained.encoded, trained.contract, words)
+    policy.start(trained.instruction, seed=0)  # the contract's
+    largest = []
+    for step, (seen, done) in enumerate(zip(trained.observations, trained.actions, strict=True)):
+        largest.append(np.abs(policy.act(seen.numpy()) - done.numpy()).max())
+        policy.actions[-1] = done
+        assert not policy.plans or policy.plans[-1] == trained.rollout.selected[step]
+    assert bool(policy.plans) == ("codebook" in trained.contract["family"]) and bool(policy.vectors) == (trained.name == "vae")
+    assert max(largest) <= 1e-4
     # The first step has no cache and one plan at most: graph against PyTorch.
-    assert float((trained.clip(actions) - trained.actions)[0].abs().max()) <= 1e-5
+    assert largest[0] <= 1e-5
     if trained.name == "cluster":
         _goals_are_encoded_as_in_training(trained)
 
