@@ -24,7 +24,7 @@ pub mod viewer;
 pub use demonstrations::{collect, dataset, expert, instructions};
 pub use environments::{assets, environment, fit, kitchen, lorel, registry};
 pub use evaluation::{evaluate, faults, results, rollout, sight, spoken, table};
-pub use recordings::{plans, recorder, replay, trace};
+pub use recordings::{plans, recorder, replay, starts, trace};
 
 /// The examples of the project's README compile as typed.
 #[cfg(all(doctest, feature = "language"))]

@@ -26,7 +26,7 @@ use lads_image::Tables;
 use lads_image::records::{MAX_ROW_STATES, Scope, StateKind};
 use lads_kernels::Isa;
 
-use crate::contract::{Beyond, Decision, Noise};
+use crate::contract::{Beyond, Decision, Noise, same_text};
 use crate::decision::Decider;
 use crate::errors::StepError;
 use crate::normal::Normals;
@@ -230,6 +230,20 @@ impl<'a, 'm> Controller<'a, 'm> {
             .plain
             .get(start..start.saturating_add(scores.width as usize))
             .unwrap_or(&[])
+    }
+
+    /// Returns the values of a plain state after the last step, by the state's name, such as those of the plan that
+    /// a low level is given; zeros before the first step, `None` for states of rows and for those that end with
+    /// their step.
+    pub fn state(&self, name: &str) -> Option<&[f32]> {
+        let tables = self.policy.tables();
+        let state = (0..tables.states_len())
+            .filter_map(|i| tables.state(i))
+            .filter(|state| state.kind == StateKind::Plain && state.scope != Scope::Step)
+            .find(|state| same_text(tables.text(state.name), name))?;
+        let start = state.offset as usize;
+        let end = start.saturating_add(state.width as usize);
+        self.workspace.now.plain.get(start..end)
     }
 
     /// Returns the action of the last step, or the one passed to [`executed`](Self::executed)

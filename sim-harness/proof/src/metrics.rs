@@ -11,7 +11,7 @@
 
 use std::fmt::{self, Display, Formatter};
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// The K-rates that are reported: at least 1, 2, 3 and 4 commanded sub-tasks completed.
 pub const K_RATES: usize = 4;
@@ -20,7 +20,7 @@ pub const K_RATES: usize = 4;
 const Z_95: f64 = 1.959963984540054;
 
 /// A two-sided 95 % confidence interval of a proportion, written to JSON as `[low, high]`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Interval(pub f64, pub f64);
 
 impl Display for Interval {
@@ -88,7 +88,7 @@ impl Rate {
 }
 
 /// Scores of a set of episodes.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Score {
     /// Number of episodes.
     pub episodes: usize,

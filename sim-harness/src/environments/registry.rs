@@ -20,6 +20,11 @@ pub fn default_noise(id: &str) -> Option<&'static str> {
     found.map(|known| known.noise)
 }
 
+/// Ids of the environments.
+pub fn ids() -> impl Iterator<Item = &'static str> {
+    ENVIRONMENTS.iter().map(|known| known.id)
+}
+
 /// Loads a scene from the vendor folder, for one noise level.
 type Loader = fn(&Path, &str) -> Result<Opener, LoadError>;
 

@@ -342,7 +342,7 @@ impl Evaluation<'_> {
 
 /// Seed of one of an episode's streams, such as the one that its plans are sampled from: the first draw of numpy's
 /// `default_rng([seed, instruction, episode, stream])`, 53 bits.
-fn stream_seed(seed: EpisodeSeed, stream: u64) -> u64 {
+pub(crate) fn stream_seed(seed: EpisodeSeed, stream: u64) -> u64 {
     let [run, instruction, episode] = seed.entropy();
     let unit = Stream::new(&[run, instruction, episode, stream]).unit();
     (unit * (1_u64 << 53) as f64) as u64

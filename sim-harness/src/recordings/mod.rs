@@ -2,6 +2,7 @@
 
 pub mod plans;
 pub mod replay;
+pub mod starts;
 
 pub use lads_record as recorder;
 pub use lads_record::trace;

@@ -176,14 +176,14 @@ pub fn replay(
 }
 
 /// What is wrong with a step's frames.
-struct BadFrame {
+pub(super) struct BadFrame {
     camera: String,
     /// `None` where there is no frame.
     wrong: Option<String>,
 }
 
 impl BadFrame {
-    fn at(self, episode: String, step: usize) -> ReplayError {
+    pub(super) fn at(self, episode: String, step: usize) -> ReplayError {
         let camera = self.camera;
         match self.wrong {
             None => ReplayError::NoFrame {
@@ -202,7 +202,10 @@ impl BadFrame {
 }
 
 /// Frames of the cameras at a control step, in the contract's order.
-fn images(contract: &Contract<'_>, step: &Step) -> Result<Vec<(ChannelId, Vec<u8>)>, BadFrame> {
+pub(super) fn images(
+    contract: &Contract<'_>,
+    step: &Step,
+) -> Result<Vec<(ChannelId, Vec<u8>)>, BadFrame> {
     let cameras = contract
         .observations()
         .filter(|channel| channel.dtype() == DType::U8);
@@ -236,7 +239,7 @@ fn pixels(_: &[u8]) -> Result<Vec<u8>, String> {
 }
 
 /// What the controller was given at a control step.
-fn seen<'s>(
+pub(super) fn seen<'s>(
     contract: &Contract<'_>,
     step: &'s Step,
     images: &'s [(ChannelId, Vec<u8>)],

@@ -1,13 +1,13 @@
 //! Charts of the report, each a list of pictures, which is empty where there is nothing to show: the form
 //! that all of them have, and those of success rates and latency.
 
-use kuva::plot::{Histogram, LinePlot};
+use kuva::plot::line::LineStyle;
+use kuva::plot::{BarPlot, Histogram, LinePlot};
 use kuva::render::layout::Layout;
 use kuva::render::plots::Plot;
 
 use super::Report;
-use crate::results::Results;
-use lads_proof::metrics::Interval;
+use lads_proof::metrics::{Interval, Score};
 
 /// Colours that stay apart for most eyes (Okabe and Ito), darkest first.
 pub const COLORS: [&str; 6] = [
@@ -38,8 +38,20 @@ pub struct Chart {
     pub wide: bool,
     /// Completions that are marked in the chart, explained below it.
     pub marks: Vec<Mark>,
+    /// What the colours stand for, listed below a chart that has no room for a legend.
+    pub key: Vec<Key>,
     /// Remark below the chart.
     pub note: String,
+}
+
+/// What a colour of a chart stands for.
+pub struct Key {
+    /// The colour, as CSS has it.
+    pub color: &'static str,
+    /// Sign of what is drawn in it, a character.
+    pub sign: &'static str,
+    /// What it stands for.
+    pub text: String,
 }
 
 /// A completion that is marked in a timeline.
@@ -66,6 +78,7 @@ pub fn chart(plots: Vec<Plot>, layout: Layout) -> Chart {
         svg: svg.replacen("<svg ", &scalable, 1),
         wide: width > HALF,
         marks: Vec::new(),
+        key: Vec::new(),
         note: String::new(),
     }
 }
@@ -81,44 +94,86 @@ pub fn sized(plots: &[Plot], title: &str, width: f64, height: f64) -> Layout {
         .with_height(height)
 }
 
-/// Draws the K-rates, Figure 3 of the paper.
-pub fn k_rates(results: &Results) -> Vec<Chart> {
-    let splits = results.splits.0.iter();
-    let splits = splits.filter(|(_, result)| result.score.episodes > 0);
-    let plots: Vec<Plot> = splits
-        .zip(COLORS)
+/// A line of a chart of K-rates, or a bar of one of success.
+pub struct Series<'s> {
+    /// Name in the legend.
+    pub name: &'s str,
+    /// Scores of the episodes.
+    pub score: &'s Score,
+}
+
+/// Arms of an interval below and above its rate.
+fn arms(rate: f64, Interval(low, high): Interval) -> (f64, f64) {
+    ((rate - low).max(0.0), (high - rate).max(0.0))
+}
+
+/// Draws the K-rates up to `most`, Figure 3 of the paper: one line for each of the series, told apart by colour, then by dashes.
+pub fn k_rates(title: &str, series: &[Series<'_>], most: usize) -> Vec<Chart> {
+    let dashes = [LineStyle::Solid, LineStyle::Dashed, LineStyle::Dotted];
+    let places = series.len().max(2) as f64 - 1.0;
+    let plots: Vec<Plot> = series
+        .iter()
         .enumerate()
-        .map(|(place, ((name, result), color))| {
-            let score = &result.score;
-            // Intervals of splits stand side by side.
-            let aside = 0.04 * place as f64;
+        .map(|(place, Series { name, score })| {
+            // Intervals of the series stand side by side.
+            let aside = place as f64 * (0.3 / places).min(0.04);
+            let rates = score.k_rate.into_iter().zip(score.k_rate_interval);
             let points: Vec<(f64, f64, Interval)> = (1..)
-                .zip(score.k_rate.into_iter().zip(score.k_rate_interval))
+                .zip(rates.take(most))
                 .filter_map(|(k, (rate, bounds))| Some((f64::from(k) + aside, rate?, bounds)))
                 .collect();
-            let ends = points.iter().map(|&(_, rate, Interval(low, high))| {
-                ((rate - low).max(0.0), (high - rate).max(0.0))
-            });
+            let ends = points.iter().map(|&(_, rate, bounds)| arms(rate, bounds));
+            let dash = dashes[place / COLORS.len() % dashes.len()].clone();
             LinePlot::new()
-                .with_color(color)
+                .with_color(COLORS[place % COLORS.len()])
+                .with_line_style(dash)
                 .with_data(points.iter().map(|&(k, rate, _)| (k, rate)))
                 .with_y_err_asymmetric(ends)
                 .with_stroke_width(2.5)
-                .with_legend(name.clone())
+                .with_legend(*name)
                 .into()
         })
         .collect();
     if plots.is_empty() {
         return Vec::new();
     }
-    let layout = sized(&plots, "", WHOLE, 360.0)
+    let layout = sized(&plots, title, WHOLE, 360.0)
         .with_x_label("K")
         .with_y_label("K-rate")
         .with_x_tick_step(1.0)
         .with_y_axis_min(0.0)
         .with_x_axis_min(0.8)
-        .with_x_axis_max(4.4)
+        .with_x_axis_max(most as f64 + 0.4)
         .with_y_axis_max(1.02);
+    vec![chart(plots, layout)]
+}
+
+/// Draws the rates of full success as bars with their intervals, for instructions with one sub-task each.
+pub fn successes(title: &str, series: &[Series<'_>]) -> Vec<Chart> {
+    let rates = series.iter().filter_map(|Series { name, score }| {
+        let rate = score.full_success?;
+        Some((*name, rate, arms(rate, score.full_success_interval)))
+    });
+    let rates: Vec<_> = rates.collect();
+    if rates.is_empty() {
+        return Vec::new();
+    }
+    let colored: Vec<_> = rates.iter().zip(COLORS.iter().cycle()).collect();
+    // The first of the series on top.
+    let bars = colored.iter().rev();
+    let bars = bars.map(|&(&(name, rate, _), &color)| (name, rate, color));
+    let plots: Vec<Plot> = vec![
+        BarPlot::new()
+            .with_colored_bars(bars)
+            .with_asymmetric_error(rates.iter().rev().map(|&(_, _, arms)| arms))
+            .with_horizontal(true)
+            .into(),
+    ];
+    let height = 110.0 + 34.0 * rates.len() as f64;
+    let layout = sized(&plots, title, WHOLE, height)
+        .with_x_label("success rate")
+        .with_x_axis_min(0.0)
+        .with_x_axis_max(1.0);
     vec![chart(plots, layout)]
 }
 

@@ -1,11 +1,18 @@
-//! Renders `--report`: one self-contained HTML file about what a policy did, with nothing to fetch.
+//! Renders self-contained HTML files with nothing to fetch: `--report` about what a policy did, and `lads-run report`, which compares several
+//! ([`Comparison`]).
 //!
 //! The charts are SVG inside the page, film strips are JPEG and the policy's own frames PNG inside it. Everything comes from the results and the traces; an episode's trace is needed for all but the success
 //! table and the K-rates. What can fail: the template, which is compiled in.
 
 mod charts;
+mod compare;
+mod compositions;
+mod figures;
+pub mod inputs;
 mod plans;
+mod scaling;
 mod timelines;
+mod words;
 
 use std::collections::BTreeSet;
 
@@ -14,10 +21,14 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use lads_compiler::Contract;
 
-use self::charts::Chart;
+use self::charts::{Chart, Series};
+pub use self::compare::{Comparison, Split, System};
+pub use self::figures::Behaviour;
+use self::figures::Figure;
 use crate::results::Results;
+use crate::starts::Drawn;
 use crate::trace::Trace;
-use lads_proof::metrics::{Interval, Score};
+use lads_proof::metrics::{Interval, K_RATES, Score};
 
 /// Inputs of a report.
 pub struct Report<'r> {
@@ -31,6 +42,8 @@ pub struct Report<'r> {
     pub plans: usize,
     /// Names of the sub-tasks that the environment watches.
     pub sub_tasks: &'r [&'static str],
+    /// Plans drawn at the start of the episodes of the [`composed`] instructions.
+    pub drawn: &'r Drawn,
     /// Pictures of the [`chosen`] episodes, or why there are none.
     pub strips: Result<Vec<Strip>, String>,
 }
@@ -64,6 +77,21 @@ pub fn chosen(traces: &[Trace]) -> Vec<&Trace> {
     chosen
 }
 
+/// Lists the composite instructions that were run with all of their parts, and these parts.
+pub fn composed(contract: &Contract, traces: &[Trace]) -> Vec<u32> {
+    let found = compositions::find(contract, &compositions::run(traces));
+    let all: BTreeSet<u32> = found.into_iter().flatten().collect();
+    all.into_iter().collect()
+}
+
+/// Counts, for each plan, the words of the instructions under which it was decided.
+fn words(results: &Results) -> words::Counts {
+    words::Counts::of(results.instructions.iter().map(|result| {
+        let plans = result.runs.iter().flat_map(|run| &run.plans).copied();
+        (result.text.as_str(), plans.collect())
+    }))
+}
+
 /// Title of an episode: its instruction, number and end.
 pub fn title(contract: &Contract, trace: &Trace) -> String {
     let known = contract.instructions.get(trace.instruction as usize);
@@ -92,13 +120,6 @@ struct Row {
 struct Number {
     value: String,
     within: String,
-}
-
-/// A chart with its explanation.
-struct Figure {
-    title: String,
-    about: String,
-    charts: Vec<Chart>,
 }
 
 /// A film strip, its pictures as text.
@@ -151,7 +172,7 @@ impl Report<'_> {
             results,
             decision,
             rows: self.rows(),
-            k_rates: charts::k_rates(results),
+            k_rates: charts::k_rates("", &self.series(), K_RATES),
             figures: self.figures(),
             films: self.films(),
             no_films: self.strips.as_ref().err().map_or("", String::as_str),
@@ -159,6 +180,16 @@ impl Report<'_> {
             few: self.few(),
         };
         page.render()
+    }
+
+    fn series(&self) -> Vec<Series<'_>> {
+        let splits = self.results.splits.0.iter();
+        let splits = splits.filter(|(_, result)| result.score.episodes > 0);
+        let series = splits.map(|(name, result)| Series {
+            name,
+            score: &result.score,
+        });
+        series.collect()
     }
 
     fn rows(&self) -> Vec<Row> {
@@ -169,14 +200,14 @@ impl Report<'_> {
             text: "all instructions of the split".to_owned(),
             split: name.clone(),
             strong: true,
-            numbers: numbers(&result.score),
+            numbers: with_un_instructed(&result.score),
         });
         let each = self.results.instructions.iter().map(|result| Row {
             id: result.id.clone(),
             text: result.text.clone(),
             split: result.split.clone(),
             strong: false,
-            numbers: numbers(&result.score),
+            numbers: with_un_instructed(&result.score),
         });
         splits.chain(each).collect()
     }
@@ -239,22 +270,20 @@ impl Report<'_> {
     }
 
     fn figures(&self) -> Vec<Figure> {
-        let figure = |title: &str, about: &str, charts: Vec<Chart>| Figure {
-            title: title.to_owned(),
-            about: about.to_owned(),
-            charts,
-        };
         // The first shows all instructions, the others composites and their parts.
         let starts = plans::start_distributions(self);
         let composites = starts.len() > 1;
+        let behaviour = Behaviour::of(self.contract, self.traces, self.drawn, self.results);
+        let alone = [("", &behaviour)];
+        let [paths, starting] = figures::composed(&alone);
         let mut figures = vec![
-            figure(
+            Figure::new(
                 "Latent plans over an episode",
                 "The plan in force at every control step. Vertical lines are completions, by number; those that the instruction does not ask \
                  for are grey and dotted. Episodes that failed come first.",
                 timelines::timelines(self),
             ),
-            figure(
+            Figure::new(
                 "Plans at the start of an episode",
                 if composites {
                     "Mean probability that the policy gives each plan in the first decision, by instruction. Then, for composite \
@@ -264,24 +293,27 @@ impl Report<'_> {
                 },
                 starts,
             ),
-            figure(
+            Figure::new(
                 "Gripper by plan",
                 "Where the gripper went from the decision on while a plan was in force, for the plans used most, in metres from where it was.",
                 plans::gripper(self),
             ),
-            figure(
+            paths,
+            starting,
+            Figure::new(
                 "Plans by word and by sub-task",
                 "First: how often each plan was decided under instructions that contain a word, as a share of the word's decisions. Second: which plan was in \
                  force when a sub-task was completed, as a share of its completions.",
                 plans::heat_maps(self),
             ),
-            figure(
+            figures::words(&alone),
+            Figure::new(
                 "Latency of the controller",
                 "All control steps, in microseconds, measured while all threads ran.",
                 charts::latency(self),
             ),
         ];
-        figures.retain(|figure| !figure.charts.is_empty());
+        figures.retain(|figure| !figure.is_empty());
         figures
     }
 }
@@ -308,6 +340,16 @@ fn numbers(score: &Score) -> Vec<Number> {
     [plain(score.episodes.to_string()), n_rate]
         .into_iter()
         .chain(k_rates)
-        .chain([full, plain(score.un_instructed.to_string())])
+        .chain([full])
         .collect()
+}
+
+/// The numbers of a score, and the number of sub-tasks that nobody asked for.
+fn with_un_instructed(score: &Score) -> Vec<Number> {
+    let mut numbers = numbers(score);
+    numbers.push(Number {
+        value: score.un_instructed.to_string(),
+        within: String::new(),
+    });
+    numbers
 }

@@ -1,7 +1,7 @@
 //! Charts of what plans are used for: by instruction at the start, by the gripper's path, by word and by
 //! sub-task.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use kuva::plot::scatter3d::Scatter3DPlot;
 use kuva::plot::{BarPlot, ColorMap, Heatmap, LegendPosition, LinePlot};
@@ -9,6 +9,7 @@ use kuva::render::plots::Plot;
 
 use super::Report;
 use super::charts::{COLORS, Chart, HALF, WHOLE, chart, sized};
+use super::compositions;
 
 /// Computes the mean softmax of the first decision's scores, by instruction.
 fn starts(report: &Report<'_>) -> BTreeMap<u32, Vec<f64>> {
@@ -50,36 +51,25 @@ pub fn start_distributions(report: &Report<'_>) -> Vec<Chart> {
         .map(|(&i, row)| (id(i), row.clone()))
         .collect();
     let mut charts = heat_map("first decision: mean probability", rows, report.plans);
-    let words = |i: u32| report.contract.evaluated(i as usize).0;
-    for (&composite, line) in &starts {
-        let whole = words(composite);
-        let atoms: Vec<u32> = starts
-            .keys()
-            .copied()
-            .filter(|&atom| words(atom).len() == 1 && whole.len() > 1)
-            .filter(|&atom| words(atom).iter().all(|part| whole.contains(part)))
-            .collect();
-        if let [a, b, ..] = atoms[..] {
-            charts.push(parts(
-                &id(composite),
-                line,
-                [(&id(a), &starts[&a]), (&id(b), &starts[&b])],
-            ));
-        }
-        if charts.len() > 4 {
-            break;
-        }
+    let run: Vec<u32> = starts.keys().copied().collect();
+    for members in compositions::find(report.contract, &run).iter().take(4) {
+        let rows: Vec<_> = members.iter().map(|i| (id(*i), &starts[i])).collect();
+        charts.extend(parts(&rows));
     }
     charts
 }
 
-fn parts(composite: &str, line: &[f64], atoms: [(&String, &Vec<f64>); 2]) -> Chart {
-    let [(a, of_a), (b, of_b)] = atoms;
-    let mut bars = BarPlot::new().with_legend(vec![a.as_str(), b.as_str()]);
-    for (plan, (&a, &b)) in of_a.iter().zip(of_b).enumerate() {
-        bars = bars.with_group(plan.to_string(), vec![(a, COLORS[4]), (b, COLORS[5])]);
+/// Draws the distribution of a composite instruction, the first of `rows`, over those of its parts.
+fn parts(rows: &[(String, &Vec<f64>)]) -> Option<Chart> {
+    let ((composite, line), atoms) = rows.split_first()?;
+    let names = atoms.iter().map(|(name, _)| name.as_str()).collect();
+    let mut bars = BarPlot::new().with_legend(names);
+    for plan in 0..line.len() {
+        let shares = atoms.iter().zip(COLORS[1..].iter().cycle());
+        let shares = shares.map(|((_, of_atom), color)| (of_atom[plan], *color));
+        bars = bars.with_group(plan.to_string(), shares);
     }
-    let points = (1..).zip(line).map(|(place, &p)| (f64::from(place), p));
+    let points = (1..).zip(*line).map(|(place, &p)| (f64::from(place), p));
     let line = LinePlot::new()
         .with_data(points)
         .with_color(COLORS[0])
@@ -88,7 +78,7 @@ fn parts(composite: &str, line: &[f64], atoms: [(&String, &Vec<f64>); 2]) -> Cha
     let layout = sized(&plots, composite, HALF, 300.0)
         .with_x_label("plan")
         .with_y_label("probability");
-    chart(plots, layout)
+    Some(chart(plots, layout))
 }
 
 /// Draws rows of shares over the plans as a heat map; plans that no row has are left out.
@@ -175,21 +165,9 @@ pub fn gripper(report: &Report<'_>) -> Vec<Chart> {
 /// Draws the heat maps of Figure 9 of the paper.
 pub fn heat_maps(report: &Report<'_>) -> Vec<Chart> {
     let size = report.plans;
-    let mut by_word: BTreeMap<String, Vec<f64>> = BTreeMap::new();
+    let by_word = super::words(report.results).by_word(size);
     let mut by_task: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     for trace in report.traces {
-        let known = report.contract.instructions.get(trace.instruction as usize);
-        let words: BTreeSet<String> = known
-            .map_or("", |known| known.text.as_str())
-            .split(|letter: char| !letter.is_alphanumeric())
-            .filter(|word| !word.is_empty())
-            .map(str::to_lowercase)
-            .collect();
-        for step in trace.steps.iter().filter(|step| step.decided) {
-            for word in &words {
-                count(&mut by_word, word, step.plan, size);
-            }
-        }
         for done in &trace.outcome.completions {
             let name = report.sub_tasks.get(done.sub_task).copied();
             let step = done

@@ -89,6 +89,9 @@ pub enum Job {
     View(Rollouts),
     /// Run the episodes, and film one of the first instruction (needs the cargo feature `record`, and EGL, which needs no display)
     Record(Record),
+    /// Compare policies in one environment on one HTML page (needs the cargo feature `report`): success rates of all inputs, and what each
+    /// bundle does in its episodes
+    Report(Compared),
     /// Draw what the environment's camera sees in every state of a dataset, for training on images (needs the cargo feature `camera`, and
     /// EGL); goes on where it was stopped
     Frames(Frames),
@@ -318,6 +321,25 @@ pub struct Record {
     pub episode: u32,
     #[command(flatten)]
     pub rollouts: Rollouts,
+}
+
+/// Options of `lads-run report`.
+#[derive(Debug, Args)]
+pub struct Compared {
+    /// What is compared: bundles (ONNX), whose episodes are run; results that --json wrote; tables that "make table" wrote
+    #[arg(required = true, value_name = "INPUT")]
+    pub inputs: Vec<PathBuf>,
+    /// The page
+    #[arg(short, long, value_name = "HTML")]
+    pub output: PathBuf,
+    /// Take only this table of a file of tables, by its name
+    #[arg(long, value_name = "NAME")]
+    pub table: Option<String>,
+    #[command(flatten)]
+    pub episodes: EpisodeArguments,
+    /// Instructions that the kernels run on; left out, the widest of this CPU. The results have the same bits on all
+    #[arg(long)]
+    pub isa: Option<IsaName>,
 }
 
 /// Options of `lads-run frames`.

@@ -8,6 +8,12 @@ use std::path::Path;
 pub enum End {
     /// Refused, with one line that names the thing and the remedy.
     Refused(String),
+    /// Refused, with such a line for each thing.
+    #[cfg_attr(
+        not(feature = "report"),
+        expect(dead_code, reason = "only `report` takes several files")
+    )]
+    AllRefused(Vec<String>),
     /// Interrupted by a signal.
     Interrupted,
 }

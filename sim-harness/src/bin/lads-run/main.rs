@@ -1,8 +1,9 @@
 //! `lads-run`: drives a bundle's policy through the simulated environment that its contract names, and reports success rates and latency;
-//! its subcommands verify and tune the policy, replay and encode recordings, sweep over faults, show and film episodes.
+//! its subcommands verify and tune the policy, replay and encode recordings, sweep over faults, show and film episodes, compare policies.
 //!
 //! Everything that can be wrong is looked at before the first episode: arguments, the place for the JSON, the bundle, its golden episode,
-//! the instruction, the assets, and whether contract and environment fit. Any of it ends with one line on stderr and exit code 2; an
+//! the instruction, the assets, and whether contract and environment fit. Any of it ends with one line on stderr and exit code 2, or with a
+//! line for each of several files; an
 //! interrupt ends with exit code 130. Files are written only after the last episode, to a temporary file that is then
 //! renamed; `frames` alone keeps what it has, and goes on with it.
 //! `verify` runs a reference's episodes, and its verdict is the exit code: 0 equivalent, 1 different, 3 inconclusive.
@@ -10,6 +11,7 @@
 
 mod arguments;
 mod bench;
+mod compare;
 mod end;
 mod frames;
 mod language;
@@ -52,6 +54,12 @@ fn main() -> ExitCode {
             ExitCode::from(INTERRUPTED)
         }
         Err(End::Refused(line)) => command::refuse(line),
+        Err(End::AllRefused(lines)) => {
+            for line in &lines {
+                command::refuse(line);
+            }
+            ExitCode::from(command::REFUSED)
+        }
     }
 }
 
@@ -73,6 +81,7 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
         Job::Tune(asked) => tune::run(asked, &stop),
         Job::Replay(replay) => recordings::replay(replay),
         Job::Encode(encode) => recordings::encode(encode),
+        Job::Report(asked) => compare::run(asked, &stop),
         Job::Frames(asked) => frames::run(asked, &stop),
         Job::Sweep(asked) => sweep::run(asked, &stop),
         Job::View(asked) => {

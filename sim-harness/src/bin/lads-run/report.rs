@@ -2,7 +2,7 @@
 //! the page says so.
 
 #[cfg(feature = "report")]
-pub use with::{check, page, write};
+pub use with::{check, drawn, page, write};
 #[cfg(not(feature = "report"))]
 pub use without::{check, page, write};
 
@@ -14,8 +14,9 @@ mod with {
     use lads_sim::evaluate::Evaluation;
     use lads_sim::output;
     use lads_sim::registry::Opener;
-    use lads_sim::report::{Report, Strip};
+    use lads_sim::report::{Report, Strip, composed};
     use lads_sim::results::Results;
+    use lads_sim::starts::{self, Drawn};
     use lads_sim::trace::Trace;
 
     use crate::end::{End, refused, unwritable};
@@ -26,6 +27,12 @@ mod with {
         output::check(&[], &outputs).map_err(refused)
     }
 
+    /// Draws plans at the start of composite instructions and their parts.
+    pub fn drawn(evaluation: &Evaluation<'_>, traces: &[Trace]) -> Result<Drawn, End> {
+        let instructions = composed(evaluation.contract, traces);
+        starts::draw(evaluation, traces, &instructions).map_err(refused)
+    }
+
     /// Renders the page, film strips included.
     pub fn page(
         results: &Results,
@@ -34,12 +41,14 @@ mod with {
         open: &Opener,
         (stop, path): (&AtomicBool, &Path),
     ) -> Result<String, End> {
+        let drawn = drawn(evaluation, traces)?;
         let report = Report {
             results,
             traces,
             contract: evaluation.contract,
             plans: evaluation.policy.index_count() as usize,
             sub_tasks: open().sub_tasks(),
+            drawn: &drawn,
             strips: strips(traces, evaluation, open, stop)?,
         };
         let html = report.html();

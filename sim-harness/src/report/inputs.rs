@@ -1,0 +1,447 @@
+//! Files of numbers that a comparison takes: results of `lads-run --json`, and tables of `python -m lads_exporter table`.
+//!
+//! Only the fields that are needed are read, so that a file with more of them is taken too. What can fail: a file that cannot be read, is
+//! no JSON, or is of another format or version.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::path::Path;
+
+use lads_proof::metrics::{Interval, K_RATES, Score, wilson};
+use serde::Deserialize;
+use serde_json::Value;
+use thiserror::Error;
+
+use super::compare::{Split, System};
+use super::figures::Behaviour;
+use super::words::Counts;
+use crate::registry;
+use crate::results::{FORMAT, FORMAT_VERSION};
+
+/// Value of the `format` of a file of tables.
+const TABLES: &str = "lads-tables";
+
+/// Versions of a file of tables that are read.
+const TABLES_VERSIONS: std::ops::RangeInclusive<u64> = 1..=2;
+
+/// Why a table has no figures of what a policy did.
+const A_TABLE: &str = "a table holds success rates only; give a bundle";
+
+/// Why results have no figures of control steps.
+const RESULTS: &str = "results hold no control steps; give the bundle";
+
+/// Why a file is not taken.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum InputError {
+    /// The file cannot be read.
+    #[error("it cannot be read ({0})")]
+    Read(io::Error),
+    /// The file is no JSON.
+    #[error("it is not JSON ({0}); give a bundle, results of lads-run --json, or tables.json")]
+    Json(serde_json::Error),
+    /// The file is of another format.
+    #[error(
+        "its format is {found}, not {FORMAT} (lads-run --json) or {TABLES} (python -m lads_exporter table)"
+    )]
+    Format {
+        /// What the file says.
+        found: String,
+    },
+    /// The file's version is unknown.
+    #[error("it is {format} of version {found}, and this program reads {read}; make it again")]
+    Version {
+        /// The file's format.
+        format: &'static str,
+        /// What the file says.
+        found: String,
+        /// Versions that are read.
+        read: String,
+    },
+    /// A field is missing or of another kind.
+    #[error("it is a damaged {format} file ({wrong}); make it again")]
+    Field {
+        /// The file's format.
+        format: &'static str,
+        /// Where the form is another one.
+        wrong: serde_json::Error,
+    },
+    /// A table of no environment.
+    #[error(
+        "its table '{table}' is of no known environment ({known}); name another one with --table"
+    )]
+    Unknown {
+        /// Name of the table.
+        table: String,
+        /// Ids of the known environments.
+        known: String,
+    },
+    /// There is no table to compare.
+    #[error("it has no table '{asked}' with a finished system; it has {tables}")]
+    NoTable {
+        /// Name that was asked for.
+        asked: String,
+        /// Names of the file's tables.
+        tables: String,
+    },
+}
+
+/// Systems that a file has numbers of, by their environment's id.
+pub type Found = BTreeMap<String, Vec<System>>;
+
+/// Reads results or tables; of tables only the one that `table` names, where it does.
+pub fn read(path: &Path, table: Option<&str>) -> Result<Found, InputError> {
+    let text = lads_host::input::read_to_string(path).map_err(InputError::Read)?;
+    parse(&text, &path.display().to_string(), table)
+}
+
+fn parse(text: &str, name: &str, table: Option<&str>) -> Result<Found, InputError> {
+    let value: Value = serde_json::from_str(text).map_err(InputError::Json)?;
+    let version = &value["format_version"];
+    let versioned = |format, known: bool, read: String| {
+        known.then_some(()).ok_or_else(|| InputError::Version {
+            format,
+            found: version.to_string(),
+            read,
+        })
+    };
+    match value["format"].as_str() {
+        Some(FORMAT) => {
+            let known = version.as_u64() == Some(u64::from(FORMAT_VERSION));
+            versioned(FORMAT, known, format!("version {FORMAT_VERSION}"))?;
+            results(value, name)
+        }
+        Some(TABLES) => {
+            let known = version.as_u64();
+            let known = known.is_some_and(|version| TABLES_VERSIONS.contains(&version));
+            let (from, to) = TABLES_VERSIONS.into_inner();
+            versioned(TABLES, known, format!("versions {from} to {to}"))?;
+            tables(value, name, table)
+        }
+        found => Err(InputError::Format {
+            found: found.map_or("not stated".to_owned(), |found| format!("'{found}'")),
+        }),
+    }
+}
+
+#[derive(Deserialize)]
+struct ResultsFile {
+    environment: Id,
+    bundle_sha256: String,
+    seed: u64,
+    noise: String,
+    decision: Decision,
+    episodes_per_instruction: u32,
+    splits: BTreeMap<String, Score>,
+    instructions: Vec<InstructionFound>,
+}
+
+#[derive(Deserialize)]
+struct Id {
+    id: String,
+}
+
+#[derive(Deserialize)]
+struct Decision {
+    rule: String,
+}
+
+#[derive(Deserialize)]
+struct InstructionFound {
+    text: String,
+    split: String,
+    completions: Vec<Value>,
+    runs: Vec<RunFound>,
+}
+
+#[derive(Deserialize)]
+struct RunFound {
+    plans: Vec<u32>,
+}
+
+fn results(value: Value, name: &str) -> Result<Found, InputError> {
+    let format = FORMAT;
+    let file: ResultsFile =
+        serde_json::from_value(value).map_err(|wrong| InputError::Field { format, wrong })?;
+    // JSON's order of splits is the alphabet's; the instructions have the contract's.
+    let mut names: Vec<&str> = Vec::new();
+    for instruction in &file.instructions {
+        if !names.contains(&instruction.split.as_str()) {
+            names.push(&instruction.split);
+        }
+    }
+    let split = |&name: &&str| {
+        let own = file.instructions.iter().filter(|it| it.split == name);
+        Some(Split {
+            name: name.to_owned(),
+            score: file.splits.get(name)?.clone(),
+            commanded: own.map(|it| it.completions.len()).max(),
+        })
+    };
+    let decided = file.instructions.iter().map(|instruction| {
+        let plans = instruction.runs.iter().flat_map(|run| &run.plans).copied();
+        (instruction.text.as_str(), plans.collect())
+    });
+    let system = System {
+        name: short(name, ".results.json"),
+        file: name.to_owned(),
+        group: None,
+        facts: facts(
+            &file.bundle_sha256,
+            (&file.noise, file.seed),
+            &file.decision.rule,
+            file.episodes_per_instruction,
+        ),
+        policies: 1,
+        splits: names.iter().filter_map(split).collect(),
+        behaviour: Behaviour {
+            compositions: Err(RESULTS.to_owned()),
+            words: Behaviour::words(Counts::of(decided)),
+        },
+    };
+    Ok(Found::from([(file.environment.id, vec![system])]))
+}
+
+/// Says what ran, in one line.
+pub fn facts(sha256: &str, (noise, seed): (&str, u64), rule: &str, episodes: u32) -> String {
+    let actions = match rule {
+        "uniform" => "uniform random actions".to_owned(),
+        rule => format!("plans by {rule}"),
+    };
+    format!(
+        "bundle {sha256:.12}, noise {noise}, seed {seed}, {actions}, {episodes} {} of each instruction",
+        if episodes == 1 { "episode" } else { "episodes" }
+    )
+}
+
+/// Name of a file without its folder and ending.
+pub fn short(path: &str, ending: &str) -> String {
+    let path = Path::new(path);
+    let file = path.file_name().unwrap_or_default().to_string_lossy();
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    file.strip_suffix(ending).unwrap_or(&stem).to_owned()
+}
+
+#[derive(Deserialize)]
+struct TablesFile {
+    tables: BTreeMap<String, TableFound>,
+}
+
+#[derive(Deserialize)]
+struct TableFound {
+    measure: String,
+    protocol: Protocol,
+    tracks: Vec<TrackFound>,
+}
+
+#[derive(Deserialize)]
+struct Protocol {
+    episodes_per_instruction: u32,
+    seed: u64,
+    noise: String,
+}
+
+#[derive(Deserialize)]
+struct TrackFound {
+    name: String,
+    rows: Vec<RowFound>,
+}
+
+#[derive(Deserialize)]
+struct RowFound {
+    title: String,
+    seeds: Vec<u64>,
+    /// Absent until a seed is finished.
+    splits: Option<BTreeMap<String, SplitFound>>,
+}
+
+#[derive(Deserialize)]
+struct SplitFound {
+    episodes: usize,
+    success: f64,
+    success_interval: Interval,
+    n_rate: f64,
+    n_rate_standard_error: f64,
+    k_rate: [f64; K_RATES],
+}
+
+impl SplitFound {
+    /// Scores of all seeds' episodes together. Every seed ran as many, so a mean of rates is the rate of all, and times the number of
+    /// episodes it is the count that an interval needs.
+    fn score(&self) -> Score {
+        let count = |rate: f64| (rate * self.episodes as f64).round() as usize;
+        Score {
+            episodes: self.episodes,
+            n_rate: Some(self.n_rate),
+            n_rate_standard_error: Some(self.n_rate_standard_error),
+            k_rate: self.k_rate.map(Some),
+            k_rate_interval: self.k_rate.map(|rate| wilson(count(rate), self.episodes)),
+            full_success: Some(self.success),
+            full_success_interval: self.success_interval,
+            full_success_count: count(self.success),
+            un_instructed: 0,
+        }
+    }
+}
+
+fn tables(value: Value, name: &str, asked: Option<&str>) -> Result<Found, InputError> {
+    let format = TABLES;
+    let file: TablesFile =
+        serde_json::from_value(value).map_err(|wrong| InputError::Field { format, wrong })?;
+    let mut found = Found::new();
+    let wanted = file.tables.iter();
+    for (table, content) in wanted.filter(|(table, _)| asked.is_none_or(|asked| *table == asked)) {
+        let systems = content.systems(table, name);
+        if systems.is_empty() {
+            continue;
+        }
+        let environment = environment_of(table).ok_or_else(|| InputError::Unknown {
+            table: table.clone(),
+            known: registry::ids().collect::<Vec<_>>().join(", "),
+        })?;
+        found
+            .entry(environment.to_owned())
+            .or_default()
+            .extend(systems);
+    }
+    if found.is_empty() {
+        let tables: Vec<&str> = file.tables.keys().map(String::as_str).collect();
+        return Err(InputError::NoTable {
+            asked: asked.unwrap_or("of any name").to_owned(),
+            tables: if tables.is_empty() {
+                "none".to_owned()
+            } else {
+                tables.join(", ")
+            },
+        });
+    }
+    Ok(found)
+}
+
+/// Finds a table's environment, which the file does not state, by the table's name: the first word of `lorel` or `kitchen-image` is a
+/// word of the environment's id.
+fn environment_of(table: &str) -> Option<&'static str> {
+    let first = table.split(['-', '_']).next()?;
+    registry::ids().find(|id| id.split('-').any(|word| word == first))
+}
+
+impl TableFound {
+    fn systems(&self, table: &str, file: &str) -> Vec<System> {
+        let Protocol {
+            episodes_per_instruction: episodes,
+            seed,
+            noise,
+        } = &self.protocol;
+        let system = |track: &TrackFound, row: &RowFound| {
+            let splits = row.splits.as_ref()?.iter();
+            Some(System {
+                name: row.title.clone(),
+                file: file.to_owned(),
+                group: Some(format!("{table}/{}", track.name)),
+                facts: format!(
+                    "table {table}, track {}, noise {noise}, seed {seed}, {episodes} episodes of each instruction by every policy",
+                    track.name
+                ),
+                policies: row.seeds.len(),
+                splits: splits
+                    .map(|(name, split)| Split {
+                        name: name.clone(),
+                        score: split.score(),
+                        // The measure says whether K-rates tell more than success; instructions are not listed.
+                        commanded: (self.measure == "n_rate").then_some(K_RATES),
+                    })
+                    .collect(),
+                behaviour: Behaviour {
+                    compositions: Err(A_TABLE.to_owned()),
+                    words: Err(A_TABLE.to_owned()),
+                },
+            })
+        };
+        let tracks = self.tracks.iter();
+        tracks
+            .flat_map(|track| track.rows.iter().filter_map(move |row| system(track, row)))
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn split(k_rate: [f64; 4]) -> Value {
+        serde_json::json!({"episodes": 20, "success": 0.25, "success_interval": [0.11, 0.47], "success_by_seed": [0.25],
+            "n_rate": 1.0, "n_rate_standard_error": 0.5, "k_rate": k_rate})
+    }
+
+    fn tables_file(version: u64) -> Value {
+        let row = serde_json::json!({"title": "LADS", "seeds": [0, 1], "splits": {"seen": split([0.75, 0.5, 0.25, 0.25])}});
+        let waiting = serde_json::json!({"title": "LISA", "seeds": []});
+        let table = |measure: &str| {
+            serde_json::json!({"measure": measure, "jobs": [], "protocol": {"episodes_per_instruction": 10, "seed": 0, "noise": "v0"},
+                "tracks": [{"name": "paper", "rows": [row.clone(), waiting.clone()]}]})
+        };
+        serde_json::json!({"format": "lads-tables", "format_version": version,
+            "tables": {"kitchen": table("n_rate"), "lorel": table("success")}})
+    }
+
+    fn parsed(value: &Value, table: Option<&str>) -> Result<Found, InputError> {
+        parse(&value.to_string(), "models/tables.json", table)
+    }
+
+    #[test]
+    fn tables_of_both_versions_are_read() {
+        for version in [1, 2] {
+            let found = parsed(&tables_file(version), None).unwrap();
+            let ids: Vec<&str> = found.keys().map(String::as_str).collect();
+            assert_eq!(ids, ["franka-kitchen", "lorel-table"]);
+            let [lads] = &found["franka-kitchen"][..] else {
+                panic!("what is not finished is left out");
+            };
+            assert_eq!((lads.name.as_str(), lads.splits.len()), ("LADS", 1));
+            assert_eq!(lads.group.as_deref(), Some("kitchen/paper"));
+            let score = &lads.splits[0].score;
+            assert_eq!(score.k_rate_interval[1], wilson(10, 20));
+            assert_eq!(score.full_success_interval, Interval(0.11, 0.47));
+            assert_eq!(lads.splits[0].commanded, Some(4));
+            assert_eq!(found["lorel-table"][0].splits[0].commanded, None);
+        }
+        let one = parsed(&tables_file(1), Some("lorel")).unwrap();
+        assert_eq!(one.len(), 1);
+    }
+
+    #[test]
+    fn other_files_are_refused_with_what_they_are() {
+        let refused = |text: &str, table: Option<&str>, parts: &[&str]| {
+            let error = parse(text, "f", table).err().unwrap().to_string();
+            for part in parts {
+                assert!(error.contains(part), "'{part}' is not in: {error}");
+            }
+        };
+        refused("{", None, &["not JSON"]);
+        refused("[1]", None, &["format is not stated"]);
+        refused(
+            r#"{"format": "lads-sweep"}"#,
+            None,
+            &["'lads-sweep'", "lads-results", "lads-tables"],
+        );
+        let newer = tables_file(3).to_string();
+        refused(&newer, None, &["version 3", "versions 1 to 2"]);
+        refused(
+            r#"{"format": "lads-results", "format_version": 9}"#,
+            None,
+            &["version 9"],
+        );
+        refused(
+            r#"{"format": "lads-results", "format_version": 1}"#,
+            None,
+            &["damaged lads-results", "environment"],
+        );
+        refused(
+            &tables_file(1).to_string(),
+            Some("libero"),
+            &["'libero'", "kitchen, lorel"],
+        );
+        let other = tables_file(1).to_string().replace("kitchen", "tiny");
+        refused(&other, None, &["'tiny'", "franka-kitchen"]);
+    }
+}
