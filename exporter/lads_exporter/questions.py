@@ -171,8 +171,8 @@ def add(head, rows, model, contract, policy, renderer=None):
             raise config.UserError(f"{where}: the recorded actions are not this policy's; make the reference again")
         if logits:
             trace["logits"] = _text([row.numpy() for row in logits], "<f4")
-        segments = len(done) // horizon
-        if encoder and segments:
+        segments = len(done) // horizon if encoder else 0
+        if segments:
             cut = lambda steps: steps[: segments * horizon].reshape(segments, horizon, -1)
             trace["encoded"], trace["encoded_margins"] = encoder.plans(cut(shown.of(index, episode)), cut(done))
         elif encoder:

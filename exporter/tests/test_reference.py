@@ -48,6 +48,11 @@ def test_the_full_sequence_gives_the_golden_episode(policy):
     assert np.abs(actions - golden["actions"]).max() < 1e-4
 
 
+def test_noise_is_seeded_as_lads_run_does():
+    # sim-harness/src/evaluation/evaluate.rs has the same numbers.
+    assert [whole.noise_seed(entropy) for entropy in ([0, 1, 2], [7, 100, 49])] == [6_282_830_349_413_829, 5_255_917_235_266_557]
+
+
 def test_the_purpose_is_what_it_is_for(tiny):
     contract = contracts.of(tiny[3])
     purpose = reference.purpose_sha256(contract)

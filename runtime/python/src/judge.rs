@@ -280,6 +280,7 @@ fn replay(
                 decided,
                 plan: selected.map(|selected| selected.index),
                 logits: scores.to_vec(),
+                plan_vector: Vec::new(),
                 action: action.clone(),
                 margin: selected
                     .map(|selected| selected.margin)

@@ -3,8 +3,8 @@
 //!
 //! Open loop: at each control step of a traced episode the policy got the observation that the reference saw, and its history held the
 //! actions that the reference executed. So a difference is the policy's own, however chaotic the physics. Judged are the steps that decide, the
-//! logits up to a constant (adding one to all of them changes no probability), the plans, the actions while the same plan is in force, and what the
-//! trajectory encoder sees. Where two plans are equally likely, rounding may pick either: a decision whose margin in the reference is
+//! logits up to a constant (adding one to all of them changes no probability), the plans, as vectors where they are none of a codebook's, the actions
+//! while the same plan is in force, and what the trajectory encoder sees. Where two plans are equally likely, rounding may pick either: a decision whose margin in the reference is
 //! at most twice the logits' tolerance may fall out otherwise. Plans that are numbered otherwise throughout are the same plans: that is said and no
 //! difference. Nothing here can fail.
 
@@ -28,6 +28,9 @@ pub const ACTION_TOLERANCE: f64 = 1e-4;
 /// Factor on the reference's own float noise that is allowed too: noise of one size does not always have the same effect. A reference measures three
 /// draws; of ten others on each shipped policy one moved an action by 2.1 times as much as the largest of the three, in both kitchens.
 pub const NOISE_FACTOR: f64 = 3.0;
+
+/// Allowed difference of an element of a plan that is a vector, whose elements deviate by about 1.
+pub const PLAN_TOLERANCE: f64 = 1e-3;
 
 /// Relative gap of squared distances up to which a segment's two nearest codes are a close call, so that either may be its encoding.
 pub const ENCODER_CLOSE_CALL: f64 = 1e-3;
@@ -71,6 +74,8 @@ pub struct Reply {
     pub logits: Vec<f32>,
     /// Lead of the best logit over the second; `None` where there are not two.
     pub margin: Option<f32>,
+    /// Plan in force of a policy whose plans are vectors; empty of others.
+    pub plan_vector: Vec<f32>,
     /// Action of the step.
     pub action: Vec<f32>,
 }
@@ -116,6 +121,12 @@ pub struct Answers {
     pub logit_tolerance: Option<f64>,
     /// Number of decisions that differ within rounding.
     pub close_calls: usize,
+    /// Number of steps whose plan was compared as a vector.
+    pub compared_plan_vectors: usize,
+    /// Largest difference of an element of a plan in these steps.
+    pub largest_plan_difference: f64,
+    /// Allowed difference of an element of a plan.
+    pub plan_tolerance: f64,
     /// Number of segments whose encoding by the trajectory encoder was compared.
     pub compared_segments: usize,
     /// Number of compared segments that were encoded as another plan.
@@ -170,6 +181,7 @@ impl Answers {
             .min(ACTION_TOLERANCE);
         Self {
             action_tolerance: stated.max(NOISE_FACTOR * noise.action),
+            plan_tolerance: PLAN_TOLERANCE.max(NOISE_FACTOR * noise.plan_vector),
             close_call: 2.0 * logit_tolerance(reference),
             ..Self::default()
         }
@@ -295,6 +307,8 @@ impl<'t> Traced<'t> {
             .trace
             .actions
             .chunks_exact((self.trace.actions.len() / steps).max(1));
+        let len = (self.trace.plan_vectors.len() / steps).max(1);
+        let mut vectors = self.trace.plan_vectors.chunks_exact(len);
         let mut numbers = self.decided_at.iter().copied().enumerate().peekable();
         let mut same_plan = true;
         for (step, (reply, done)) in self.replay.replies.iter().zip(done).enumerate() {
@@ -324,6 +338,9 @@ impl<'t> Traced<'t> {
                     );
                 }
                 None => {}
+            }
+            if let Some(reference) = vectors.next() {
+                found(step, answers.plan_vector(&reply.plan_vector, reference));
             }
             if same_plan {
                 found(step, answers.action(&reply.action, done));
@@ -415,6 +432,26 @@ impl Answers {
         Some(format!(
             "plan {plan}, the reference's is {reference} by a margin of {margin:.4}"
         ))
+    }
+
+    fn plan_vector(&mut self, plan: &[f32], reference: &[f32]) -> Option<String> {
+        self.compared_plan_vectors += 1;
+        if plan.len() != reference.len() {
+            let (ours, theirs) = (plan.len(), reference.len());
+            return Some(format!(
+                "the policy's plan has {ours} elements, the reference's {theirs}"
+            ));
+        }
+        let differences = plan.iter().zip(reference);
+        let differences = differences.map(|(ours, theirs)| f64::from((ours - theirs).abs()));
+        // No difference is NaN below: what is no number counts as infinitely far.
+        let finite = differences.map(|it| if it.is_nan() { f64::INFINITY } else { it });
+        let difference = finite.fold(0.0, f64::max);
+        self.largest_plan_difference = self.largest_plan_difference.max(difference);
+        let tolerance = self.plan_tolerance;
+        (difference > tolerance).then(|| {
+            format!("an element of the plan is off by {difference:.1e}, allowed {tolerance:.1e}")
+        })
     }
 
     fn action(&mut self, action: &[f32], done: &[f32]) -> Option<String> {

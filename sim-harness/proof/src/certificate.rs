@@ -423,6 +423,13 @@ fn agreement(
     } else {
         format!("within {:.1e}", environment.largest_state_difference)
     };
+    let plans = match policy.compared_plan_vectors {
+        0 => String::new(),
+        steps => format!(
+            ", plans within {:.1e} over {steps} steps",
+            policy.largest_plan_difference
+        ),
+    };
     let clear = rounding
         .filter(|it| it.smallest_margin.is_some())
         .map_or(String::new(), |it| {
@@ -433,7 +440,7 @@ fn agreement(
             )
         });
     format!(
-        "logits within {:.1e} over {} decisions{clear}, actions within {:.1e} over {} steps, states {physics} over {} states{frames}, {:.1} % of {} episodes with identical completions",
+        "logits within {:.1e} over {} decisions{clear}{plans}, actions within {:.1e} over {} steps, states {physics} over {} states{frames}, {:.1} % of {} episodes with identical completions",
         policy.largest_logit_difference,
         policy.compared_decisions,
         policy.largest_action_difference,

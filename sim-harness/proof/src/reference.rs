@@ -113,6 +113,9 @@ pub struct FloatNoise {
     pub action: f64,
     /// Largest difference of a logit, up to a constant.
     pub logit: f64,
+    /// Largest difference of an element of a plan that is a vector; 0 of a policy whose plans are none.
+    #[serde(default)]
+    pub plan_vector: f64,
 }
 
 /// All episodes of one instruction.
@@ -145,6 +148,8 @@ pub struct Episode {
     pub margins: Vec<f64>,
     /// Noise-free state after the last step.
     pub final_state: Vec<f64>,
+    /// Seed of the noise that the policy drew; `None` of one that draws none.
+    pub noise_seed: Option<u64>,
     /// Observations and actions step by step, in the first episodes of each instruction.
     pub trace: Option<Trace>,
 }
@@ -172,6 +177,8 @@ pub struct Trace {
     pub states: Vec<f64>,
     /// Logits of each decision, `[decisions, M]`; empty where none were recorded.
     pub logits: Vec<f32>,
+    /// Plan in force at each step, `[steps, D]`, of a policy whose plans are vectors; empty of others.
+    pub plan_vectors: Vec<f32>,
     /// Plan that the trajectory encoder sees in each full segment.
     pub encoded: Option<Vec<u32>>,
     /// Extra distance of the second nearest code in each segment, relative to the nearest's squared distance.
@@ -187,6 +194,8 @@ struct Written {
     states: String,
     #[serde(default)]
     logits: String,
+    #[serde(default)]
+    plan_vectors: String,
     encoded: Option<Vec<u32>>,
     encoded_margins: Option<Vec<f64>>,
 }
@@ -217,6 +226,7 @@ impl Trace {
             && self.actions.len() == steps * subject.action_len
             && self.frames.len() == frames
             && self.states.len() == states * subject.state_len
+            && self.plan_vectors.len().is_multiple_of(steps.max(1))
             && (states >= frames && (states == 0) == (steps == 0));
         let wrong = "the lengths of a trace are not those of the environment";
         fits.then_some(()).ok_or(wrong)
@@ -233,6 +243,7 @@ impl TryFrom<Written> for Trace {
             actions: numbers(&written.actions, f32::from_le_bytes)?,
             states: numbers(&written.states, f64::from_le_bytes)?,
             logits: numbers(&written.logits, f32::from_le_bytes)?,
+            plan_vectors: numbers(&written.plan_vectors, f32::from_le_bytes)?,
             encoded: written.encoded,
             encoded_margins: written.encoded_margins,
         })
@@ -268,6 +279,8 @@ pub struct Subject<'s> {
     pub observation_len: usize,
     /// Whether the policy has cameras.
     pub sees: bool,
+    /// Whether the policy draws noise from a seed.
+    pub draws: bool,
     /// Number of elements of an action.
     pub action_len: usize,
 }
@@ -413,6 +426,13 @@ impl Reference {
                 return Err(content(
                     "the length of a final state is not the environment's",
                 ));
+            }
+            if episode.noise_seed.is_some() != subject.draws {
+                return Err(content(if subject.draws {
+                    "the policy draws noise, and its episodes do not say from which seed"
+                } else {
+                    "its episodes were drawn from seeds, and the policy draws no noise"
+                }));
             }
             if let Some(trace) = &episode.trace {
                 trace.check(episode.steps, subject).map_err(content)?;

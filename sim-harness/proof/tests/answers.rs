@@ -145,6 +145,47 @@ fn logits_are_judged_up_to_a_constant() {
 }
 
 #[test]
+fn plans_that_are_vectors_are_judged_element_by_element() {
+    // A policy that selects nothing, two elements in each plan.
+    let mut file = file();
+    file["horizon"] = Value::Null;
+    let episode = &mut file["instructions"][0]["episodes"][0];
+    for key in ["plans", "margins", "decided_at"] {
+        episode[key] = json!([]);
+    }
+    let plans: Vec<f32> = (0..2 * STEPS).map(|element| element as f32 / 8.0).collect();
+    episode["trace"]["logits"] = json!("");
+    episode["trace"]["plan_vectors"] = text(&plans, f32::to_le_bytes).into();
+    let reference = read(&file);
+    let judged = |change: fn(&mut Reply)| {
+        let mut replay = own();
+        for (reply, plan) in replay.replies.iter_mut().zip(plans.chunks(2)) {
+            *reply = Reply {
+                plan_vector: plan.to_vec(),
+                action: reply.action.clone(),
+                ..Reply::default()
+            };
+        }
+        change(&mut replay.replies[3]);
+        Answers::judge(&reference, &[replay], None).0
+    };
+    let same = judged(|_| {});
+    assert_eq!(
+        (same.differing_episodes, same.compared_plan_vectors),
+        (0, STEPS)
+    );
+    let near = judged(|reply| reply.plan_vector[1] += 1e-4);
+    assert!(near.differing_episodes == 0 && near.largest_plan_difference > 9e-5);
+    let far = "step 3: an element of the plan is off by";
+    difference(&judged(|reply| reply.plan_vector[1] += 0.01), far);
+    difference(&judged(|reply| reply.plan_vector[0] = f32::NAN), far);
+    difference(
+        &judged(|reply| reply.plan_vector.clear()),
+        "step 3: the policy's plan has 0 elements, the reference's 2",
+    );
+}
+
+#[test]
 fn a_consistent_renumbering_of_the_plans_is_harmless() {
     // The reference's plans 0, 1, 2 are the run's 2, 0, 1.
     let number = |plan: u32| [2, 0, 1][plan as usize];

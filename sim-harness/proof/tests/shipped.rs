@@ -41,6 +41,7 @@ fn shipped_references_are_whole() {
             state_len,
             observation_len: len("observation"),
             sees: shapes("observation", 3).next().is_some(),
+            draws: false,
             action_len: len("action"),
         };
         reference.check(&subject).unwrap();

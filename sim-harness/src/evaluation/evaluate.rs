@@ -379,4 +379,20 @@ mod tests {
         drawn.dedup();
         assert_eq!(drawn.len(), 16);
     }
+
+    #[test]
+    fn noise_is_seeded_as_the_exporter_does() {
+        // exporter/tests/test_reference.py has the same numbers.
+        for ([seed, instruction, episode], known) in [
+            ([0, 1, 2], 6_282_830_349_413_829),
+            ([7, 100, 49], 5_255_917_235_266_557),
+        ] {
+            let seed = EpisodeSeed {
+                seed,
+                instruction,
+                episode,
+            };
+            assert_eq!(stream_seed(seed, NOISE_STREAM), known);
+        }
+    }
 }

@@ -24,6 +24,9 @@ pub const FORMAT: &str = "lads-plans";
 /// Version of the file's form.
 pub const FORMAT_VERSION: u32 = 1;
 
+/// Name of the state that holds the vector of the plan in force, in every family that keeps one.
+pub const VECTOR: &str = "plan";
+
 /// Plans of one episode, as in a file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

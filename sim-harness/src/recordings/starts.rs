@@ -11,11 +11,9 @@ use lads_host::Memory;
 
 use crate::environment::EpisodeSeed;
 use crate::evaluate::{Evaluation, stream_seed};
+use crate::plans;
 use crate::replay::{self, ReplayError};
 use crate::trace::Trace;
-
-/// Name of the state that holds the plan's vector, in every family that has one.
-const PLAN: &str = "plan";
 
 /// Fourth number of the entropy of the stream that seeds a draw.
 const START_STREAM: u64 = 6;
@@ -48,7 +46,7 @@ pub fn draw(
         .controller_with(policy, evaluation.isa)
         .map_err(ReplayError::Memory)?;
     let mut drawn = Drawn::new();
-    if controller.state(PLAN).is_none() {
+    if controller.state(plans::VECTOR).is_none() {
         return Ok(drawn);
     }
     let mut action = vec![0.0; contract.action_len()];
@@ -82,7 +80,7 @@ pub fn draw(
             })?;
             of_instruction.push(Draw {
                 plan: report.selected.map(|selected| selected.index),
-                vector: controller.state(PLAN).unwrap_or_default().to_vec(),
+                vector: controller.state(plans::VECTOR).unwrap_or_default().to_vec(),
             });
         }
     }

@@ -16,7 +16,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::AtomicBool;
 
 use lads_compiler::Bundle;
-use lads_core::DType;
+use lads_core::{DType, Noise};
 use lads_proof::answers::Answers;
 use lads_proof::contract::Compared;
 use lads_proof::numbering::Numbering;
@@ -148,6 +148,7 @@ pub fn subject<'s>(bundle: &'s Bundle, environment: &'s dyn Environment) -> Subj
         state_len: environment.state().len(),
         observation_len: vectors.next().map_or(0, |_| environment.observation_len()),
         sees: contract.observations().any(sight::is_image),
+        draws: matches!(contract.noise(), Noise::Seeded { .. }),
         action_len: environment.action_len(),
     }
 }

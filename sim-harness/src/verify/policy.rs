@@ -7,7 +7,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use lads_compiler::{Bundle, Options};
-use lads_core::{Controller, DType, Data, Decision, Instruction, Isa, Policy};
+use lads_core::{Controller, DType, Data, Decision, Instruction, Isa, Noise, Policy};
 use lads_host::Memory;
 use lads_proof::answers::{Replay, Reply};
 use lads_proof::numbering::Numbering;
@@ -15,7 +15,7 @@ use lads_proof::reference::{Reference, Trace};
 use lads_proof::rounding::Asked;
 
 use crate::evaluate::{Assignment, EvaluationError};
-use crate::plans::Segment;
+use crate::plans::{self, Segment};
 use crate::verify::shown::Shown;
 
 /// Questions to a policy: the first traced episodes of each assigned instruction.
@@ -100,6 +100,9 @@ pub fn ask(
                     shown,
                     place: [index as usize, episode],
                 };
+                if let Some(seed) = recorded.noise_seed {
+                    controller.set_noise(Noise::Seeded { seed });
+                }
                 replays.push(Replay {
                     episode,
                     encoded: encoder.map(|encoder| encode(&mut controller, trace, encoder)),
@@ -178,6 +181,7 @@ fn replay(
             decided,
             plan: report.selected.map(|selected| selected.index),
             logits: scores.to_vec(),
+            plan_vector: controller.state(plans::VECTOR).unwrap_or_default().to_vec(),
             margin: report
                 .selected
                 .map(|selected| selected.margin)

@@ -99,10 +99,17 @@ fn alone(f: &mut fmt::Formatter<'_>, which: &str, answers: &Answers) -> fmt::Res
     let allowed = answers.logit_tolerance.map_or(String::new(), |tolerance| {
         format!(" (allowed {tolerance:.1e})")
     });
+    let plans = match answers.compared_plan_vectors {
+        0 => String::new(),
+        steps => format!(
+            ", plans within {:.1e} (allowed {:.1e}) over {steps} steps",
+            answers.largest_plan_difference, answers.plan_tolerance
+        ),
+    };
     writeln!(
         f,
-        "{which:<18} {} of {} replayed episodes differ; logits within {:.1e}{allowed} over {} decisions, actions within {:.1e} (allowed {:.1e}) over \
-         {} steps",
+        "{which:<18} {} of {} replayed episodes differ; logits within {:.1e}{allowed} over {} decisions{plans}, actions within {:.1e} (allowed {:.1e}) \
+         over {} steps",
         answers.differing_episodes,
         answers.episodes,
         answers.largest_logit_difference,
