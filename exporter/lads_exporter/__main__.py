@@ -65,7 +65,7 @@ def _train(arguments):
     setting = dataclasses.replace(setting, rendering=data.rendering)
     device = _device(arguments.device)
     trainer = training.Trainer(setting, data, _encode(setting), arguments.out, device, arguments.seed)
-    if not trainer.run(resume=arguments.resume):
+    if not trainer.run(resume=arguments.resume, encoder=arguments.encoder):
         print(f"stopped; continue with --resume ({arguments.out})", file=sys.stderr)
         return 130
     print(f"{arguments.out}: trained; next: python -m lads_exporter export --run {arguments.out} -o models/{setting.config.name}.onnx")
@@ -206,7 +206,7 @@ def _parser():
     random = commands.add_parser("random", help="a bundle with random weights, for tests")
     network = random.add_mutually_exclusive_group(required=True)
     network.add_argument("--config", help="a LADS policy of this configuration")
-    network.add_argument("--kind", help="a small policy of this kind: lads, lang_dt, lisa, vae, lcsd, skilldiffuser, history, plain, recurrent, stacked, camera, images, sighted, sighted_history; or with an encoder of the field's sizes: lorel-encoder, lite0, resnet18")
+    network.add_argument("--kind", help="a small policy of this kind: lads, lang_dt, lisa, vae, lcsd, skilldiffuser, history, plain, recurrent, stacked, camera, images, sighted, sighted_lang_dt, sighted_lisa, sighted_vae, sighted_history; or with an encoder of the field's sizes: lorel-encoder, lite0, resnet18")
     random.add_argument("-o", "--output", required=True)
     random.add_argument("--seed", type=int, default=0)
     random.add_argument("--rendering", metavar="FILE", help="how the frames are drawn that a configuration's policy sees, as lads-run frames --rendering takes it")
@@ -239,6 +239,7 @@ def _parser():
     train.add_argument("--system", action="append", default=[], metavar="FILE", help="values of a system over those of --config, such as configs/kitchen/lisa.toml")
     train.add_argument("--data", required=True, help=".safetensors of lads-collect, or D4RL kitchen .hdf5")
     train.add_argument("--frames", metavar="FILE", help="frames of the dataset, made by lads-run frames, for a setting with a camera")
+    train.add_argument("--encoder", metavar="FILE", help="the encoder of frames that several systems share: taken from there instead of its stage, or put there after it")
     train.add_argument("--features", metavar="FILE", help="features of the dataset's frames, made by the command features, for a setting with a frozen encoder")
     train.add_argument("--out", required=True, help="folder of the run: checkpoint, curves, summary")
     train.add_argument("--resume", action="store_true", help="continue from the run's checkpoint")

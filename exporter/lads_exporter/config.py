@@ -217,6 +217,7 @@ class SkillDiffuser:
 
 
 SYSTEMS = {"lads": Lads, "vae": Vae, "cluster": Cluster, "lang_dt": LangDt, "lisa": Lisa, "lcsd": Lcsd, "skilldiffuser": SkillDiffuser}
+SEEING = ("lads", "vae", "lang_dt", "lisa")  # systems that [images] goes with
 LADS = {"kind": "lads", "regressed": False}  # what a configuration without [system] trains
 
 
@@ -340,8 +341,7 @@ def from_tables(table, environment, instructions, where):
         if value not in allowed:
             raise UserError(f"{where}: {name} = {value!r}: must be one of {', '.join(allowed)}")
     plain = config.system.kind == "lads" and not config.system.regressed and config.training.schedule == "staged"
-    if config.images.channel and (not plain or config.data.renoise):
-        raise UserError(f"{where}: [images] goes with system lads, not regressed, schedule staged, and without renoise only")
+    _seen(config, plain, where)
     _frozen(config, plain, len(environment.get("observation", [])), where)
     if config.high_level.hidden % config.high_level.heads:
         raise UserError("high_level.hidden must be a multiple of high_level.heads")
@@ -367,6 +367,23 @@ def from_tables(table, environment, instructions, where):
         if name not in known:
             raise UserError(f"data.weights names {name!r}, which is not an instruction id of {config.instructions}")
     return Setting(config, environment, rows, [table, environment, instructions])
+
+
+def _seen(config, plain, where):
+    """Checks what goes with [images]: all problems at once."""
+    if not config.images.channel:
+        return
+    problems = []
+    if config.system.kind not in SEEING:
+        problems.append(f"system {config.system.kind} does not see; those that do: {', '.join(SEEING)}")
+    elif not config.images.frames.steps and not plain:
+        problems.append("the encoder learns in the stage plans of LADS only; others need images.frames.steps above 0")
+    if config.training.schedule != "staged":
+        problems.append("schedule staged is needed")
+    if config.data.renoise:
+        problems.append("data.renoise is of states: false is needed")
+    if problems:
+        raise UserError(f"{where}: [images]: {'; '.join(problems)}")
 
 
 def _frozen(config, plain, state_len, where):

@@ -9,6 +9,8 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from .contract import OBSERVATION
+
 OPSET = 18
 IR_VERSION = 8
 LAYER_NORM_EPSILON = 1e-5
@@ -20,6 +22,7 @@ class Graph:
     def __init__(self):
         self.nodes, self.inputs, self.outputs = [], [], []
         self.initializers = {}
+        self.observed = OBSERVATION  # what the levels read: the channel, or the features that an encoder's entry hands to them
 
     def constant(self, name, array):
         """Adds an initializer once and returns its name."""
@@ -207,18 +210,17 @@ def high_level_instruct(graph, policy, words_len):
     Transformer(entry, policy, words_len, cached=False).run(x, record_only=True)
 
 
-def high_level_state(graph, policy, normalizer, first=False, previous=None, observed="observation"):
+def high_level_state(graph, policy, normalizer, first=False, previous=None):
     """Adds the nodes of `high_level/start` or `high_level/step` up to the state token -> the entry, its row [1, d], the observation's
     embedding.
 
     previous: the name of the input for the previous action; without it the history is of observations only.
-    observed: the name of the input for the observation.
     """
     entry = Entry(graph, "high_level/start" if first else "high_level/step")
     tokens = []
     if previous and not first:
         action = entry.input(previous, [1, policy.embed_action.in_features])
-    observation = entry.input(observed, [1, policy.embed_observation.in_features])
+    observation = entry.input(graph.observed, [1, policy.embed_observation.in_features])
     timestep = entry.input("timestep", [1], TensorProto.INT64)
     times = entry.weight("high_level.embed_timestep", policy.embed_timestep.weight)
     if previous and not first:
@@ -236,9 +238,9 @@ def head(entry, x, module, out, name="high_level.head"):
     entry.output(out, [1, module.out_features])
 
 
-def high_level_step(graph, policy, normalizer, first, out="logits", previous="action", observed="observation"):
+def high_level_step(graph, policy, normalizer, first, out="logits", previous="action"):
     """Adds `high_level/start` (first: the observation only) and `high_level/step` (previous action, then observation)."""
-    entry, x, _ = high_level_state(graph, policy, normalizer, first, previous, observed)
+    entry, x, _ = high_level_state(graph, policy, normalizer, first, previous)
     head(entry, x, policy.head, out)
 
 
@@ -272,11 +274,11 @@ def codebook_lookup(graph, codes):
     entry.output("plan", [1, codes.shape[1]])
 
 
-def low_level_act(graph, policy, normalizer, observed="observation"):
+def low_level_act(graph, policy, normalizer):
     """Adds the low level's MLP with batch norm folded into the linear layer before it."""
     entry = Entry(graph, "low_level/act")
     observations = len(normalizer.mean)
-    observation = entry.input(observed, [1, observations])
+    observation = entry.input(graph.observed, [1, observations])
     plan = entry.input("plan", [1, policy.first.in_features - observations])
     centred = entry.centred(observation, normalizer, "observation_centred")
     x = entry.op("Concat", [centred, plan], "observation_and_plan", axis=1)
@@ -297,7 +299,10 @@ def low_level_act(graph, policy, normalizer, observed="observation"):
 
 
 def trajectory_encode(graph, encoder, codes, normalizer, horizon):
-    """Adds the trajectory encoder: a whole segment of H steps to its latent and, where there are codes, the index of the nearest one."""
+    """Adds the trajectory encoder: a whole segment of H steps to its latent and, where there are codes, the index of the nearest one. Of features,
+    which no caller has, there is none."""
+    if graph.observed != OBSERVATION:
+        return
     entry = Entry(graph, "trajectory_encoder/encode")
     observation_len, hidden = len(normalizer.mean), encoder.lstm.hidden_size
     observations = entry.input("observations", [1, horizon, observation_len])
@@ -350,11 +355,18 @@ def known_instructions(graph, policy, encoded):
     high_level_instruct(graph, policy, encoded.max_words)
 
 
+def see(graph, networks):
+    """Adds the encoder of frames of networks that have one; what is added after it reads its features."""
+    if hasattr(networks, "frames"):
+        networks.frames.add(graph)
+
+
 def build(lads, encoded, horizon):
     """Builds all entries of one policy as one checked ONNX model, without metadata."""
     graph = Graph()
     codes = to_numpy(lads.codebook.codes)
     known_instructions(graph, lads.high_level, encoded)
+    see(graph, lads)
     high_level_step(graph, lads.high_level, lads.normalizer, first=True)
     high_level_step(graph, lads.high_level, lads.normalizer, first=False)
     codebook_lookup(graph, codes)

@@ -27,6 +27,19 @@ def place_normalizer(normalizer, rows):
     normalizer.std.copy_(torch.from_numpy(0.3 * half))
 
 
+def place(networks, rows, seed):
+    """Sets what is of healthy size by what is observed: the normaliser's statistics, or convolutions that keep the size of a frame's values; features
+    are not normalised."""
+    if not hasattr(networks, "frames"):
+        place_normalizer(networks.normalizer, rows)
+        return
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for module in networks.frames.modules():
+            if isinstance(module, torch.nn.Conv2d):
+                module.weight.copy_(torch.randn(module.weight.shape, generator=generator) * (2 / module.weight[0].numel()) ** 0.5)
+
+
 def _limits(low, high):
     low, high = np.array(low, np.float64), np.array(high, np.float64)
     return (low + high) / 2, (high - low) / 2
@@ -43,13 +56,7 @@ def randomize(lads, setting, seed):
         for norm in getattr(lads.low_level, "norms", ()):  # only the MLP has batch norms
             norm.running_mean.copy_(0.2 * draw(norm.running_mean))
             norm.running_var.copy_(0.5 + torch.rand(norm.running_var.shape, generator=generator))
-        if setting.rendering is None:
-            place_normalizer(lads.normalizer, setting.environment["observation"])
-        else:  # features are not normalised; convolutions keep their size
-            own = torch.Generator().manual_seed(seed)
-            for module in lads.frames.modules():
-                if isinstance(module, torch.nn.Conv2d):
-                    module.weight.copy_(torch.randn(module.weight.shape, generator=own) * (2 / module.weight[0].numel()) ** 0.5)
+        place(lads, setting.environment["observation"], seed)
         lads.codebook.codes.copy_(draw(lads.codebook.codes))
         lads.codebook.started.fill_(True)
 

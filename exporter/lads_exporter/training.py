@@ -6,6 +6,7 @@ resumed run does what an uninterrupted one would have done. An interrupt finishe
 
 import csv
 import dataclasses
+import hashlib
 import io
 import json
 import math
@@ -30,6 +31,7 @@ from .feature_corpus import FeatureCorpus
 from .features import golden_episodes
 from .frames import FrameCorpus
 from .hindsight import relabel
+from .systems.sighted import FRAMES
 
 LOG_EVERY, VALIDATE_EVERY, SAVE_SECONDS = 50, 500, 120
 CHECKPOINT, CURVES, SUMMARY = "checkpoint.pt", "curves.csv", "summary.json"
@@ -161,12 +163,18 @@ class Trainer:
         writer.writerows(self.curves)
         write_atomically(self.out / CURVES, table.getvalue().encode())
 
-    def run(self, resume=False, quiet=False):
-        """Trains to the end; False when it was interrupted (the checkpoint is then written)."""
+    def run(self, resume=False, quiet=False, encoder=None):
+        """Trains to the end; False when it was interrupted (the checkpoint is then written).
+
+        `encoder`: a file that has the encoder of frames, which is then not trained anew, or gets it when it is trained.
+        """
         if not resume and (self.out / CHECKPOINT).exists():
             raise UserError(f"{self.out / CHECKPOINT} exists; continue it with --resume or choose another --out")
         optimizer_state = self.resume() if resume else None
         names = self.system.stages(self.config)
+        shared = SharedEncoder(encoder, self) if encoder else None
+        if shared and self.position == {"stage": 0, "step": 0} and shared.read():
+            self.position = {"stage": 1, "step": 0}
         with self._interruptible(), _matmul_precision("medium" if self.config.training.bf16 else "highest"):
             while self.position["stage"] < len(names):
                 name = names[self.position["stage"]]
@@ -179,6 +187,8 @@ class Trainer:
                 stage.finish()
                 self.position = {"stage": self.position["stage"] + 1, "step": 0}
                 self.save(None)
+                if shared and name == FRAMES:
+                    shared.write()
         self._summarise(names)
         return True
 
@@ -249,6 +259,42 @@ class Trainer:
             "versions": {"lads-exporter": __version__, "torch": torch.__version__},
         }
         write_atomically(self.out / SUMMARY, (json.dumps(summary, indent=1) + "\n").encode())
+
+
+class SharedEncoder:
+    """The file of an encoder of frames that several systems observe by: weights, and what they were made of."""
+
+    def __init__(self, path, trainer):
+        self.path, self.trainer = Path(path), trainer
+        if trainer.system.stages(trainer.config)[0] != FRAMES:
+            raise UserError(f"--encoder {path}: {trainer.config.name} has no encoder of frames that learns in a stage of its own (images.frames.steps)")
+        config, identity = trainer.setting.tables[0], trainer.identity
+        parts = [config["images"], config["data"], identity["dataset_sha256"], identity["rendering"], trainer.seed]
+        self.made_of = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+    def read(self):
+        """Takes the encoder from the file; false where there is none yet."""
+        if not self.path.exists():
+            return False
+        try:
+            saved = torch.load(self.path, map_location=self.trainer.corpus.device, weights_only=True)
+            made_of, frames, state, seconds = (saved[key] for key in ("made_of", "frames", "state", "seconds"))
+        except (OSError, RuntimeError, EOFError, ValueError, TypeError, KeyError, pickle.UnpicklingError) as error:
+            raise UserError(f"{self.path}: no encoder of frames ({type(error).__name__}); it stays as it is: move it away to train one") from error
+        if made_of != self.made_of:
+            raise UserError(f"{self.path}: its encoder was made with another configuration, dataset or seed; name another file")
+        self.trainer.networks.frames.load_state_dict(frames)
+        self.trainer.networks.state.load_state_dict(state)
+        self.trainer.seconds[FRAMES] = seconds
+        return True
+
+    def write(self):
+        networks = self.trainer.networks
+        buffer = io.BytesIO()
+        parts = {"frames": networks.frames.state_dict(), "state": networks.state.state_dict(), "seconds": self.trainer.seconds[FRAMES]}
+        torch.save({"made_of": self.made_of} | parts, buffer)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(self.path, buffer.getvalue())
 
 
 def golden_candidates(dataset, episodes, setting, most=24):

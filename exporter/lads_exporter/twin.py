@@ -197,6 +197,8 @@ class Twin:
                 self.states[row["name"]].append(self.observed[row["source"]])
         self.draws, self.fresh = [], False
         self.action = None
+        if "features" in self.family:
+            self.run("observation_encoder/encode")
         self.schedule(self)
         self.action = np.clip(self.action[0], *self.limits)
         self.previous = self.action[None]
@@ -275,8 +277,6 @@ def _first_or_later(twin):
 
 
 def _lads(twin):
-    if "features" in twin.family:
-        twin.run("observation_encoder/encode")
     _first_or_later(twin)
     if twin.decides:
         twin.select()
@@ -324,8 +324,6 @@ def _skilldiffuser(twin):
 
 
 def _history(twin):
-    if "features" in twin.family:
-        twin.run("observation_encoder/encode")
     if twin.family.get("actions"):
         _first_or_later(twin)
     else:

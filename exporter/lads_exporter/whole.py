@@ -62,7 +62,9 @@ class Whole:
         return action.numpy()
 
     def read(self, seen):
-        """Normalises what the policy sees."""
+        """Normalises what the policy sees: an observation, or the features of a frame."""
+        if hasattr(self.networks, "frames"):
+            seen = self.networks.frames(seen[None])[0]
         return self.networks.normalizer(seen)
 
     def decide(self):

@@ -12,7 +12,7 @@ import torch
 from resuming import assert_same_weights, interrupt
 from test_training import setting_for
 
-from lads_exporter import bundle, config, contract as contracts, dataset, frames, language, systems, training, twin
+from lads_exporter import bundle, config, contract as contracts, dataset, frames, language, systems, training, twin, whole
 from lads_exporter.config import UserError
 from lads_exporter.dataset import sha256
 
@@ -43,8 +43,10 @@ def dataset_rows(data):
 APART = {"steps": 12, "batch": 16, "learning_rate": 1e-3, "warmup": 2, "final": 0.1, "weight_decay": 0.0}
 
 
-def setting(apart=False, **training):
+def setting(apart=False, system=None, **training):
     table, *beside = copy.deepcopy(setting_for("staged", **training).tables)
+    if system:
+        table["system"] = system
     table["images"] = SEEN | ({"frames": APART} if apart else {})
     table["encoder"] |= {"kmeans_step": 5, "observed": 0}
     table["data"]["renoise"] = False
@@ -59,8 +61,8 @@ def files(tmp_path):
     return data, write_frames(tmp_path / "tiny.frames", data)
 
 
-def trainer_for(folder, files, apart=False):
-    made = setting(apart)
+def trainer_for(folder, files, apart=False, system=None):
+    made = setting(apart, system)
     data = dataset.load(files[0], made, files[1])
     made = dataclasses.replace(made, rendering=data.rendering)
     encoded = language.encode(made.config.language, [row["text"] for row in made.instructions])
@@ -191,3 +193,67 @@ def test_an_encoder_that_learns_by_itself_stays_as_it_is_afterwards(tmp_path, fi
     told = [row for row in trainer.curves if row["stage"] == "frames"][-1]
     assert float(told["val_state"]) < before
     assert training.load_run(tmp_path / "run")[1].config.images.frames.steps == APART["steps"]
+
+
+SYSTEMS = {
+    "wo_cp": {"kind": "lads", "regressed": True},
+    "vae": {"kind": "vae", "beta": 1e-3, "rule": "mean"},
+    "lang_dt": {"kind": "lang_dt"},
+    "lisa": {"kind": "lisa", "low_level_layers": 1, "option_gradient": "first"},
+}
+
+
+@pytest.mark.parametrize("name", list(SYSTEMS))
+def test_other_systems_observe_by_the_same_encoder(tmp_path, files, name):
+    """Tests that a system's encoder is LADS' own, trained here or taken from a file, and that its bundle acts as its networks do."""
+    shared = tmp_path / "encoder.pt"
+    first, _, _ = trainer_for(tmp_path / "lads", files, apart=True)
+    assert first.run(quiet=True, encoder=shared)
+    own, _, _ = trainer_for(tmp_path / "own", files, True, SYSTEMS[name])
+    assert own.run(quiet=True)
+    taken, made, encoded = trainer_for(tmp_path / "taken", files, True, SYSTEMS[name])
+    assert taken.run(quiet=True, encoder=shared)
+    assert_same_weights(own, taken)
+    assert all(torch.equal(value, taken.networks.frames.state_dict()[key]) for key, value in first.networks.frames.state_dict().items())
+    assert "frames" not in {row["stage"] for row in taken.curves}
+
+    (saved, loaded), provenance = training.load_run(tmp_path / "taken"), {"dataset_sha256": "", "seed": 0, "steps": {}}
+    candidates = [(instruction, drawn.numpy()) for instruction, drawn in saved["golden"]]
+    networks = taken.networks.eval()
+    if name != "lang_dt":
+        with torch.no_grad():
+            networks.high_level.head.weight.mul_(30)
+    model = bundle.assemble(networks, loaded, encoded, provenance, candidates)
+    contract = contracts.of(model)
+    assert contract["family"]["features"] == 8 and not any(row["role"] == "demonstration" for row in contract["channels"])
+    runner, (instruction, drawn) = twin.Twin(model), candidates[0]
+    words = [torch.from_numpy(row.words) for row in encoded.instructions]
+    policy = whole.of_networks(networks, loaded, encoded, contract, words)
+    policy.start(instruction)
+    runner.set_instruction(instruction)
+    for frame in drawn[: runner.steps]:
+        action, _ = runner.step({"camera": frame})
+        assert np.abs(policy.act(frame.copy()) - action).max() < 1e-4
+        policy.actions[-1] = torch.from_numpy(action.copy())
+
+
+def test_a_file_of_another_encoder_is_refused(tmp_path, files):
+    trainer, _, _ = trainer_for(tmp_path / "run", files, apart=True)
+    shared = tmp_path / "encoder.pt"
+    shared.write_bytes(b"no encoder")
+    with pytest.raises(UserError, match="encoder.pt: no encoder of frames"):
+        trainer.run(quiet=True, encoder=shared)
+    assert shared.read_bytes() == b"no encoder"
+    torch.save({"made_of": "something else", "frames": {}, "state": {}, "seconds": 1.0}, shared)
+    with pytest.raises(UserError, match="encoder.pt: its encoder was made with another configuration"):
+        trainer.run(quiet=True, encoder=shared)
+    live, _, _ = trainer_for(tmp_path / "live", files)
+    with pytest.raises(UserError, match="has no encoder of frames that learns in a stage of its own"):
+        live.run(quiet=True, encoder=shared)
+
+
+def test_what_does_not_see_is_named():
+    table, *beside = copy.deepcopy(setting().tables)
+    for system, wrong in (({"kind": "cluster", "points": 9, "perplexity": 3.0}, "system cluster does not see; those that do: lads"), (SYSTEMS["lang_dt"], "others need images.frames.steps above 0")):
+        with pytest.raises(UserError, match=wrong):
+            config.from_tables(table | {"system": system}, *beside, "test")

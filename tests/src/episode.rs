@@ -13,7 +13,7 @@ use safetensors::{SafeTensors, tensor::TensorView};
 pub const FOLDER: &str = "LADS_FAMILIES";
 
 /// Kinds of random policies.
-pub const KINDS: [&str; 14] = [
+pub const KINDS: [&str; 17] = [
     "lads",
     "lang_dt",
     "lisa",
@@ -28,6 +28,9 @@ pub const KINDS: [&str; 14] = [
     "images",
     "sighted",
     "sighted_history",
+    "sighted_lang_dt",
+    "sighted_lisa",
+    "sighted_vae",
 ];
 
 /// Returns the folder of the bundles and episodes.

@@ -31,6 +31,12 @@ def _images(name, cameras, hidden, sizes=Sizes(steps=12)):
     return Kind(lambda sizes, seed: images.randomize(images.Images(cameras, hidden), seed), images.build, contract, sizes)
 
 
+def _sighted(network, build, family, noise=None):
+    sizes = Sizes(observation=sighted.SEEN.features)
+    contract = lambda sizes, seed: sighted.contract_of(family(sizes), sizes, seed, noise)
+    return Kind(lambda sizes, seed: sighted.of_kind(network(sizes), seed), build, contract, sizes)
+
+
 KINDS = {
     "lads": Kind(lads.policy, lads.build, lads.contract),
     "lang_dt": _of(lang_dt.LangDt, lang_dt.build, lang_dt.contract),
@@ -44,7 +50,10 @@ KINDS = {
     "stacked": _of(plain.Stacked, plain.build_stacked, plain.contract_stacked),
     "camera": _of(plain.Camera, plain.build_camera, plain.contract_camera),
     "images": _images("images", images.SMALL, (32,)),
-    "sighted": Kind(sighted.policy, sighted.build, sighted.contract),
+    "sighted": Kind(sighted.policy, lads.build, sighted.contract),
+    "sighted_lang_dt": _sighted(lang_dt.LangDt, lang_dt.build, lambda sizes: {"kind": "lang_dt"}),
+    "sighted_lisa": _sighted(lisa.Lisa, lisa.build, lambda sizes: lisa.family(sizes, common.argmax())),
+    "sighted_vae": _sighted(vae.Vae, vae.build, lambda sizes: vae.family(sizes, "sample", 0), [Sizes().plan]),
     "sighted_history": Kind(sighted_history.policy, sighted_history.build, sighted_history.contract),
 }
 # Of the sizes that encoders have in the field.

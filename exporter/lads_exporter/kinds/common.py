@@ -88,7 +88,7 @@ def randomize(policy, seed):
     """Sets random weights in all parts of a policy: plans differ from step to step, and few actions are at their limits."""
     generator = torch.Generator().manual_seed(seed)
     random_policy.draw_weights(policy, generator)
-    random_policy.place_normalizer(policy.normalizer, ENVIRONMENT["observation"])
+    random_policy.place(policy, ENVIRONMENT["observation"], seed)
     with torch.no_grad():
         for module in policy.modules():
             if isinstance(module, nn.Embedding):
@@ -99,9 +99,10 @@ def randomize(policy, seed):
 
 
 def graph_of(policy, sizes):
-    """Makes a graph with the table of instructions and the entry that sets one."""
+    """Makes a graph with the table of instructions, the entry that sets one, and the encoder of frames where the policy has one."""
     graph = graphs.Graph()
     graphs.known_instructions(graph, policy.high_level, sizes.words)
+    graphs.see(graph, policy)
     return graph
 
 

@@ -87,9 +87,9 @@ def _recall(graph, policy, sizes):
     _transformer(entry, policy, x, 2, record_only=True)
 
 
-def _step(graph, policy, normalizer, sizes, observed="observation"):
+def _step(graph, policy, normalizer, sizes):
     entry = graphs.Entry(graph, f"{LEVEL}/step")
-    action, observation = entry.input("previous_action", [1, sizes.action]), entry.input(observed, [1, sizes.observation])
+    action, observation = entry.input("previous_action", [1, sizes.action]), entry.input(graph.observed, [1, sizes.observation])
     phase = entry.input("phase", [1], TensorProto.INT64)
     place = entry.op("Add", [phase, entry.integers("window", [sizes.window])], "place")
     positions = entry.weight(f"{LEVEL}.embed_position", policy.embed_position.weight)
@@ -101,9 +101,9 @@ def _step(graph, policy, normalizer, sizes, observed="observation"):
     graphs.head(entry, x, policy.head, "action", f"{LEVEL}.head")
 
 
-def _append(graph, policy, normalizer, sizes, observed="observation"):
+def _append(graph, policy, normalizer, sizes):
     entry = graphs.Entry(graph, "memory/append")
-    action, observation = entry.input("previous_action", [1, sizes.action]), entry.input(observed, [1, sizes.observation])
+    action, observation = entry.input("previous_action", [1, sizes.action]), entry.input(graph.observed, [1, sizes.observation])
     observation, folded = graphs.raw(entry, observation, policy.embed_observation, normalizer)
     rows, parts = [], (("action", action, policy.embed_action, policy.embed_action.weight), ("observation", observation, policy.embed_observation, folded))
     for name, x, module, weight in parts:
@@ -113,12 +113,12 @@ def _append(graph, policy, normalizer, sizes, observed="observation"):
     entry.output("next_row", [1, 2 * sizes.hidden])
 
 
-def add_low_level(graph, policy, normalizer, sizes, observed="observation"):
-    """Adds the low level's entries; `observed` is the name of what it observes."""
+def add_low_level(graph, policy, normalizer, sizes):
+    """Adds the low level's entries."""
     _plan(graph, policy)
     _recall(graph, policy, sizes)
-    _step(graph, policy, normalizer, sizes, observed)
-    _append(graph, policy, normalizer, sizes, observed)
+    _step(graph, policy, normalizer, sizes)
+    _append(graph, policy, normalizer, sizes)
 
 
 def build(policy, sizes):

@@ -78,7 +78,7 @@ def _low_level(graph, policy, normalizer, sizes, first):
     if not first:
         action = entry.input("previous_action", [1, sizes.action])
     index = entry.input("index", [1], TensorProto.INT64)
-    observation = entry.input("observation", [1, sizes.observation])
+    observation = entry.input(graph.observed, [1, sizes.observation])
     timestep = entry.input("timestep", [1], TensorProto.INT64)
     times = entry.weight(f"{LEVEL}.embed_timestep", policy.embed_timestep.weight)
     tokens = []

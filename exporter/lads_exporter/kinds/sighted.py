@@ -1,4 +1,4 @@
-"""`sighted`: LADS on frames of a camera. An encoder of its own entry runs once in a control step, and both levels read its features."""
+"""`sighted`: policies on frames of a camera. An encoder of its own entry runs once in a control step, and all levels read its features."""
 
 import dataclasses
 
@@ -31,8 +31,8 @@ class FrameEncoder(nn.Module):
             x = F.relu(layer(x))
         return self.dense[-1](x)
 
-    def build(self, graph):
-        """Adds the entry to a graph."""
+    def add(self, graph):
+        """Adds the entry to a graph, whose later entries read its features."""
         entry = graphs.Entry(graph, ENTRY)
         x, last = self.convolutions.build(entry), len(self.dense) - 1
         for number, layer in enumerate(self.dense):
@@ -40,42 +40,44 @@ class FrameEncoder(nn.Module):
             x = entry.gemm(x, weight, bias, FEATURES if number == last else f"dense.{number}")
             x = x if number == last else entry.op("Relu", [x], f"dense.{number}.relu")
         entry.output(FEATURES, [1, self.dense[-1].out_features])
+        graph.observed = FEATURES
 
 
-class Sighted(Lads):
-    """The networks of LADS on features, the encoder that makes them, and what reads the state in them while they are learnt."""
+def give_eyes(networks, setting, encoded):
+    """Adds to networks on features the encoder that makes them, and what reads the state in them while it learns.
 
-    def __init__(self, setting, encoded):
-        super().__init__(setting, encoded)
-        self.frames = FrameEncoder(setting.config.images, setting.rendering["size"])
-        self.state = nn.Linear(setting.observation_len, setting.state_len)
-
-
-def graph(networks, encoded):
-    """Makes the graph of all entries but the trajectory encoder, whose features no caller has."""
-    made = graphs.Graph()
-    graphs.known_instructions(made, networks.high_level, encoded)
-    networks.frames.build(made)
-    for first in (True, False):
-        graphs.high_level_step(made, networks.high_level, networks.normalizer, first, observed=FEATURES)
-    graphs.codebook_lookup(made, graphs.to_numpy(networks.codebook.codes))
-    graphs.low_level_act(made, networks.low_level, networks.normalizer, observed=FEATURES)
-    return made.model("lads")
+    Both start from the same weights whatever the system: those that follow LADS' own.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(torch.initial_seed())
+        Lads(setting, encoded)
+        networks.frames = FrameEncoder(setting.config.images, setting.rendering["size"])
+        networks.state = nn.Linear(setting.observation_len, setting.state_len)
+    return networks
 
 
 def policy(sizes, seed):
     made = lads.setting(sizes)
     made = dataclasses.replace(made, config=dataclasses.replace(made.config, images=SEEN), rendering={"size": SIZE})
-    networks = Sighted(made, common.WORDS)
+    networks = give_eyes(Lads(made, common.WORDS), made, common.WORDS)
     random_policy.randomize(networks, made, seed)
     return networks.eval()
 
 
-def build(networks, sizes):
-    return graph(networks, common.WORDS)
-
-
 def contract(sizes, seed):
-    family = {"kind": "lads", "horizon": sizes.horizon, "codebook": sizes.codebook, "decision": common.argmax(), "features": SEEN.features}
+    return contract_of({"kind": "lads", "horizon": sizes.horizon, "codebook": sizes.codebook, "decision": common.argmax()}, sizes, seed)
+
+
+def of_kind(network, seed):
+    """Makes a random policy of another family on features: `network`, whose observation they are, with the encoder that makes them."""
+    network.frames = FrameEncoder(SEEN, SIZE)
+    common.randomize(network, seed)
+    with torch.no_grad():
+        network.frames.dense[-1].weight.mul_(4)  # frames of noise look much alike
+    return network
+
+
+def contract_of(family, sizes, seed, noise=None):
+    """Makes the contract of a random policy on features."""
     image = contracts.array(SEEN.channel, "observation", [*SIZE, 3], "u8", layout="hwc", min=0, max=255)
-    return common.contract(family, sizes, seed, image=image)
+    return common.contract(family | {"features": SEEN.features}, sizes, seed, noise=noise, image=image)

@@ -75,6 +75,7 @@ def _encode(graph, networks):
     x = entry.op("Div", [x, entry.weight("observation_std", networks.normalizer.std)], "normalised")
     entry.op("Clip", [x, entry.scalar("lowest", -networks.clip), entry.scalar("highest", networks.clip)], FEATURES)
     entry.output(FEATURES, [1, width])
+    graph.observed = FEATURES
 
 
 def graph(networks, setting, encoded):
@@ -83,8 +84,8 @@ def graph(networks, setting, encoded):
     graphs.known_instructions(made, networks.high_level, encoded)
     _encode(made, networks)
     for first in (True, False):
-        graphs.high_level_step(made, networks.high_level, None, first, observed=FEATURES)
-    history.add_low_level(made, networks.acting_low_level(), None, low_level_sizes(setting, encoded), FEATURES)
+        graphs.high_level_step(made, networks.high_level, None, first)
+    history.add_low_level(made, networks.acting_low_level(), None, low_level_sizes(setting, encoded))
     return made.model("history")
 
 

@@ -25,5 +25,5 @@ MODULES = {
 
 def of(config):
     """Returns the module of the system that a configuration names."""
-    seen = "_images" if config.images.channel else "_history" if config.history.window else ""
-    return import_module(f".{MODULES[config.system.kind]}{seen}", __name__)
+    module = import_module(f".{MODULES[config.system.kind]}{'_history' if config.history.window else ''}", __name__)
+    return import_module(".sighted", __name__).of(module) if config.images.channel else module

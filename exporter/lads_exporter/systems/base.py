@@ -41,6 +41,13 @@ def sizes(setting, encoded):
     )
 
 
+def with_eyes(policy, networks):
+    """Hands the encoder of frames, where there is one, to the policy that acts; returns that."""
+    if hasattr(networks, "frames"):
+        policy.frames = networks.frames
+    return policy
+
+
 def decision(setting):
     """Returns how a plan is picked from logits, for the contract."""
     return {"rule": setting.config.decision, "temperature": 1.0, "seed": 0}

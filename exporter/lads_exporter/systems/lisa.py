@@ -162,7 +162,7 @@ def acting(networks, setting, encoded):
     state["embed_option.weight"] = networks.low_level.embed_option(networks.option_table())
     state["embed_timestep.weight"] = trained["embed_timestep.weight"][: sizes.steps]
     policy.low_level.load_state_dict(state)
-    return policy.eval()
+    return base.with_eyes(policy, networks).eval()
 
 
 def export(networks, setting, encoded):

@@ -154,5 +154,6 @@ def export(networks, setting, encoded):
     encoder.load_state_dict(state | {f"{last}.{part}": state[f"{last}.{part}"][: sizes.plan] for part in ("weight", "bias")})
     encoder.shown.copy_(networks.encoder.shown)
     policy = SimpleNamespace(normalizer=networks.normalizer, high_level=networks.high_level, low_level=networks.low_level, encoder=encoder.eval())
+    base.with_eyes(policy, networks)
     family = vae.family(sizes, setting.config.system.rule, 0)
     return Exported(vae.build(policy, sizes), family, noise=[sizes.plan], segment=sizes.horizon)

@@ -1,24 +1,32 @@
 //! Lang DT: a causal transformer over words, observations and actions that outputs the action
 //! itself, in every step.
+//!
+//! Where the contract says `features`, an encoder runs first in every step, and the transformer reads what it gives instead.
 
 use lads_image::records::Event;
 use serde::Deserialize;
 
-use super::{Blueprint, Call, Entry, Kind, instructed};
+use super::{Blueprint, Call, Entry, Kind, instructed, lengths};
 use crate::contract::Contract;
 
-/// Contract fields of Lang DT, which has none of its own.
+/// Contract fields of Lang DT.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
-pub struct LangDt {}
+pub struct LangDt {
+    /// Elements of what an encoder makes of the observations, such as camera frames, once in a control step; without it the transformer
+    /// reads the observations themselves.
+    #[serde(default)]
+    pub features: Option<usize>,
+}
 
 impl Kind for LangDt {
     fn check(&self, contract: &Contract) -> Result<(), String> {
+        lengths([("features", self.features.unwrap_or(1))])?;
         instructed(contract)
     }
 
     fn blueprint(&self, contract: &Contract) -> Blueprint {
         let (start, step) = ("high_level/start", "high_level/step");
-        Blueprint::default()
+        Blueprint::observed(self.features, &[Event::Step])
             .kv("context", contract.network)
             .entry(Entry::new(start, &["action"]).cache("context").acts())
             .entry(Entry::new(step, &["action"]).cache("context").acts())

@@ -5,7 +5,8 @@
 //! t % H == 0   low start: (index, s_t) -> a_t          otherwise   low step: (a_{t-1}, index, s_t) -> a_t
 //! ```
 //!
-//! The low level's cache is emptied when the plan changes.
+//! The low level's cache is emptied when the plan changes. Where the contract says `features`, an encoder runs first in every step, and both
+//! levels read what it gives instead.
 
 use lads_image::records::Event;
 use serde::Deserialize;
@@ -26,6 +27,10 @@ pub struct Lisa {
     pub decision: Decision,
     /// Sizes of the low level's transformer.
     pub low_level: Network,
+    /// Elements of what an encoder makes of the observations, such as camera frames, once in a control step for all levels; without it
+    /// they read the observations themselves.
+    #[serde(default)]
+    pub features: Option<usize>,
 }
 
 impl Kind for Lisa {
@@ -42,6 +47,7 @@ impl Kind for Lisa {
             ("horizon", self.horizon),
             ("codebook.size", self.codebook.size),
             ("codebook.dim", self.codebook.dim),
+            ("features", self.features.unwrap_or(1)),
         ])?;
         network(Some(self.low_level), "family.low_level")?;
         self.decision.check()?;
@@ -52,7 +58,7 @@ impl Kind for Lisa {
         let (step, record) = ("high_level/step", "high_level/record");
         let (low_start, low_step) = ("low_level/start", "low_level/step");
         let h = self.horizon;
-        Blueprint::default()
+        Blueprint::observed(self.features, &[Event::Step])
             .kv("context", contract.network)
             .kv("chunk", Some(self.low_level))
             .plain("logits")

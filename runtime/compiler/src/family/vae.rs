@@ -1,5 +1,7 @@
 //! VAE, and LADS with a VAE: the plan is a vector, the mean of the high level's distribution or a
 //! draw from it.
+//!
+//! Where the contract says `features`, an encoder runs first in every step, and both levels read what it gives instead.
 
 use lads_image::records::{Event, NoiseRule};
 use serde::Deserialize;
@@ -43,6 +45,10 @@ pub struct Vae {
     pub plan: Plan,
     /// Rule by which a plan is taken.
     pub decision: VaeDecision,
+    /// Elements of what an encoder makes of the observations, such as camera frames, once in a control step for all levels; without it
+    /// they read the observations themselves.
+    #[serde(default)]
+    pub features: Option<usize>,
 }
 
 impl Kind for Vae {
@@ -61,7 +67,11 @@ impl Kind for Vae {
     }
 
     fn check(&self, contract: &Contract) -> Result<(), String> {
-        lengths([("horizon", self.horizon), ("plan.dim", self.plan.dim)])?;
+        lengths([
+            ("horizon", self.horizon),
+            ("plan.dim", self.plan.dim),
+            ("features", self.features.unwrap_or(1)),
+        ])?;
         one_noise(contract)?;
         instructed(contract)
     }
@@ -69,7 +79,7 @@ impl Kind for Vae {
     fn blueprint(&self, contract: &Contract) -> Blueprint {
         let (start, step, record) = ("high_level/start", "high_level/step", "high_level/record");
         let plan = ["plan_mean", "plan_log_std"];
-        Blueprint::default()
+        Blueprint::observed(self.features, &[Event::Step])
             .kv("context", contract.network)
             .plain("plan")
             .wide(self.plan.dim, "family.plan.dim")
