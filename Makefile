@@ -7,6 +7,7 @@ PY     := $(VENV)/bin/python
 MODEL  ?= models/kitchen.onnx
 ARGS   ?=
 JOB    ?=
+INPUTS ?= models/lorel.onnx models/lorel-image.results.json
 ENV    ?= kitchen
 DATA   ?= data/$(ENV).safetensors
 COLLECT_kitchen := --episodes-per-instruction 50
@@ -20,7 +21,7 @@ PUBLISHED := -p lads-kernels -p lads-image -p lads-core -p lads-compiler -p lads
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report record viewer say language verify tune mutate frames features test test-torch test-full setup lint test-rust test-runtime test-exporter test-python test-targets wheel sanitize fuzz package msrv deny unused book lock collect train export table reference install bench clean help
+.PHONY: run report compare record viewer say language verify tune mutate frames features test test-torch test-full setup lint test-rust test-runtime test-exporter test-python test-targets wheel sanitize fuzz package msrv deny unused book lock collect train export table reference install bench clean help
 
 # Says before a build that takes long what it takes, where nothing of it is there yet: $(call first-build,a crate of it,what,minutes)
 first-build = @ls target/release/deps/lib$(1)-*.rlib >/dev/null 2>&1 || echo "The first build of $(2) takes some $(3) minutes of one core; later ones take seconds."
@@ -34,6 +35,11 @@ run: setup
 report: setup
 	$(call first-build,kuva,the charts,4)
 	cargo run --release -p lads-sim --features report,record --bin lads-run -- --model $(MODEL) --report report.html $(ARGS)
+
+## compare: several policies of one environment on one page, INPUTS="A.onnx B.results.json models/tables.json"; ARGS="--episodes 10"
+compare: setup
+	$(call first-build,kuva,the charts,4)
+	cargo run --release -p lads-sim --features report,record --bin lads-run -- report $(INPUTS) -o report.html $(ARGS)
 
 ## record: the first episode of an instruction as episode.gif; ARGS="--instruction kbls"
 record: setup

@@ -1,10 +1,14 @@
-//! Tests `lads-run --report`: the page says what the JSON says, has every chart, and fetches nothing.
+//! Tests `lads-run --report` and `lads-run report`: the pages say what the JSON says, have every chart, and fetch nothing.
 #![cfg(feature = "report")]
+
+#[path = "common/lads_run.rs"]
+mod lads_run;
 
 use std::fs;
 use std::path::Path;
 use std::process::Command;
 
+use lads_run::{assert_refused, project_file};
 use serde_json::Value;
 
 /// Makes the page and the JSON of one small run.
@@ -68,6 +72,18 @@ fn the_page_has_the_numbers_of_the_json_and_every_chart() {
         let charts = section(&page, title).matches("<svg viewBox=").count();
         assert!(charts > 0, "{title}");
     }
+    let words = section(&page, "Words by plan");
+    assert!(words.contains("<b>plan ") && words.contains("<span>burner</span>"));
+    // No instruction of this run is a part of another.
+    for title in ["Gripper", "Plans at the start"] {
+        let left_out = section(
+            &page,
+            &format!("{title} of a composite instruction and its parts"),
+        );
+        assert!(
+            left_out.contains("Left out: no composite instruction") && !left_out.contains("<svg")
+        );
+    }
     // Every cell of a heat map says which it is.
     let cells: Vec<_> = page.split("<title>").skip(2).collect();
     let cells: Vec<_> = cells
@@ -108,13 +124,17 @@ fn the_page_has_the_numbers_of_the_json_and_every_chart() {
     } else {
         assert!(pictures >= 2, "start and end at least");
     }
-    // Nothing is fetched: addresses are names of forms only, sources are inside.
+    assert_eq!(page.matches("src=").count(), pictures);
+    fetches_nothing(&page);
+}
+
+/// Asserts that addresses in the page are names of forms only.
+fn fetches_nothing(page: &str) {
     let addresses = page.matches("http://").count() + page.matches("https://").count();
     assert_eq!(
         addresses,
         page.matches("xmlns=\"http://www.w3.org/2000/svg\"").count()
     );
-    assert_eq!(page.matches("src=").count(), pictures);
     for fetched in ["href=", "@import", "url(http", "<script"] {
         assert!(!page.contains(fetched), "{fetched}");
     }
@@ -128,4 +148,134 @@ fn without_egl_the_page_says_why_there_are_no_film_strips() {
         films.contains("None: ") && !films.contains("<img"),
         "{films}"
     );
+}
+
+/// Makes a `lads-run report` command of inputs, by their paths.
+fn compare(inputs: &[&Path], page: &Path, options: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_lads-run"));
+    command.arg("report").args(inputs).arg("-o").arg(page);
+    command.args(options);
+    command
+}
+
+#[test]
+fn a_bundle_and_results_are_compared_chart_by_chart() {
+    let folder = tempfile::tempdir().unwrap();
+    let page = folder.path().join("r.html");
+    let [bundle, results] =
+        ["models/lorel.onnx", "models/lorel-image.results.json"].map(project_file);
+    let output = compare(&[&bundle, &results], &page, &["--episodes", "1"])
+        .output()
+        .unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{errors}");
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+    let page = fs::read_to_string(page).unwrap();
+    fetches_nothing(&page);
+
+    // What the results say of each split stands in the table, beside the bundle.
+    let results: Value = serde_json::from_str(&fs::read_to_string(results).unwrap()).unwrap();
+    let table = section(&page, "Success");
+    let splits = ["atomic", "rephrased", "composite", "composite_corrected"];
+    for split in splits {
+        let score = &results["splits"][split];
+        let [low, high] = [0, 1].map(|end| score["full_success_interval"][end].as_f64().unwrap());
+        let rate = score["full_success"].as_f64().unwrap();
+        let cell = format!("<td>{rate:.2}<small>{low:.2}–{high:.2}</small></td>");
+        assert!(table.contains(&cell), "{split}: {cell}");
+        assert!(table.contains(&format!(">{split}</td>")));
+    }
+    for name in ["lorel", "lorel-image"] {
+        assert_eq!(
+            table.matches(&format!("<td>{name}</td>")).count(),
+            splits.len()
+        );
+    }
+    let rates = section(&page, "K-rates");
+    assert_eq!(rates.matches("<svg viewBox=").count(), splits.len());
+    assert_eq!(
+        rates.matches(">success rate<").count(),
+        2,
+        "one sub-task each"
+    );
+    assert_eq!(rates.matches(">K-rate<").count(), 2);
+
+    // The paper's composite instruction and its parts, of the bundle alone.
+    let composite = "open drawer and move black mug right";
+    for (title, said) in [
+        ("Gripper", ">x (m)<"),
+        (
+            "Plans at the start",
+            "entries of the codebook (16 elements)",
+        ),
+    ] {
+        let figure = section(
+            &page,
+            &format!("{title} of a composite instruction and its parts"),
+        );
+        assert!(figure.contains(&format!(">lorel: {composite}<")) && figure.contains(said));
+        for part in ["open drawer", "move black mug right"] {
+            assert!(figure.contains(&format!("</span> {part}</li>")), "{part}");
+        }
+        assert!(
+            figure
+                .contains("Left out: lorel-image: results hold no control steps; give the bundle.")
+        );
+    }
+    // Both inputs have plans, and so words; what was decided is what the results list.
+    let words = section(&page, "Words by plan");
+    assert!(words.contains("<h3>lorel</h3>") && words.contains("<h3>lorel-image</h3>"));
+    let (_, of_results) = words.split_once("<h3>lorel-image</h3>").unwrap();
+    let instructions = results["instructions"].as_array().unwrap().iter();
+    let runs = instructions.flat_map(|it| it["runs"].as_array().unwrap());
+    let plans = runs.flat_map(|run| run["plans"].as_array().unwrap());
+    let count = plans.filter(|plan| **plan == 3).count();
+    assert!(
+        count > 0 && of_results.contains(&format!("<b>plan 3 <small>{count} decisions</small>"))
+    );
+}
+
+#[test]
+fn bad_inputs_are_named_at_once_and_nothing_is_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let page = folder.path().join("r.html");
+    let [kitchen, lorel] =
+        ["models/kitchen.results.json", "models/lorel.results.json"].map(project_file);
+    let mixed = compare(&[&kitchen, &lorel], &page, &[]).output().unwrap();
+    let parts = [
+        "several environments",
+        "franka-kitchen (",
+        "kitchen.results.json)",
+        "lorel-table (",
+        "lorel.results.json)",
+    ];
+    assert_refused(&mixed, &parts);
+
+    let other = project_file("models/lorel.instructions.json");
+    let missing = folder.path().join("missing.onnx");
+    let output = compare(&[&other, &missing, &lorel], &page, &[])
+        .output()
+        .unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{errors}");
+    let lines: Vec<&str> = errors.lines().collect();
+    let [first, second] = lines[..] else {
+        panic!("one line for each: {errors}");
+    };
+    assert!(
+        first.contains("lorel.instructions.json: its format is not stated"),
+        "{first}"
+    );
+    assert!(
+        second.contains("missing.onnx") && second.starts_with("error: "),
+        "{second}"
+    );
+
+    let results = compare(&[&lorel], &lorel, &[]).output().unwrap();
+    assert_refused(&results, &["lorel.results.json"]);
+    let none = compare(&[&lorel], &page, &["--episodes", "0"])
+        .output()
+        .unwrap();
+    assert_refused(&none, &["--episodes 0"]);
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
 }

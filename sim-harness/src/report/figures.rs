@@ -123,75 +123,61 @@ pub fn composed(policies: &[(&str, &Behaviour)]) -> [Figure; 2] {
          their own.",
         Vec::new(),
     );
-    let mut reasons: [Vec<(&str, &str)>; 2] = [Vec::new(), Vec::new()];
-    let known = policies.iter().map(|(name, behaviour)| {
-        let known = behaviour.compositions.as_deref();
-        (*name, known.map_err(String::as_str))
-    });
-    for (name, wrong) in known
-        .clone()
-        .filter_map(|(name, it)| Some((name, it.err()?)))
-    {
-        reasons.iter_mut().for_each(|all| all.push((name, wrong)));
+    let (mut no_paths, mut no_plans) = (Vec::new(), Vec::new());
+    let mut known: Vec<(&str, &[Composition])> = Vec::new();
+    for (name, behaviour) in policies {
+        match &behaviour.compositions {
+            Ok(compositions) => known.push((name, compositions)),
+            Err(why) => {
+                no_paths.push((*name, why.as_str()));
+                no_plans.push((*name, why.as_str()));
+            }
+        }
     }
-    let known: Vec<(&str, &[Composition])> = known
-        .filter_map(|(name, it)| Some((name, it.ok()?)))
-        .collect();
-    let shown: Vec<&str> = shown(&known);
-    let of = |text: &str, of_policy: &'_ [Composition]| {
-        of_policy.iter().position(|it| it.text() == text)
-    };
-    for text in shown {
-        let own = known.iter().map(|&(name, of_policy)| {
-            let place = of(text, of_policy);
-            (name, place.map(|place| &of_policy[place]))
-        });
+    for text in shown(&known) {
+        let own = known.iter().map(|&(name, of)| (name, find(of, text)));
         let reach = own.clone().filter_map(|(_, it)| Some(it?.reach()));
         let reach = reach.fold(0.0, f64::max);
         for (name, composition) in own {
             let Some(composition) = composition else {
-                reasons
-                    .iter_mut()
-                    .for_each(|all| all.push((name, NOT_COMPOSED)));
+                no_paths.push((name, NOT_COMPOSED));
+                no_plans.push((name, NOT_COMPOSED));
                 continue;
             };
             let colon = if name.is_empty() { "" } else { ": " };
             let title = format!("{name}{colon}{text}");
             match composition.paths(&title, reach) {
                 Some(chart) => paths.charts.push(chart),
-                None => reasons[0].push((name, NO_GRIPPER)),
+                None => no_paths.push((name, NO_GRIPPER)),
             }
             match composition.plans(&title) {
                 Some(chart) => plans.charts.push(chart),
-                None => reasons[1].push((name, NO_VECTOR)),
+                None => no_plans.push((name, NO_VECTOR)),
             }
         }
     }
-    for (figure, reasons) in [&mut paths, &mut plans].into_iter().zip(reasons) {
-        figure.leave_out(&reasons);
-    }
+    paths.leave_out(&no_paths);
+    plans.leave_out(&no_plans);
     [paths, plans]
+}
+
+fn find<'c>(compositions: &'c [Composition], text: &str) -> Option<&'c Composition> {
+    compositions.iter().find(|it| it.text() == text)
 }
 
 /// Chooses the composite instructions that are shown: those that most policies have, in the first one's order.
 fn shown<'k>(known: &[(&str, &'k [Composition])]) -> Vec<&'k str> {
+    let all = known.iter().flat_map(|(_, of)| of.iter());
     let mut texts: Vec<&str> = Vec::new();
-    for text in known
-        .iter()
-        .flat_map(|(_, of)| of.iter())
-        .map(Composition::text)
-    {
+    for text in all.map(Composition::text) {
         if !texts.contains(&text) {
             texts.push(text);
         }
     }
-    let having = |text: &str| {
-        let having = known
-            .iter()
-            .filter(|(_, of)| of.iter().any(|it| it.text() == text));
-        having.count()
-    };
-    texts.sort_by_key(|text| std::cmp::Reverse(having(text)));
+    texts.sort_by_key(|text| {
+        let having = known.iter().filter(|(_, of)| find(of, text).is_some());
+        std::cmp::Reverse(having.count())
+    });
     texts.truncate(COMPOSITIONS);
     texts
 }

@@ -142,3 +142,30 @@ fn the_executed_action_reaches_the_naive_model_too() {
         assert!((f64::from(got) - expected).abs() < 1e-4);
     }
 }
+
+#[test]
+fn the_plan_in_force_is_read_by_its_name() {
+    let model = tiny();
+    let image = parts(&model).image();
+    let policy = image.policy();
+    let mut memory = Memory::for_policy(&policy);
+    let mut controller = memory.controller(&policy);
+    let zeros = vec![0.0; model.spec.plan_len];
+    assert_eq!(controller.state("plan"), Some(zeros.as_slice()));
+    controller
+        .set_instruction(Instruction::Id(0))
+        .expect("the instruction is known");
+    let mut random = Random(5);
+    let mut action = vec![0.0; model.spec.action_len];
+    for _ in 0..=model.spec.horizon {
+        let observation = random.vec(model.spec.observation_len, 1.0);
+        let report = controller.step(&observation, &mut action);
+        let report = report.expect("the step is sound");
+        let index = report.selected.expect("it selects").index as usize;
+        assert_eq!(controller.state("plan"), Some(model.plan(index)));
+        assert_eq!(controller.state("logits"), Some(controller.scores()));
+    }
+    for name in ["context", "", "plans"] {
+        assert_eq!(controller.state(name), None, "{name}");
+    }
+}

@@ -10,6 +10,7 @@ pub use without::run;
 #[cfg(feature = "report")]
 mod with {
     use std::collections::BTreeMap;
+    use std::ffi::OsStr;
     use std::path::Path;
     use std::process::ExitCode;
     use std::sync::atomic::AtomicBool;
@@ -217,15 +218,19 @@ mod with {
             .collect()
     }
 
-    /// Names inputs whose short names are equal by their paths.
+    /// Names inputs whose short names are equal by their files' names, and where these are equal by their paths.
     fn tell_apart(systems: &mut [System]) {
-        let mut counts: BTreeMap<String, usize> = BTreeMap::new();
-        for system in systems.iter().filter(|system| system.group.is_none()) {
-            *counts.entry(system.name.clone()).or_default() += 1;
-        }
-        for system in systems.iter_mut().filter(|system| system.group.is_none()) {
-            if counts.get(&system.name).is_some_and(|&count| count > 1) {
-                system.name.clone_from(&system.file);
+        let longer: [fn(&Path) -> &OsStr; 2] =
+            [|file| file.file_name().unwrap_or_default(), Path::as_os_str];
+        for name in longer {
+            let mut counts: BTreeMap<String, usize> = BTreeMap::new();
+            for system in systems.iter().filter(|system| system.group.is_none()) {
+                *counts.entry(system.name.clone()).or_default() += 1;
+            }
+            for system in systems.iter_mut().filter(|system| system.group.is_none()) {
+                if counts.get(&system.name).is_some_and(|&count| count > 1) {
+                    system.name = name(Path::new(&system.file)).to_string_lossy().into_owned();
+                }
             }
         }
     }
