@@ -21,7 +21,7 @@ PUBLISHED := -p lads-kernels -p lads-image -p lads-core -p lads-compiler -p lads
 
 PREFIX  ?= /usr/local
 
-.PHONY: run report compare record viewer say language verify tune mutate frames features test test-torch test-full setup lint test-rust test-runtime test-exporter test-python test-targets wheel sanitize fuzz package msrv deny unused book lock collect train export table reference install bench clean help
+.PHONY: run report compare record viewer say language verify tune mutate frames features test test-torch test-full setup lint test-rust test-runtime test-exporter test-python test-targets wheel sanitize fuzz package msrv deny unused book lock cluster test-cluster collect train export table reference install bench clean help
 
 # Says before a build that takes long what it takes, where nothing of it is there yet: $(call first-build,a crate of it,what,minutes)
 first-build = @ls target/release/deps/lib$(1)-*.rlib >/dev/null 2>&1 || echo "The first build of $(2) takes some $(3) minutes of one core; later ones take seconds."
@@ -159,13 +159,26 @@ $(VENV)/stamp: exporter/pyproject.toml exporter/requirements.lock exporter/encod
 	$(PIP) --no-deps --no-build-isolation -e exporter
 	touch $@
 
-## lock: exporter/requirements.lock anew from the ranges of exporter/pyproject.toml, with the newest versions inside them
+# Tables on more than one machine need Ray, and nothing else does.
+$(VENV)/cluster-stamp: $(VENV)/stamp exporter/cluster.lock
+	$(PIP) --require-hashes -r exporter/cluster.lock
+	touch $@
+
+## cluster: Ray into the project's environment (250 MB), for tables on more than one machine, docs/cluster.md
+cluster: $(VENV)/cluster-stamp
+
+COMPILE = ../$(VENV)/bin/uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --quiet --upgrade
+# What the extra for clusters asks for, one requirement a line.
+RAY = import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["cluster"], sep="\n")
+
+## lock: exporter/requirements.lock and cluster.lock anew from the ranges of exporter/pyproject.toml, with the newest versions inside them
 lock: $(VENV)/stamp
 	$(PIP) uv==0.13.9
-	cd exporter && ../$(VENV)/bin/uv pip compile pyproject.toml --extra test --universal --python-version 3.11 --generate-hashes \
-		--no-header --no-annotate --quiet --upgrade --output-file ../target/requirements.txt
-	(sed -n '1,/^[^#]/{/^#/p}' exporter/requirements.lock; cat target/requirements.txt) > target/requirements.lock
-	mv target/requirements.lock exporter/requirements.lock
+	cd exporter && $(COMPILE) pyproject.toml --extra test --output-file ../target/requirements.txt
+	cd exporter && ../$(PY) -c '$(RAY)' | $(COMPILE) - --constraints ../target/requirements.txt --output-file ../target/cluster.txt
+	for name in requirements cluster; do \
+		(sed -n '1,/^[^#]/{/^#/p}' exporter/$$name.lock; cat target/$$name.txt) > target/$$name.lock && mv target/$$name.lock exporter/$$name.lock || exit 1; \
+	done
 
 # One process a core, up to what memory bears; who is done first takes tests of the others.
 WORKERS = -n auto --maxprocesses 6 --dist worksteal
@@ -174,6 +187,10 @@ test-exporter: setup $(VENV)/stamp
 	# With the examples, cargo counts in the dependencies of tests, and what `make test` has built serves here.
 	cargo build $(ALL) --bins --examples
 	$(TALLY) $(PY) -m pytest -rs $(WORKERS) exporter/tests tests/parity
+
+## test-cluster: tables on Ray clusters of two nodes on this machine, one of which is lost; installs Ray; some minutes
+test-cluster: $(VENV)/cluster-stamp
+	$(TALLY) $(PY) -m pytest -rs exporter/tests/test_cluster.py exporter/tests/test_shards.py
 
 # An environment of its own: a wheel needs no PyTorch. The pin is that of runtime/python/pyproject.toml.
 MATURIN := target/maturin
@@ -224,7 +241,7 @@ export: $(VENV)/stamp
 	$(PY) -m lads_exporter export --run runs/$(ENV) -o models/$(ENV).onnx
 
 ## table: every system of the paper's tables, ENV=kitchen or ENV=lorel: trained, exported, evaluated, into models/TABLES.md; hours, and the
-##        same command goes on where it was stopped. TABLE_ARGS="--jobs 2" trains two at a time
+##        same command goes on where it was stopped. TABLE_ARGS="--jobs 2" trains two at a time, "--engine ray" on a cluster (docs/cluster.md)
 table: setup $(VENV)/stamp $(DATA)
 	cargo build --release -p lads-sim --bin lads-run
 	$(PY) -m lads_exporter table exporter/tables/$(ENV).toml --data $(DATA) $(TABLE_ARGS)

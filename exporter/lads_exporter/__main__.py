@@ -191,7 +191,7 @@ def _calibrate(arguments):
 def _table(arguments):
     from .tables import run
 
-    chosen = {key: getattr(arguments, key) for key in ("data", "runs", "lads_run", "models")}
+    chosen = {key: getattr(arguments, key) for key in ("data", "runs", "lads_run", "models", "engine")}
     if not run.run(arguments.table, at_once=arguments.jobs, **chosen):
         print("stopped; the same command goes on", file=sys.stderr)
         return 130
@@ -294,7 +294,8 @@ def _parser():
     table.add_argument("--runs", default="runs/tables", help="where jobs are kept (runs/tables)")
     table.add_argument("--lads-run", default="target/release/lads-run", help="the built program (target/release/lads-run)")
     table.add_argument("--models", default="models", help="where TABLES.md and tables.json go (models)")
-    table.add_argument("--jobs", type=int, default=1, help="trainings at a time, of one thread each (1)")
+    table.add_argument("--jobs", type=int, help="trainings at a time, of one thread each; left out, 1, and with ray one for each CPU of the cluster")
+    table.add_argument("--engine", choices=("local", "ray"), default="local", help="where jobs run: on this machine, or on the Ray cluster at $RAY_ADDRESS, without it on a Ray of this machine's own (docs/cluster.md)")
     table.set_defaults(run_command=_table)
     return parser
 

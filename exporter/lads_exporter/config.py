@@ -417,6 +417,13 @@ def layered(table, over):
     return table | over | both
 
 
+def files(path, *over):
+    """Lists the files that `load` reads."""
+    path = find(path)
+    table = read_toml(path)
+    return [path, *(find(path.parent / table[key]) for key in ("environment", "instructions")), *map(find, over)]
+
+
 def load(path, *over):
     """Reads a configuration and the environment and instruction files it names; `over` are files of a system's own values."""
     path = find(path)

@@ -1,91 +1,24 @@
-"""Tests a table end to end on the tiny setting, with a program in the place of lads-run that writes results of its form; what is refused;
-the numbers."""
+"""Tests a table end to end on the tiny setting, what is refused, and the numbers."""
 
 import json
 import os
 import shutil
 import signal
-import stat
 import subprocess
 import sys
 import time
 
 import pytest
-import synthetic
-from test_training import setting_for
+import tiny_table
+from tiny_table import TABLE, play
 
-from lads_exporter import config, dataset
+from lads_exporter import dataset
 from lads_exporter.config import UserError
-from lads_exporter.tables import definition, jobs, render, run
-
-# Writes what lads-run would: every episode of `lads-HASH.onnx` succeeds, of others one in four.
-PROGRAM = """#!{python}
-import hashlib, json, sys
-options = dict(zip(sys.argv[1::2], sys.argv[2::2]))
-episodes, data = int(options["--episodes"]), open(options["--model"], "rb").read()
-full = 0.25 if "/lads-" not in options["--model"].removesuffix(".onnx")[-20:] or "--uniform" in sys.argv else 1.0
-split = {{"episodes": 4 * episodes, "n_rate": 4 * full, "n_rate_standard_error": 0.5, "k_rate": [full] * 4, "full_success": full,
-         "full_success_count": int(4 * episodes * full), "full_success_interval": [0, 1], "un_instructed": 0}}
-found = {{"bundle_sha256": hashlib.sha256(data).hexdigest(), "seed": int(options["--seed"]), "noise": options["--noise"],
-         "episodes_per_instruction": episodes, "splits": {{"seen": split, "unseen": split}}}}
-open(options["--json"], "w").write(json.dumps(found))
-"""
-
-TABLE = """
-name = "tiny"
-title = "Tiny"
-measure = "n_rate"
-data = "tiny.safetensors"
-splits = ["seen", "unseen"]
-headings = ["seen", "unseen"]
-[evaluation]
-episodes = 5
-seed = 3
-noise = "none"
-[[track]]
-name = "paper"
-config = "base.toml"
-note = "A note."
-seeds = [0, 1]
-[[system]]
-id = "lads"
-title = "LADS"
-config = "lads.toml"
-published = { seen = [2.25, 0.14] }
-[[system]]
-id = "lang_dt"
-title = "Lang DT"
-config = "lang_dt.toml"
-published = {}
-seeds = { paper = [4] }
-"""
-
+from lads_exporter.tables import definition, jobs, render
 
 @pytest.fixture
 def folder(tmp_path):
-    """Makes a folder with a table, its configurations, data and program."""
-    beside = config.find("configs/tiny.toml").resolve().parent
-    base = (beside / "tiny.toml").read_text().replace('"tiny.', f'"{beside}/tiny.')
-    for name, steps in {"plans": 40, "low_level": 20, "high_level": 20}.items():
-        now = setting_for("staged").tables[0]["training"][name]
-        shipped = config.read_toml("configs/tiny.toml")["training"][name]["steps"]
-        assert now
-        base = base.replace(f"[training.{name}]\nsteps = {shipped}", f"[training.{name}]\nsteps = {steps}")
-    (tmp_path / "base.toml").write_text(base.replace("kmeans_step = 200", "kmeans_step = 15"))
-    (tmp_path / "lads.toml").write_text('[system]\nkind = "lads"\nregressed = false\n')
-    (tmp_path / "lang_dt.toml").write_text('[system]\nkind = "lang_dt"\n')
-    (tmp_path / "table.toml").write_text(TABLE)
-    synthetic.write(tmp_path / "tiny.safetensors", config.load(tmp_path / "base.toml"), discarded='{"dl": 1}', attempts='{"dl": 4, "ld": 6}')
-    program = tmp_path / "lads-run"
-    program.write_text(PROGRAM.format(python=sys.executable))
-    program.chmod(program.stat().st_mode | stat.S_IXUSR)
-    return tmp_path
-
-
-def play(folder, **changes):
-    os.environ["PYTHONPATH"] = str(config.find("pyproject.toml").resolve().parent) + os.pathsep + os.environ.get("PYTHONPATH", "")
-    places = {"runs": folder / "runs", "lads_run": folder / "lads-run", "models": folder / "models"} | changes
-    return run.run(folder / "table.toml", **places)
+    return tiny_table.write(tmp_path)
 
 
 def goes_on_elsewhere(folder):
@@ -114,11 +47,11 @@ def test_a_table_from_nothing_again_and_from_its_middle(folder, capsys):
     found = json.loads((folder / "models/tables.json").read_text())["tables"]["tiny"]
     lads, lang_dt = found["tracks"][0]["rows"]
     assert lads["seeds"] == [0, 1] and lang_dt["seeds"] == [4] and len(set(lads["bundle_sha256"])) == 2
-    assert lads["splits"]["seen"]["n_rate"] == 4.0 and lads["splits"]["seen"]["n_rate_deviation"] == 0.0
-    assert lads["splits"]["seen"]["episodes"] == 40 and lads["splits"]["seen"]["success_interval"][0] == pytest.approx(0.9124, abs=1e-3)
-    assert found["uniform"]["seen"]["success"] == 0.25 and found["expert"]["attempts"] == 10 and found["expert"]["success"] == 0.9
+    assert lads["splits"]["seen"]["n_rate"] == pytest.approx(5 / 3) and lads["splits"]["seen"]["n_rate_deviation"] == 0.0
+    assert lads["splits"]["seen"]["episodes"] == 30 and lads["splits"]["seen"]["success_interval"][0] == pytest.approx(0.8865, abs=1e-3)
+    assert found["uniform"]["seen"]["success"] == 0.6 and found["expert"]["attempts"] == 10 and found["expert"]["success"] == 0.9
     page = (folder / "models/TABLES.md").read_text()
-    assert "| LADS | 0, 1 | 2.25 ± 0.14 | 4.00 ± 0.00 (3.31-4.69); all 100 % (91-100) | - |" in page
+    assert "| LADS | 0, 1 | 2.25 ± 0.14 | 1.67 ± 0.00 (1.49-1.84); all 100 % (89-100) | - |" in page
     assert "scripted expert" in page and "uniform random actions" in page and "`" + lads["bundle_sha256"][0][:12] + "`" in page
     assert "about" in capsys.readouterr().out
 
@@ -170,8 +103,7 @@ sys.exit(main())
 @pytest.mark.parametrize("program", [("-m", "lads_exporter"), ("-c", ELSEWHERE)], ids=["main thread", "another thread"])
 def test_an_interrupted_table_goes_on(folder, program):
     command = [sys.executable, *program, "table", folder / "table.toml", "--runs", folder / "runs", "--lads-run", folder / "lads-run", "--models", folder / "models"]
-    source = str(config.find("pyproject.toml").resolve().parent)
-    process = subprocess.Popen([str(part) for part in command], env=os.environ | {"PYTHONPATH": source + os.pathsep + os.environ.get("PYTHONPATH", "")}, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen([str(part) for part in command], env=os.environ | {"PYTHONPATH": tiny_table.python_path()}, stderr=subprocess.PIPE, text=True)
     while not list(folder.glob("runs/tiny/paper/lads-seed0-*/log.txt")):
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.05)

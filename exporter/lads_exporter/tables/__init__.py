@@ -5,6 +5,9 @@ TABLE.toml`.
 |---|---|
 | definition | the table's file: splits, how is evaluated, tracks, systems with the paper's numbers |
 | jobs | one system and seed in one track: train, export, evaluate; what is finished is kept by the hash of its inputs |
+| commands | the steps of a job, with all files that each reads and writes |
+| local, on_ray | the engines that run them: this machine; a Ray cluster |
+| node, shards | what runs on a node of a cluster; an evaluation put together from its parts |
 | run | all jobs of a table, some at a time; the numbers of finished ones |
 | render | models/tables.json and models/TABLES.md |
 

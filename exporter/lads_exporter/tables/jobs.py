@@ -8,26 +8,18 @@ fail: a command ends with an error, which is the job's; a checkpoint or a result
 import dataclasses
 import hashlib
 import json
-import subprocess
-import sys
-import threading
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 from .. import card, config, language
 from ..config import UserError
-from ..training import CHECKPOINT, SUMMARY
+from ..training import CHECKPOINT, CURVES, SUMMARY
+from .commands import Command, Rollouts
 
 CHANGES_NOTHING = ("sampler", "passes", "guidance", "temperature", "clip", "rule")  # of [system]: what only an export depends on
-
-
 SUMMARISED = ("perplexity", "codebook_size", "plan_elements_in_use", "validation", "steps")  # of a training's summary, in the table's file
 SCORES = ("episodes", "n_rate", "n_rate_standard_error", "k_rate", "full_success", "full_success_count")  # of a split's results, in the same
-
-
-class Stopped(Exception):
-    """The command was interrupted; its state is kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,36 +31,6 @@ class Place:
     data_sha256: str
     lads_run: Path
     threads: int = 1  # of a training: sums depend on their number
-
-
-class Processes:
-    """Commands that run; `stop` ends them in good order."""
-
-    def __init__(self):
-        self.running, self.stopped, self.lock = set(), False, threading.Lock()
-
-    def run(self, command, log):
-        """Runs a command whose output goes to a file; an error carries its last line."""
-        with self.lock:
-            if self.stopped:
-                raise Stopped
-            with open(log, "ab") as file:
-                process = subprocess.Popen([str(part) for part in command], stdout=file, stderr=subprocess.STDOUT, start_new_session=True)
-            self.running.add(process)
-        code = process.wait()
-        with self.lock:
-            self.running.discard(process)
-        if self.stopped or code == 130:
-            raise Stopped
-        if code:
-            lines = Path(log).read_text(errors="replace").strip().splitlines() or ["no output"]
-            raise UserError(f"{' '.join(str(part) for part in command[:4])} ... failed ({code}): {lines[-1]}; all of it is in {log}")
-
-    def stop(self):
-        with self.lock:
-            self.stopped = True
-            for process in self.running:
-                process.terminate()
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,13 +55,20 @@ class Job:
         return self.place.runs / self.table.name / self.track.name / f"{self.trained.id}-seed{self.seed}-{self.inputs[:12]}"
 
     @cached_property
+    def _setting(self):
+        return config.load(*self.table.configuration(self.track, self.trained))
+
+    @property
+    def _encoder(self):
+        return self._setting.config.language.encoder
+
+    @cached_property
     def inputs(self):
         """Hashes all that the trained weights depend on."""
-        setting = config.load(*self.table.configuration(self.track, self.trained))
-        tables = json.loads(json.dumps(setting.tables))
+        tables = json.loads(json.dumps(self._setting.tables))
         own = tables[0].get("system", {})
         tables[0]["system"] = {key: value for key, value in own.items() if key not in CHANGES_NOTHING}
-        encoder = setting.config.language.encoder
+        encoder = self._encoder
         known = encoder if encoder.startswith("random-") else language.weights_sha256(encoder)
         return _hash([tables, self.place.data_sha256, known, self.seed, self.place.threads])
 
@@ -126,22 +95,40 @@ class Job:
     def finished(self):
         return self.results.is_file() and self.bundle.is_file()
 
-    def run(self, processes):
+    def run(self, engine):
         """Runs the steps of the job that are not done yet."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        log = self.folder / "log.txt"
-        exporter = [sys.executable, "-m", "lads_exporter"]
-        base, over = self.table.configuration(self.track, self.trained)
         if not (self.folder / SUMMARY).is_file():
-            resume = ["--resume"] if (self.folder / CHECKPOINT).is_file() else []
-            options = ["--config", base, "--system", over, "--data", self.place.data, "--out", self.folder, "--seed", self.seed, "--threads", self.place.threads]
-            processes.run([*exporter, "train", *options, *resume], log)
+            engine.run(self._training())
         if not self.bundle.is_file():
-            own = ["--system", self.table.path(self.system.config)]
-            processes.run([*exporter, "export", "--run", self.folder, *own, "-o", self.bundle], log)
+            engine.run(self._export())
         if not self.results.is_file():
-            evaluate(self.table, self.bundle, self.results, self.place, processes, log)
+            engine.evaluate(self.rollouts(self.results))
         self.numbers()
+
+    @property
+    def log(self):
+        return self.folder / "log.txt"
+
+    def _training(self):
+        place, (base, over) = self.place, self.table.configuration(self.track, self.trained)
+        written = [self.folder / name for name in (CHECKPOINT, CURVES, SUMMARY)]
+        there = [path for path in written if path.is_file()]
+        resume = ["--resume"] if written[0] in there else []
+        options = ["--config", base, "--system", over, "--data", place.data, "--out", self.folder, "--seed", self.seed, "--threads", place.threads]
+        return Command(None, ["train", *options, *resume], [*config.files(base, over), place.data, *there], written, self.log, self._encoder)
+
+    def _export(self):
+        own = self.table.path(self.system.config)
+        run = [self.folder / name for name in (CHECKPOINT, CURVES, SUMMARY)]
+        arguments = ["export", "--run", self.folder, "--system", own, "-o", self.bundle]
+        return Command(None, arguments, [own, *run], [self.bundle.with_suffix(".md"), self.bundle], self.log, self._encoder)
+
+    def rollouts(self, results, uniform=False):
+        """Returns the episodes that the table asks for, of this job's bundle."""
+        instructions = [row["id"] for row in self._setting.instructions]
+        log = results.with_name("uniform.log.txt") if uniform else self.log
+        return Rollouts(self.table.evaluation, instructions, self.bundle, results, self.place.lads_run, log, uniform)
 
     def numbers(self):
         """Returns what the table keeps of a finished job: its bundle's hash, training time and summary, and the scores of its splits."""
@@ -158,15 +145,6 @@ class Job:
 
 def _hash(parts):
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-
-
-def evaluate(table, bundle, results, place, processes, log, uniform=False):
-    """Runs a bundle by lads-run; the results appear whole or not at all."""
-    partial = results.with_suffix(".partial")
-    asked = table.evaluation
-    command = [place.lads_run, "--model", bundle, "--episodes", asked.episodes, "--seed", asked.seed, "--noise", asked.noise, "--threads", 1, "--json", partial]
-    processes.run([*command, *(["--uniform"] if uniform else [])], log)
-    partial.replace(results)
 
 
 def checked_results(table, path, sha256=None):

@@ -1,4 +1,4 @@
-"""Runs all jobs of a table, some at a time on this machine, and writes the numbers of those that are finished.
+"""Runs all jobs of a table, some at a time on this machine or on a cluster, and writes the numbers of those that are finished.
 
 A job is finished if its files are here, or if tables.json has its numbers from the same inputs. After every job the tables are written anew, so
 that a reader always sees what is known. An interrupt stops trainings at their next step, in their checkpoints.
@@ -14,8 +14,10 @@ from pathlib import Path
 from .. import dataset
 from ..config import UserError
 from . import render
+from .commands import Stopped
 from .definition import load
-from .jobs import Place, Processes, Stopped, all_jobs, checked_results, evaluate
+from .jobs import Place, all_jobs, checked_results
+from .local import Local
 
 
 def duration(seconds):
@@ -41,9 +43,9 @@ class Progress:
 
 
 @contextmanager
-def _stoppable(processes):
+def _stoppable(engine):
     def handler(number, frame):
-        processes.stop()
+        engine.stop()
 
     before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -53,24 +55,37 @@ def _stoppable(processes):
             signal.signal(number, previous)
 
 
-def floor(table, place, jobs, processes):
+def floor(table, place, jobs, engine):
     """Evaluates uniform random actions in the same episodes: needs a bundle for its limits, whichever is here."""
     path = place.runs / table.name / "uniform.results.json"
     if not path.is_file():
         job = next((job for job in jobs if job.finished), None)
         if job is None:
             return None
-        evaluate(table, job.bundle, path, place, processes, path.with_name("uniform.log.txt"), uniform=True)
+        engine.evaluate(job.rollouts(path, uniform=True))
     return checked_results(table, path)
 
 
-def run(path, data=None, runs="runs/tables", lads_run="target/release/lads-run", models="models", at_once=1):
+def open_engine(name, place, at_once):
+    if name == "local":
+        return Local(at_once or 1)
+    from .on_ray import OnRay
+
+    return OnRay(place, at_once)
+
+
+def run(path, data=None, runs="runs/tables", lads_run="target/release/lads-run", models="models", at_once=None, engine="local"):
     """Runs a table's file to its end, or until it is stopped -> whether it reached the end."""
-    if at_once < 1:
+    if at_once is not None and at_once < 1:
         raise UserError(f"--jobs {at_once}: must be at least 1")
     table = load(path)
     place = _place(table, data, runs, lads_run)
-    jobs, processes = all_jobs(table, place), Processes()
+    jobs = all_jobs(table, place)
+    with open_engine(engine, place, at_once) as opened:
+        return _run(table, place, jobs, models, opened)
+
+
+def _run(table, place, jobs, models, engine):
     known, uniform, others = render.recorded(models, table, jobs)
     groups = {}
     for job in jobs:
@@ -87,17 +102,17 @@ def run(path, data=None, runs="runs/tables", lads_run="target/release/lads-run",
 
     def write():
         with writing:
-            scores = uniform or floor(table, place, jobs, processes)
+            scores = uniform or floor(table, place, jobs, engine)
             render.write(models, table, place, [(job, known.get(job)) for job in jobs], scores)
 
     def work(group):
         for job in group:
-            if job in known or processes.stopped:
+            if job in known or engine.stopped:
                 continue
             begun = time.monotonic()
             try:
                 progress.say(f"{job.label}: begins")
-                job.run(processes)
+                job.run(engine)
                 known[job] = job.numbers()
                 progress.finished(job.label, time.monotonic() - begun)
                 write()
@@ -107,18 +122,18 @@ def run(path, data=None, runs="runs/tables", lads_run="target/release/lads-run",
                 failures.append(f"{job.label}: {error}")
                 progress.say(f"{job.label}: {error}")
 
-    with _stoppable(processes), ThreadPoolExecutor(at_once) as pool:
+    with _stoppable(engine), ThreadPoolExecutor(engine.at_once) as pool:
         left = [pool.submit(work, group) for group in groups.values()]
         while left:
             # Python runs a handler in the main thread only, which the system may leave asleep: it may interrupt another thread instead.
             done, left = wait(left, timeout=0.2)
             for outcome in done:
                 outcome.result()
-        if not processes.stopped:
+        if not engine.stopped:
             write()
     if failures:
         raise UserError(f"{len(failures)} of {len(jobs)} jobs failed:\n  " + "\n  ".join(failures))
-    return not processes.stopped
+    return not engine.stopped
 
 
 def _place(table, data, runs, lads_run):

@@ -1,0 +1,48 @@
+"""The engine of one machine: commands as processes, as many at a time as are asked for.
+
+`stop` may be called by a signal's handler; it ends the processes in good order, and trainings keep their checkpoints.
+"""
+
+import subprocess
+import threading
+
+from .commands import INTERRUPTED, Stopped
+
+
+class Local:
+    def __init__(self, at_once=1):
+        self.at_once = at_once
+        self.running, self.stopped, self.lock = set(), False, threading.Lock()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def run(self, command):
+        with self.lock:
+            if self.stopped:
+                raise Stopped
+            with open(command.log, "ab") as file:
+                process = subprocess.Popen(command.line(), stdout=file, stderr=subprocess.STDOUT, start_new_session=True)
+            self.running.add(process)
+        code = process.wait()
+        with self.lock:
+            self.running.discard(process)
+        if self.stopped or code == INTERRUPTED:
+            raise Stopped
+        if code:
+            raise command.failed(code, command.log.read_text(errors="replace"))
+
+    def evaluate(self, rollouts):
+        """Runs all episodes; the results appear whole or not at all."""
+        partial = rollouts.results.with_suffix(".partial")
+        self.run(rollouts.command(partial))
+        partial.replace(rollouts.results)
+
+    def stop(self):
+        with self.lock:
+            self.stopped = True
+            for process in self.running:
+                process.terminate()
