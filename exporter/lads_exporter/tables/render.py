@@ -22,13 +22,13 @@ Z = 1.959963984540054  # of 95 %
 
 
 def wilson(count, total):
-    """Computes the Wilson score interval of a share, 95 %."""
+    """Computes the Wilson score interval of a share, 95 %, with the bits of `wilson` in sim-harness/proof/src/metrics.rs."""
     if total == 0:
         return [0.0, 1.0]
     share, z2 = count / total, Z * Z
-    centre = (share + z2 / (2 * total)) / (1 + z2 / total)
-    half = Z / (1 + z2 / total) * math.sqrt(share * (1 - share) / total + z2 / (4 * total * total))
-    return [max(0.0, centre - half), min(1.0, centre + half)]
+    centre, scale = share + z2 / (2.0 * total), 1.0 + z2 / total
+    half = Z * math.sqrt(share * (1.0 - share) / total + z2 / (4.0 * total * total))
+    return [(centre - half) / scale if count else 0.0, (centre + half) / scale if count < total else 1.0]
 
 
 def summarise(splits):
