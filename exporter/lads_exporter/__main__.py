@@ -191,7 +191,7 @@ def _calibrate(arguments):
 def _table(arguments):
     from .tables import run
 
-    chosen = {key: getattr(arguments, key) for key in ("data", "runs", "lads_run", "models", "engine")}
+    chosen = {key: getattr(arguments, key) for key in ("data", "frames", "runs", "lads_run", "models", "engine")}
     if not run.run(arguments.table, at_once=arguments.jobs, **chosen):
         print("stopped; the same command goes on", file=sys.stderr)
         return 130
@@ -291,6 +291,7 @@ def _parser():
     table = commands.add_parser("table", help="the paper's tables: trains, exports and evaluates every system; goes on where it was stopped")
     table.add_argument("table", metavar="TABLE", help="exporter/tables/kitchen.toml or lorel.toml")
     table.add_argument("--data", help="the dataset; left out, the one that the table names")
+    table.add_argument("--frames", help="the frames of the dataset's states, for systems with a camera; left out, those that the table names")
     table.add_argument("--runs", default="runs/tables", help="where jobs are kept (runs/tables)")
     table.add_argument("--lads-run", default="target/release/lads-run", help="the built program (target/release/lads-run)")
     table.add_argument("--models", default="models", help="where TABLES.md and tables.json go (models)")

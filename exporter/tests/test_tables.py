@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -9,12 +10,15 @@ import sys
 import time
 
 import pytest
+import synthetic
+import test_frames
 import tiny_table
 from tiny_table import TABLE, play
 
-from lads_exporter import dataset
+from lads_exporter import config, dataset
 from lads_exporter.config import UserError
 from lads_exporter.tables import definition, jobs, render
+
 
 @pytest.fixture
 def folder(tmp_path):
@@ -172,3 +176,27 @@ def test_the_tables_that_ship_are_sound():
         table = definition.load(f"tables/{name}.toml")
         assert [track.name for track in table.tracks] == ["shipping", "paper"]
         assert {row.id for row in table.systems} >= {"lads", "lang_dt", "lisa", "vae", "cluster"}
+
+
+def test_systems_with_a_camera_share_the_encoder(folder):
+    """Tests that one encoder of frames is trained for a table's systems, and that the frames are those of its dataset."""
+    base = (folder / "base.toml").read_text()
+    for key, old, new in (("observed", r"\d+", "0"), ("renoise", r"\w+", "false"), ("schedule", r'"\w+"', '"staged"')):
+        base, count = re.subn(rf"^{key} = {old}", f"{key} = {new}", base, flags=re.MULTILINE)
+        assert count == 1
+    section = lambda name, rows: f"\n[{name}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in rows.items())
+    (folder / "base.toml").write_text(base + section("images", {key: value for key, value in test_frames.SEEN.items() if key != "frames"}) + section("images.frames", test_frames.APART))
+    (folder / "table.toml").write_text('frames = "tiny.frames"' + TABLE.replace("seeds = [0, 1]", "seeds = [4]"))
+    with pytest.raises(UserError, match=r"no frames at .*tiny\.frames; draw them first \(make frames DATA="):
+        play(folder)
+    data = synthetic.write(folder / "tiny.safetensors", config.load(folder / "base.toml"))
+    test_frames.write_frames(folder / "tiny.frames", data, dataset_sha256="00")
+    with pytest.raises(UserError, match="made of another dataset"):
+        play(folder)
+    test_frames.write_frames(folder / "tiny.frames", data)
+    assert play(folder)
+    stages = {path.parent.name[:4]: {row.split(",")[0] for row in path.read_text().splitlines()} for path in folder.glob("runs/tiny/paper/*/curves.csv")}
+    assert stages == {"lads": {"stage", "frames", "plans", "low_level", "high_level"}, "lang": {"stage", "joint"}}
+    assert len(list(folder.glob("runs/tiny/paper/encoder-seed4-*.pt"))) == 1
+    found = json.loads((folder / "models/tables.json").read_text())["tables"]["tiny"]["jobs"]
+    assert [row["summary"]["steps"]["frames"] for row in found] == [test_frames.APART["steps"]] * 2

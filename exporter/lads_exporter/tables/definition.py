@@ -56,6 +56,7 @@ class Table:
     tracks: list
     systems: list
     folder: Path  # where the file lies; paths in it are relative to it
+    frames: str = ""  # of the dataset's states, for systems that observe by a camera
 
     def path(self, name):
         return self.folder / name

@@ -30,7 +30,14 @@ class Place:
     data: Path
     data_sha256: str
     lads_run: Path
+    frames: Path | None = None  # of the dataset's states
+    rendering: dict | None = None  # how they were drawn; their last bits depend on the machine that drew them
     threads: int = 1  # of a training: sums depend on their number
+
+    @property
+    def large(self):
+        """Returns the files that are too large to go along with every command."""
+        return [path for path in (self.data, self.frames) if path]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +77,17 @@ class Job:
         tables[0]["system"] = {key: value for key, value in own.items() if key not in CHANGES_NOTHING}
         encoder = self._encoder
         known = encoder if encoder.startswith("random-") else language.weights_sha256(encoder)
-        return _hash([tables, self.place.data_sha256, known, self.seed, self.place.threads])
+        seen = [self.place.rendering] if self.place.frames else []
+        return _hash([tables, self.place.data_sha256, known, self.seed, self.place.threads, *seen])
+
+    @property
+    def shared_encoder(self):
+        """Returns the file of the encoder of frames, which a track's systems share; None where there is none."""
+        table = self._setting.tables[0]
+        if not self._setting.config.images.frames.steps:
+            return None
+        made_of = _hash([table["images"], table["data"], self.place.data_sha256, self.place.rendering, self.seed, self.place.threads])
+        return self.place.runs / self.table.name / self.track.name / f"encoder-seed{self.seed}-{made_of[:12]}.pt"
 
     @cached_property
     def exported(self):
@@ -113,10 +130,15 @@ class Job:
     def _training(self):
         place, (base, over) = self.place, self.table.configuration(self.track, self.trained)
         written = [self.folder / name for name in (CHECKPOINT, CURVES, SUMMARY)]
-        there = [path for path in written if path.is_file()]
-        resume = ["--resume"] if written[0] in there else []
+        resume = ["--resume"] if written[0].is_file() else []
         options = ["--config", base, "--system", over, "--data", place.data, "--out", self.folder, "--seed", self.seed, "--threads", place.threads]
-        return Command(None, ["train", *options, *resume], [*config.files(base, over), place.data, *there], written, self.log, self._encoder)
+        if place.frames:
+            options += ["--frames", place.frames]
+        if self.shared_encoder:
+            options += ["--encoder", self.shared_encoder]
+            written.insert(0, self.shared_encoder)
+        there = [path for path in written if path.is_file()]
+        return Command(None, ["train", *options, *resume], [*config.files(base, over), *place.large, *there], written, self.log, self._encoder)
 
     def _export(self):
         own = self.table.path(self.system.config)

@@ -35,8 +35,8 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Data:
-    """The dataset, which is sent to nodes that do not have it."""
+class Large:
+    """A large file, a dataset or its frames, which is sent to nodes that do not have it."""
 
     path: Path
     sha256: str
@@ -68,8 +68,8 @@ def _code():
     return known.hexdigest()
 
 
-def work(command, inputs, expected, lads_run, data):
-    """Runs a command. inputs: {path: bytes}; expected: its surroundings where the table runs; data: for a training."""
+def work(command, inputs, expected, lads_run, large):
+    """Runs a command. inputs: {path: bytes}; expected: its surroundings where the table runs; large: files for a training."""
     import ray
 
     id = ray.get_runtime_context().get_node_id()
@@ -77,7 +77,7 @@ def work(command, inputs, expected, lads_run, data):
     try:
         check(expected, surroundings(lads_run, command.encoder))
         with tempfile.TemporaryDirectory(prefix="lads-table-") as root:
-            code, output, files = _run(command, inputs, data, Path(root))
+            code, output, files = _run(command, inputs, large, Path(root))
             return Outcome(node, id, code, output=output, files=files)
     except (UserError, OSError) as error:
         return Outcome(node, id, problem=str(error))
@@ -91,14 +91,14 @@ def check(expected, found):
         raise UserError(f"not what it is where the table runs: {'; '.join(other)}")
 
 
-def _run(command, inputs, data, root):
+def _run(command, inputs, large, root):
     placed = {}
     at = lambda path: placed.get(path) or root / path.absolute().relative_to("/")
     for path, content in inputs.items():
         at(path).parent.mkdir(parents=True, exist_ok=True)
         at(path).write_bytes(content)
-    if data:
-        placed[data.path] = _dataset(data, root)
+    for one in large:
+        placed[one.path] = _fetched(one, root)
     for path in command.writes:
         at(path).parent.mkdir(parents=True, exist_ok=True)
     log = root / "log.txt"
@@ -114,13 +114,13 @@ def _run(command, inputs, data, root):
     return code, output, files
 
 
-def _dataset(data, root):
+def _fetched(large, root):
     import ray
 
-    if data.path.is_file() and dataset.sha256(data.path) == data.sha256:
-        return data.path
-    there = root / data.path.name
-    there.write_bytes(ray.get(data.sent[0]))
+    if large.path.is_file() and dataset.sha256(large.path) == large.sha256:
+        return large.path
+    there = root / large.path.name
+    there.write_bytes(ray.get(large.sent[0]))
     return there
 
 

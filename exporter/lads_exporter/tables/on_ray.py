@@ -17,6 +17,7 @@ import time
 
 import numpy as np
 
+from .. import dataset
 from ..config import UserError
 from ..output import write_atomically
 from . import node, shards
@@ -36,7 +37,7 @@ class OnRay:
     def __init__(self, place, at_once=None):
         self.place, self.stopped, self.lock = place, False, threading.Lock()
         self.unfit = {}  # id of a node -> why nothing runs there
-        self.expected, self.data = {}, None
+        self.expected, self.large = {}, {}
         _connect()
         self.alive, self.looked = _alive(), 0.0
         self.at_once = at_once or max(1, int(ray.cluster_resources().get("CPU", 1)))
@@ -103,18 +104,18 @@ class OnRay:
         options = {"num_cpus": 1, "max_retries": LOST, "label_selector": self._fit_nodes()}
         work = ray.remote(node.work).options(**options)
         for command in commands:
-            data = self._sent_data() if self.place.data in command.reads else None
-            files = tuple(path for path in command.reads if path != self.place.data)
+            large = [self._sent(path) for path in self.place.large if path in command.reads]
+            files = tuple(path for path in command.reads if path not in self.place.large)
             if files not in sent:
                 sent[files] = ray.put({path: path.read_bytes() for path in files})
-            yield work.remote(command, sent[files], self._expected(command.encoder), str(self.place.lads_run), data)
+            yield work.remote(command, sent[files], self._expected(command.encoder), str(self.place.lads_run), large)
 
-    def _sent_data(self):
+    def _sent(self, path):
         with self.lock:
-            if self.data is None:
-                content = ray.put(np.fromfile(self.place.data, np.uint8))
-                self.data = node.Data(self.place.data, self.place.data_sha256, [content])
-            return self.data
+            if path not in self.large:
+                content = ray.put(np.fromfile(path, np.uint8))
+                self.large[path] = node.Large(path, dataset.sha256(path), [content])
+            return self.large[path]
 
     def _expected(self, encoder):
         with self.lock:

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from pathlib import Path
 
-from .. import dataset
+from .. import dataset, frames as frame_file
 from ..config import UserError
 from . import render
 from .commands import Stopped
@@ -74,12 +74,12 @@ def open_engine(name, place, at_once):
     return OnRay(place, at_once)
 
 
-def run(path, data=None, runs="runs/tables", lads_run="target/release/lads-run", models="models", at_once=None, engine="local"):
+def run(path, data=None, frames=None, runs="runs/tables", lads_run="target/release/lads-run", models="models", at_once=None, engine="local"):
     """Runs a table's file to its end, or until it is stopped -> whether it reached the end."""
     if at_once is not None and at_once < 1:
         raise UserError(f"--jobs {at_once}: must be at least 1")
     table = load(path)
-    place = _place(table, data, runs, lads_run)
+    place = _place(table, data, frames, runs, lads_run)
     jobs = all_jobs(table, place)
     with open_engine(engine, place, at_once) as opened:
         return _run(table, place, jobs, models, opened)
@@ -136,14 +136,21 @@ def _run(table, place, jobs, models, engine):
     return not engine.stopped
 
 
-def _place(table, data, runs, lads_run):
+def _place(table, data, frames, runs, lads_run):
     data = Path(data) if data else table.path(table.data)
+    frames = Path(frames) if frames else table.path(table.frames) if table.frames else None
     lads_run = Path(lads_run)
     problems = []
     if not data.is_file():
         problems.append(f"no dataset at {data}; collect one first (make collect ENV={table.name})")
     if not lads_run.is_file():
         problems.append(f"no program at {lads_run}; build it first: cargo build --release -p lads-sim")
+    if frames and not table.frames:
+        problems.append(f"{table.name} has no systems with a camera; leave --frames out")
+    elif frames and not frames.is_file():
+        problems.append(f"no frames at {frames}; draw them first (make frames DATA={data})")
     if problems:
         raise UserError("; ".join(problems))
-    return Place(Path(runs).resolve(), data.resolve(), dataset.sha256(data), lads_run.resolve())
+    sha256 = dataset.sha256(data)
+    rendering = frame_file.read(frames, sha256)[1] if frames else None
+    return Place(Path(runs).resolve(), data.resolve(), sha256, lads_run.resolve(), frames and frames.resolve(), rendering)
