@@ -263,6 +263,27 @@ mod tests {
     }
 
     #[test]
+    fn names_are_text_wherever_they_stand() {
+        let comparison = Comparison {
+            environment: "e",
+            systems: vec![
+                system("<i>a & b</i>", None, Some(1)),
+                system("<i>c</i>", Some("<i>t</i>/x"), Some(4)),
+            ],
+        };
+        let page = comparison.html().unwrap();
+        assert!(!page.contains("<i>") && page.contains("a &amp; b"));
+        let bars = charts::successes(
+            "<i>",
+            &[Series {
+                name: "<i>a",
+                score: &comparison.systems[0].splits[0].score,
+            }],
+        );
+        assert!(!bars[0].svg.contains("<i>"));
+    }
+
+    #[test]
     fn tracks_have_charts_of_their_own_with_every_other_input() {
         let systems = vec![
             system("mine", None, Some(4)),

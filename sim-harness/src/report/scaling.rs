@@ -16,8 +16,14 @@ pub struct Plane {
 /// An eigenvector's sign is free; here its largest coordinate is positive, so that the same vectors give the same picture.
 pub fn plane(vectors: &[&[f32]]) -> Plane {
     let n = vectors.len();
+    if n == 0 {
+        return Plane {
+            points: Vec::new(),
+            kept: 1.0,
+        };
+    }
     let squared = DMatrix::from_fn(n, n, |i, j| distance_squared(vectors[i], vectors[j]));
-    let centring = DMatrix::identity(n, n) - DMatrix::from_element(n, n, 1.0 / n.max(1) as f64);
+    let centring = DMatrix::identity(n, n) - DMatrix::from_element(n, n, 1.0 / n as f64);
     let inner = -0.5 * (&centring * squared * &centring);
     let total = inner.trace();
     let eigen = SymmetricEigen::new(inner);

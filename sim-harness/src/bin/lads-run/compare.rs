@@ -86,7 +86,8 @@ mod with {
         output::write(&asked.output, page.as_bytes())
             .map_err(|error| unwritable("-o", &asked.output, &error))?;
         let (count, path) = (comparison.systems.len(), asked.output.display());
-        let line = format!("{environment}: {count} systems compared in {path}\n");
+        let systems = if count == 1 { "system" } else { "systems" };
+        let line = format!("{environment}: {count} {systems} compared in {path}\n");
         print(&line)?;
         Ok(ExitCode::SUCCESS)
     }
