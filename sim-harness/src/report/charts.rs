@@ -109,7 +109,9 @@ fn arms(rate: f64, Interval(low, high): Interval) -> (f64, f64) {
 
 /// Draws the K-rates up to `most`, Figure 3 of the paper: one line for each of the series, told apart by colour, then by dashes.
 pub fn k_rates(title: &str, series: &[Series<'_>], most: usize) -> Vec<Chart> {
-    let dashes = [LineStyle::Solid, LineStyle::Dashed, LineStyle::Dotted];
+    // Short, so that the legend's little lines show them.
+    let dash = |dashes: &str| LineStyle::Custom(dashes.to_owned());
+    let dashes = [LineStyle::Solid, dash("4 3"), dash("1.5 3")];
     let places = series.len().max(2) as f64 - 1.0;
     let plots: Vec<Plot> = series
         .iter()
