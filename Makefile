@@ -12,6 +12,7 @@ ENV    ?= kitchen
 DATA   ?= data/$(ENV).safetensors
 COLLECT_kitchen := --episodes-per-instruction 50
 COLLECT_lorel   := --episodes 50000
+COLLECT_lorel-image := --episodes 3000
 # What lints and tests cover; one selection, because each is a build of its own, of tract too: the oracle and the language encoder's engine.
 FEATURES := lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language
 ALL      := --workspace --features $(FEATURES)
@@ -216,9 +217,10 @@ test-python: setup wheel $(VENV)/stamp
 	$(PIP) 'lads[test,examples]'
 	$(TALLY) $(PY) -m pytest -rs $(WORKERS) runtime/python/tests
 
-## collect: demonstrations into data/ENV.safetensors; ENV=kitchen (scripted, of the 22 seen instructions) or ENV=lorel (random, labelled)
+## collect: demonstrations into data/ENV.safetensors; ENV=kitchen (scripted, of the 22 seen instructions), lorel (random, labelled), or lorel-image
+##         (as many as are drawn)
 collect: setup
-	cargo run --release -p lads-sim --bin lads-collect -- --env $(ENV) $(COLLECT_$(ENV)) -o data/$(ENV).safetensors
+	cargo run --release -p lads-sim --bin lads-collect -- --env $(ENV:-image=) $(COLLECT_$(ENV)) -o data/$(ENV).safetensors
 
 ## frames: what the environment's camera sees in every state of $(DATA), for settings on images (ENV=lorel DATA=data/lorel.safetensors); about
 ##         20 ms each on one core, and the same command goes on where it was stopped. Then: make train ENV=lorel-image DATA=... FRAMES=...
@@ -240,11 +242,14 @@ train: $(VENV)/stamp
 export: $(VENV)/stamp
 	$(PY) -m lads_exporter export --run runs/$(ENV) -o models/$(ENV).onnx
 
-## table: every system of the paper's tables, ENV=kitchen or ENV=lorel: trained, exported, evaluated, into models/TABLES.md; hours, and the
+## table: every system of the paper's tables, ENV=kitchen, lorel or lorel-image: trained, exported, evaluated, into models/TABLES.md; hours, and the
 ##        same command goes on where it was stopped. TABLE_ARGS="--jobs 2" trains two at a time, "--engine ray" on a cluster (docs/cluster.md)
-table: setup $(VENV)/stamp $(DATA)
-	cargo build --release -p lads-sim --bin lads-run
+table: setup $(VENV)/stamp $(DATA) $(if $(filter %-image,$(ENV)),$(DATA:.safetensors=.frames))
+	cargo build --release -p lads-sim $(if $(filter %-image,$(ENV)),--features camera) --bin lads-run
 	$(PY) -m lads_exporter table exporter/tables/$(ENV).toml --data $(DATA) $(TABLE_ARGS)
+
+%.frames: | %.safetensors
+	$(MAKE) frames DATA=$*.safetensors
 
 $(DATA):
 	$(MAKE) collect ENV=$(ENV)

@@ -50,6 +50,7 @@ def test_a_table_from_nothing_again_and_from_its_middle(folder, capsys):
     assert play(folder, at_once=2)
     found = json.loads((folder / "models/tables.json").read_text())["tables"]["tiny"]
     lads, lang_dt = found["tracks"][0]["rows"]
+    assert found["environment"] == "tiny-bench"
     assert lads["seeds"] == [0, 1] and lang_dt["seeds"] == [4] and len(set(lads["bundle_sha256"])) == 2
     assert lads["splits"]["seen"]["n_rate"] == pytest.approx(5 / 3) and lads["splits"]["seen"]["n_rate_deviation"] == 0.0
     assert lads["splits"]["seen"]["episodes"] == 30 and lads["splits"]["seen"]["success_interval"][0] == pytest.approx(0.8865, abs=1e-3)

@@ -66,6 +66,11 @@ class Job:
         return config.load(*self.table.configuration(self.track, self.trained))
 
     @property
+    def environment(self):
+        """Returns the id of the environment that the job's episodes run in."""
+        return self._setting.environment["id"]
+
+    @property
     def _encoder(self):
         return self._setting.config.language.encoder
 

@@ -95,6 +95,7 @@ def entry(table, place, jobs, uniform):
         tracks.append({"name": track.name, "config": Path(track.config).name, "note": track.note, "rows": rows})
     found = {
         "title": table.title,
+        "environment": jobs[0][0].environment,
         "measure": table.measure,
         "splits": dict(zip(table.splits, table.headings)),
         "protocol": _protocol(table),

@@ -15,14 +15,13 @@ use thiserror::Error;
 use super::compare::{Split, System};
 use super::figures::Behaviour;
 use super::words::Counts;
-use crate::registry;
 use crate::results::{FORMAT, FORMAT_VERSION};
 
 /// Value of the `format` of a file of tables.
 const TABLES: &str = "lads-tables";
 
 /// Versions of a file of tables that are read.
-const TABLES_VERSIONS: std::ops::RangeInclusive<u64> = 1..=2;
+const TABLES_VERSION: u32 = 1;
 
 /// Why a table has no figures of what a policy did.
 const A_TABLE: &str = "a table holds success rates only; give a bundle";
@@ -55,8 +54,8 @@ pub enum InputError {
         format: &'static str,
         /// What the file says.
         found: String,
-        /// Versions that are read.
-        read: String,
+        /// Version that is read.
+        read: u32,
     },
     /// A field is missing or of another kind.
     #[error("it is a damaged {format} file ({wrong}); make it again")]
@@ -65,16 +64,6 @@ pub enum InputError {
         format: &'static str,
         /// Where the form is another one.
         wrong: serde_json::Error,
-    },
-    /// A table of no environment.
-    #[error(
-        "its table '{table}' is of no known environment ({known}); name another one with --table"
-    )]
-    Unknown {
-        /// Name of the table.
-        table: String,
-        /// Ids of the known environments.
-        known: String,
     },
     /// There is no table to compare.
     #[error("it has no table '{asked}' with a finished system; it has {tables}")]
@@ -98,7 +87,8 @@ pub fn read(path: &Path, table: Option<&str>) -> Result<Found, InputError> {
 fn parse(text: &str, name: &str, table: Option<&str>) -> Result<Found, InputError> {
     let value: Value = serde_json::from_str(text).map_err(InputError::Json)?;
     let version = &value["format_version"];
-    let versioned = |format, known: bool, read: String| {
+    let versioned = |format, read: u32| {
+        let known = version.as_u64() == Some(u64::from(read));
         known.then_some(()).ok_or_else(|| InputError::Version {
             format,
             found: version.to_string(),
@@ -107,15 +97,11 @@ fn parse(text: &str, name: &str, table: Option<&str>) -> Result<Found, InputErro
     };
     match value["format"].as_str() {
         Some(FORMAT) => {
-            let known = version.as_u64() == Some(u64::from(FORMAT_VERSION));
-            versioned(FORMAT, known, format!("version {FORMAT_VERSION}"))?;
+            versioned(FORMAT, FORMAT_VERSION)?;
             results(value, name)
         }
         Some(TABLES) => {
-            let known = version.as_u64();
-            let known = known.is_some_and(|version| TABLES_VERSIONS.contains(&version));
-            let (from, to) = TABLES_VERSIONS.into_inner();
-            versioned(TABLES, known, format!("versions {from} to {to}"))?;
+            versioned(TABLES, TABLES_VERSION)?;
             tables(value, name, table)
         }
         found => Err(InputError::Format {
@@ -229,6 +215,7 @@ struct TablesFile {
 
 #[derive(Deserialize)]
 struct TableFound {
+    environment: String,
     measure: String,
     protocol: Protocol,
     tracks: Vec<TrackFound>,
@@ -295,12 +282,8 @@ fn tables(value: Value, name: &str, asked: Option<&str>) -> Result<Found, InputE
         if systems.is_empty() {
             continue;
         }
-        let environment = environment_of(table).ok_or_else(|| InputError::Unknown {
-            table: table.clone(),
-            known: registry::ids().collect::<Vec<_>>().join(", "),
-        })?;
         found
-            .entry(environment.to_owned())
+            .entry(content.environment.clone())
             .or_default()
             .extend(systems);
     }
@@ -316,13 +299,6 @@ fn tables(value: Value, name: &str, asked: Option<&str>) -> Result<Found, InputE
         });
     }
     Ok(found)
-}
-
-/// Finds a table's environment, which the file does not state, by the table's name: the first word of `lorel` or `kitchen-image` is a
-/// word of the environment's id.
-fn environment_of(table: &str) -> Option<&'static str> {
-    let first = table.split(['-', '_']).next()?;
-    registry::ids().find(|id| id.split('-').any(|word| word == first))
 }
 
 impl TableFound {
@@ -373,15 +349,15 @@ mod tests {
             "n_rate": 1.0, "n_rate_standard_error": 0.5, "k_rate": k_rate})
     }
 
-    fn tables_file(version: u64) -> Value {
+    fn tables_file(version: u32) -> Value {
         let row = serde_json::json!({"title": "LADS", "seeds": [0, 1], "splits": {"seen": split([0.75, 0.5, 0.25, 0.25])}});
         let waiting = serde_json::json!({"title": "LISA", "seeds": []});
-        let table = |measure: &str| {
-            serde_json::json!({"measure": measure, "jobs": [], "protocol": {"episodes_per_instruction": 10, "seed": 0, "noise": "v0"},
+        let table = |environment: &str, measure: &str| {
+            serde_json::json!({"environment": environment, "measure": measure, "jobs": [], "protocol": {"episodes_per_instruction": 10, "seed": 0, "noise": "v0"},
                 "tracks": [{"name": "paper", "rows": [row.clone(), waiting.clone()]}]})
         };
         serde_json::json!({"format": "lads-tables", "format_version": version,
-            "tables": {"kitchen": table("n_rate"), "lorel": table("success")}})
+            "tables": {"kitchen": table("franka-kitchen", "n_rate"), "lorel": table("lorel-table", "success")}})
     }
 
     fn parsed(value: &Value, table: Option<&str>) -> Result<Found, InputError> {
@@ -389,22 +365,20 @@ mod tests {
     }
 
     #[test]
-    fn tables_of_both_versions_are_read() {
-        for version in [1, 2] {
-            let found = parsed(&tables_file(version), None).unwrap();
-            let ids: Vec<&str> = found.keys().map(String::as_str).collect();
-            assert_eq!(ids, ["franka-kitchen", "lorel-table"]);
-            let [lads] = &found["franka-kitchen"][..] else {
-                panic!("what is not finished is left out");
-            };
-            assert_eq!((lads.name.as_str(), lads.splits.len()), ("LADS", 1));
-            assert_eq!(lads.group.as_deref(), Some("kitchen/paper"));
-            let score = &lads.splits[0].score;
-            assert_eq!(score.k_rate_interval[1], wilson(10, 20));
-            assert_eq!(score.full_success_interval, Interval(0.11, 0.47));
-            assert_eq!(lads.splits[0].commanded, Some(4));
-            assert_eq!(found["lorel-table"][0].splits[0].commanded, None);
-        }
+    fn tables_are_read_by_their_environment() {
+        let found = parsed(&tables_file(1), None).unwrap();
+        let ids: Vec<&str> = found.keys().map(String::as_str).collect();
+        assert_eq!(ids, ["franka-kitchen", "lorel-table"]);
+        let [lads] = &found["franka-kitchen"][..] else {
+            panic!("what is not finished is left out");
+        };
+        assert_eq!((lads.name.as_str(), lads.splits.len()), ("LADS", 1));
+        assert_eq!(lads.group.as_deref(), Some("kitchen/paper"));
+        let score = &lads.splits[0].score;
+        assert_eq!(score.k_rate_interval[1], wilson(10, 20));
+        assert_eq!(score.full_success_interval, Interval(0.11, 0.47));
+        assert_eq!(lads.splits[0].commanded, Some(4));
+        assert_eq!(found["lorel-table"][0].splits[0].commanded, None);
         let one = parsed(&tables_file(1), Some("lorel")).unwrap();
         assert_eq!(one.len(), 1);
     }
@@ -424,8 +398,8 @@ mod tests {
             None,
             &["'lads-sweep'", "lads-results", "lads-tables"],
         );
-        let newer = tables_file(3).to_string();
-        refused(&newer, None, &["version 3", "versions 1 to 2"]);
+        let newer = tables_file(2).to_string();
+        refused(&newer, None, &["version 2", "version 1"]);
         refused(
             r#"{"format": "lads-results", "format_version": 9}"#,
             None,
@@ -441,7 +415,5 @@ mod tests {
             Some("libero"),
             &["'libero'", "kitchen, lorel"],
         );
-        let other = tables_file(1).to_string().replace("kitchen", "tiny");
-        refused(&other, None, &["'tiny'", "franka-kitchen"]);
     }
 }

@@ -14,6 +14,7 @@ fn reply(plan: u32, logits: &[f32], margin: Option<f32>, action: f32) -> Reply {
         decided: !logits.is_empty(),
         plan: Some(plan),
         logits: logits.to_vec(),
+        plan_vector: Vec::new(),
         margin,
         action: vec![action],
     }
