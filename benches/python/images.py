@@ -1,7 +1,7 @@
 """Measures control steps of policies that see images beside ONNX Runtime on the same graph: one thread, hot, in turns.
 
-    cargo build --release -p lads-benches --bin images
-    python benches/python/images.py target/release/images BUNDLE.onnx... [FORMAT...]
+    cargo build --release -p lads-benches --bin steps
+    python benches/python/images.py target/release/steps BUNDLE.onnx... [FORMAT...]
 
 Formats are those of weights, such as int16, beside 32-bit floats. In each round every contender gets a block of steps, and a ratio is taken between two medians of the same round; printed are the medians
 of all blocks' medians and of the ratios, with quartiles. Times are those in which the thread ran, so that a busy machine changes them

@@ -1,9 +1,9 @@
-//! Runs a policy that sees images, hot, for `python/images.py`, which lets it take turns with ONNX Runtime.
+//! Runs a policy, hot, for `python/images.py` and `python/families.py`, which let it take turns with ONNX Runtime.
 //!
-//! usage: images BUNDLE.onnx [FORMAT...], formats of weights, of which 32-bit floats are the first in any case.
+//! usage: steps BUNDLE.onnx [FORMAT...], formats of weights, of which 32-bit floats are the first in any case.
 //!
 //! Prints a line for each instruction set that this CPU offers and each format. Then each line of its input, one of these and a number, is
-//! that many control steps of the golden episode, answered by a line of their nanoseconds, in which the thread ran. A format with which the golden episode is not
+//! that many control steps of the golden episode, which begins anew after its last, answered by a line of their nanoseconds, in which the thread ran. A format with which the golden episode is not
 //! replayed is measured too, and said on stderr. What can fail ends with one line on stderr and exit code 2.
 #![forbid(unsafe_code)]
 
@@ -13,7 +13,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use lads_compiler::{Bundle, Options, Storage, WeightFormat, compile_with, named};
-use lads_core::{Isa, Policy};
+use lads_core::{Instruction, Isa, Policy};
 use lads_host::Memory;
 use rustix::time::{ClockId, clock_gettime};
 
@@ -62,7 +62,6 @@ fn run() -> Result<(), Box<dyn Error>> {
         if let Err(error) = controller.self_test() {
             eprintln!("{name}: {error}");
         }
-        controller.reset();
         controllers.push((name, policy, controller));
     }
     let mut out = std::io::stdout().lock();
@@ -77,9 +76,15 @@ fn run() -> Result<(), Box<dyn Error>> {
         let found = controllers.iter_mut().find(|(known, ..)| known == name);
         let (_, policy, controller) = found.ok_or("a contender that is not there")?;
         let golden = policy.golden().ok_or("the bundle has no golden episode")?;
+        if let Some(id) = golden.instruction() {
+            controller.set_instruction(Instruction::Id(id))?;
+        }
         let mut action = vec![0.0; policy.contract().action_len()];
         let mut took = vec![];
         for i in 0..count.parse()? {
+            if i % golden.len() == 0 {
+                controller.reset();
+            }
             let step = golden.step(i % golden.len()).ok_or("no step")?;
             let start = ran_ns();
             controller.step_with(step.observations(), &mut action)?;
