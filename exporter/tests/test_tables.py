@@ -141,6 +141,7 @@ def test_a_job_is_its_inputs(folder):
         (("published = {}", "published = { third = [1.0] }"), "the paper has no split 'third'"),
         (('id = "lang_dt"', 'id = "lads"'), "system 'lads' stands twice"),
         (('measure = "n_rate"', 'measure = "rate"'), "measure = 'rate': must be one of success, n_rate"),
+        (('id = "lads"', 'id = "lads"\nsweep = { horizon = "5" }'), "system 'lads': sweep = .*: must be numbers by name"),
         (("seeds = [0, 1]", "seeds = [0, -1]"), "seeds of 'paper': must be lists of whole numbers from 0 on"),
         (("[[track]]", "[track]"), r"tracks are a list of tables, \[\[track\]\]"),
         (("episodes = 5", "episode = 5"), "unknown key 'episode'; key 'episodes' is missing"),

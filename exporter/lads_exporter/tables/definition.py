@@ -37,6 +37,7 @@ class System:
     tracks: list = dataclasses.field(default_factory=list)  # none: all
     weights: str = ""  # trains nothing: takes the run of this system, and exports it with its own configuration
     seeds: dict = dataclasses.field(default_factory=dict)  # track -> seeds of its own
+    sweep: dict = dataclasses.field(default_factory=dict)  # what a figure of several sizes varies -> its value here
 
     @property
     def trained(self):
@@ -127,6 +128,8 @@ def _check(table, path):
     for row in table.systems:
         problems += [f"system {row.id!r}: unknown track {name!r}; known: {', '.join(tracks)}" for name in [*row.tracks, *row.seeds] if name not in tracks]
         problems += [f"system {row.id!r}: the paper has no split {name!r}" for name in row.published if name not in table.splits]
+        if not all(type(value) in (int, float) for value in row.sweep.values()):
+            problems.append(f"system {row.id!r}: sweep = {row.sweep!r}: must be numbers by name")
         if row.weights and row.weights not in ids:
             problems.append(f"system {row.id!r}: weights = {row.weights!r}: unknown system; known: {', '.join(ids)}")
     for track in table.tracks:

@@ -86,6 +86,7 @@ def entry(table, place, jobs, uniform):
             own = [(job.seed, found) for job, found in jobs if job.track == track and job.system == system]
             done = [(seed, found) for seed, found in own if found]
             row = {"id": system.id, "title": system.title, "published": system.published, "seeds_asked": [seed for seed, _ in own]}
+            row |= {"sweep": system.sweep} if system.sweep else {}
             row |= {"seeds": [seed for seed, _ in done], "bundle_sha256": [found["bundle_sha256"] for _, found in done]}
             if done:
                 row["training_s"] = statistics.mean(found["training_s"] for _, found in done)

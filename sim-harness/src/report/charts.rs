@@ -179,6 +179,32 @@ pub fn successes(title: &str, series: &[Series<'_>]) -> Vec<Chart> {
     vec![chart(plots, layout)]
 }
 
+/// A point of a curve: where it stands, its value and the interval of that.
+pub type Point = (f64, f64, Interval);
+
+/// Draws values by a size, Figure 6 of the paper: one line for each of the named curves; `None` without any.
+pub fn curves(size: &str, measure: &str, curves: &[(&str, Vec<Point>)]) -> Option<Chart> {
+    let plots: Vec<Plot> = curves
+        .iter()
+        .zip(COLORS.iter().cycle())
+        .map(|((name, points), &color)| {
+            LinePlot::new()
+                .with_color(color)
+                .with_data(points.iter().map(|&(x, value, _)| (x, value)))
+                .with_y_err_asymmetric(points.iter().map(|&(_, value, bounds)| arms(value, bounds)))
+                .with_stroke_width(2.5)
+                .with_legend(*name)
+                .into()
+        })
+        .collect();
+    let layout = sized(&plots, size, HALF, 340.0)
+        .with_x_label(size)
+        .with_y_label(measure)
+        .with_x_axis_min(0.0)
+        .with_y_axis_min(0.0);
+    (!plots.is_empty()).then(|| chart(plots, layout))
+}
+
 /// Rounds `value` up to the next number that is easy to read: 1, 2, 2.5 or 5 times a power of ten.
 fn round_up(value: f64) -> f64 {
     let power = 10_f64.powf(value.max(f64::MIN_POSITIVE).log10().floor());

@@ -1,11 +1,16 @@
 //! Renders `lads-run report`: one page about several policies in one environment, from bundles that ran, results and tables.
 
+use std::collections::{BTreeMap, BTreeSet};
+
 use askama::Template;
 
 use super::charts::{self, Chart, Series};
 use super::figures::{self, Behaviour, Figure};
 use super::{Number, numbers};
-use lads_proof::metrics::{K_RATES, Score};
+use lads_proof::metrics::{Interval, K_RATES, Score};
+
+/// Quantile of a standard normal number: 95 % lie within it.
+const Z: f64 = 1.96;
 
 /// Scores of a system on one split.
 #[derive(Debug, Clone, PartialEq)]
@@ -33,6 +38,8 @@ pub struct System {
     pub policies: usize,
     /// Scores by split.
     pub splits: Vec<Split>,
+    /// What the systems of a sweep differ in, with this one's value; empty of others.
+    pub sweep: BTreeMap<String, f64>,
     /// What the policy did.
     pub behaviour: Behaviour,
 }
@@ -82,7 +89,11 @@ impl Comparison<'_> {
             inputs: self.inputs().collect(),
             grouped: self.systems.iter().any(|it| it.group.is_some()),
             rows: self.rows(),
-            figures: vec![self.rates(), paths, plans, figures::words(&policies)],
+            figures: [self.rates()]
+                .into_iter()
+                .chain(self.sizes())
+                .chain([paths, plans, figures::words(&policies)])
+                .collect(),
         };
         page.render()
     }
@@ -163,6 +174,41 @@ impl Comparison<'_> {
         Figure::new("K-rates", about, charts)
     }
 
+    /// Draws Figure 6 of the paper: the score by each size that systems were trained in several of; `None` without any.
+    fn sizes(&self) -> Option<Figure> {
+        let keys: BTreeSet<&String> = self.systems.iter().flat_map(|it| it.sweep.keys()).collect();
+        let charts = keys.into_iter().filter_map(|key| {
+            let whole = |split: &Split| split.commanded.is_none_or(|commanded| commanded < 2);
+            let splits = self.splits();
+            let successes = splits
+                .iter()
+                .all(|&name| self.on(name).all(|it| whole(it.1)));
+            let curves = splits.iter().map(|&name| {
+                let points = self.on(name).filter_map(|(system, split)| {
+                    let score = &split.score;
+                    let of_success = (score.full_success?, score.full_success_interval);
+                    let (rate, bounds) = if successes {
+                        of_success
+                    } else {
+                        let half = Z * score.n_rate_standard_error.unwrap_or(0.0);
+                        let rate = score.n_rate?;
+                        (rate, Interval(rate - half, rate + half))
+                    };
+                    Some((*system.sweep.get(key)?, rate, bounds))
+                });
+                let mut points: Vec<_> = points.collect();
+                points.sort_by(|a, b| a.0.total_cmp(&b.0));
+                (name, points)
+            });
+            let curves: Vec<_> = curves.filter(|(_, points)| points.len() > 1).collect();
+            let measure = if successes { "success rate" } else { "N-rate" };
+            charts::curves(key, measure, &curves)
+        });
+        let charts: Vec<_> = charts.collect();
+        let about = "Figure 6 of the paper: one policy of each size, with 95 % intervals of its episodes; what another training would give is not in them.";
+        (!charts.is_empty()).then(|| Figure::new("Sizes", about, charts))
+    }
+
     fn rates_of(&self, name: &str, group: Option<&str>) -> Vec<Chart> {
         let own = |system: &System| {
             let own = system.group.as_deref();
@@ -228,6 +274,7 @@ mod tests {
             group: group.map(str::to_owned),
             facts: String::new(),
             policies: 1,
+            sweep: BTreeMap::new(),
             splits: vec![Split {
                 name: "seen".to_owned(),
                 score: Score::of([outcome(1), outcome(0)]),
@@ -260,6 +307,37 @@ mod tests {
                 "{commanded:?}"
             );
         }
+    }
+
+    #[test]
+    fn sizes_are_curves_by_what_they_vary() {
+        let sized = |name: &str, sizes: &[(&str, f64)]| {
+            let sizes = sizes.iter().map(|&(key, value)| (key.to_owned(), value));
+            System {
+                sweep: sizes.collect(),
+                ..system(name, Some("sizes/x"), Some(4))
+            }
+        };
+        let figure = |systems| {
+            let environment = "e";
+            let comparison = Comparison {
+                environment,
+                systems,
+            };
+            comparison.sizes()
+        };
+        let base = sized("base", &[("horizon", 10.0), ("codes", 40.0)]);
+        assert!(figure(vec![base.clone()]).is_none(), "one size is no curve");
+        let more = vec![
+            base,
+            sized("H", &[("horizon", 5.0)]),
+            sized("M", &[("codes", 20.0)]),
+            system("other", None, Some(4)),
+        ];
+        let charts = figure(more).unwrap().charts;
+        assert_eq!(charts.len(), 2);
+        assert!(charts[0].svg.contains(">codes<") && charts[1].svg.contains(">horizon<"));
+        assert!(charts[1].svg.contains(">N-rate<"));
     }
 
     #[test]

@@ -179,6 +179,7 @@ fn results(value: Value, name: &str) -> Result<Found, InputError> {
             file.episodes_per_instruction,
         ),
         policies: 1,
+        sweep: BTreeMap::new(),
         splits: names.iter().filter_map(split).collect(),
         behaviour: Behaviour {
             compositions: Err(RESULTS.to_owned()),
@@ -238,6 +239,8 @@ struct TrackFound {
 struct RowFound {
     title: String,
     seeds: Vec<u64>,
+    #[serde(default)]
+    sweep: BTreeMap<String, f64>,
     /// Absent until a seed is finished.
     splits: Option<BTreeMap<String, SplitFound>>,
 }
@@ -319,6 +322,7 @@ impl TableFound {
                     track.name
                 ),
                 policies: row.seeds.len(),
+                sweep: row.sweep.clone(),
                 splits: splits
                     .map(|(name, split)| Split {
                         name: name.clone(),

@@ -199,6 +199,7 @@ mod with {
                 results.episodes_per_instruction,
             ),
             policies: 1,
+            sweep: BTreeMap::new(),
             splits: splits(&results),
             behaviour: Behaviour::of(evaluation.contract, traces, &drawn, &results),
         })
