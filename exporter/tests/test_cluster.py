@@ -17,6 +17,8 @@ import tiny_table
 os.environ |= {"RAY_AUTH_MODE": "disabled", "RAY_USAGE_STATS_ENABLED": "0", "PYTHONPATH": tiny_table.python_path()}
 ray = pytest.importorskip("ray", reason="ray is not installed")
 
+import yaml
+from lads_exporter import __main__ as main
 from lads_exporter import dataset
 from lads_exporter.config import UserError
 from lads_exporter.tables import jobs, node, on_ray
@@ -120,6 +122,22 @@ def test_a_node_without_mujoco_is_named_and_the_others_go_on(folder, cluster):
     assert [row["seed"] for row in json.loads((folder / "models/tables.json").read_text())["tables"]["tiny"]["jobs"]] == [0, 1]
 
 
+def test_a_node_without_the_project_is_named_and_gets_nothing_else(folder, cluster, monkeypatch):
+    other = folder / "other/lads_exporter"
+    other.mkdir(parents=True)
+    (other / "__init__.py").write_text("raise ImportError('of another time')\n")
+    monkeypatch.chdir(folder)
+    cluster.add_node(**NODE, env_vars={"PYTHONPATH": str(other.parent)})
+    place = jobs.Place(folder / "runs", folder / "tiny.safetensors", "", folder / "lads-run")
+    with on_ray.OnRay(place) as engine:
+        engine.unfit[cluster.head_node.node_id] = "busy"
+        command = Command(sys.executable, ["-c", "pass"], [], [], folder / "log.txt")
+        with pytest.raises(UserError, match=r"node at [\d.]+: .*of another time; it needs the project"):
+            engine.run(command)
+        with pytest.raises(UserError, match="no node is left that can run it: .*of another time"):
+            engine.run(command)
+
+
 # Leaves a checkpoint when it is told to end, as a training does.
 PATIENT = """
 import signal, sys, time
@@ -204,3 +222,13 @@ def test_a_cluster_that_is_not_there_is_named(folder, monkeypatch):
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:9")
     with pytest.raises(UserError, match="no Ray at RAY_ADDRESS=127.0.0.1:9: .*refused.*; start one with: ray start --head"):
         tiny_table.play(folder, engine="ray")
+
+
+def test_what_ships_for_slurm_and_kubernetes_is_sound():
+    """Tests the form of both, and that what they run is a command; which fields there are, only the operator knows."""
+    beside = Path(__file__).parents[1]
+    subprocess.run(["bash", "-n", beside / "cluster/slurm.sh"], check=True)
+    manifest = yaml.safe_load((beside / "cluster/kuberay.yaml").read_text())
+    entrypoint = manifest["spec"]["entrypoint"].split()
+    assert entrypoint[1:3] == ["-m", "lads_exporter"] and main._parser().parse_args(entrypoint[3:]).engine == "ray"
+    assert f"ray=={manifest['spec']['rayClusterSpec']['rayVersion']} " in (beside / "cluster.lock").read_text()

@@ -18,6 +18,8 @@ from tiny_table import TABLE, play
 from lads_exporter import config, dataset
 from lads_exporter.config import UserError
 from lads_exporter.tables import definition, jobs, render
+from lads_exporter.tables.commands import Command
+from lads_exporter.tables.local import Local
 
 
 @pytest.fixture
@@ -152,6 +154,13 @@ def test_a_bad_table_is_refused_before_anything_runs(folder, change, message):
     with pytest.raises(UserError, match=message):
         play(folder)
     assert not (folder / "runs").exists()
+
+
+def test_a_command_takes_one_thread_whatever_the_machine_has(tmp_path, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    log = tmp_path / "log.txt"
+    Local().run(Command(sys.executable, ["-c", "import os; print(os.environ['OMP_NUM_THREADS'])"], [], [], log))
+    assert log.read_text() == "1\n"
 
 
 def test_an_unknown_kind_of_system_is_named(folder):

@@ -12,6 +12,8 @@ from pathlib import Path
 
 from ..config import UserError
 
+# Sums of an export too depend on the number of threads, which PyTorch takes from the machine unless it is told.
+ENVIRONMENT = {"OMP_NUM_THREADS": "1"}
 INTERRUPTED = 130  # exit code of a command that kept its state
 
 

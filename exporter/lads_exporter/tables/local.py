@@ -3,10 +3,11 @@
 `stop` may be called by a signal's handler; it ends the processes in good order, and trainings keep their checkpoints.
 """
 
+import os
 import subprocess
 import threading
 
-from .commands import INTERRUPTED, Stopped
+from .commands import ENVIRONMENT, INTERRUPTED, Stopped
 
 
 class Local:
@@ -25,7 +26,7 @@ class Local:
             if self.stopped:
                 raise Stopped
             with open(command.log, "ab") as file:
-                process = subprocess.Popen(command.line(), stdout=file, stderr=subprocess.STDOUT, start_new_session=True)
+                process = subprocess.Popen(command.line(), stdout=file, stderr=subprocess.STDOUT, start_new_session=True, env=os.environ | ENVIRONMENT)
             self.running.add(process)
         code = process.wait()
         with self.lock:

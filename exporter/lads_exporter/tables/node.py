@@ -8,6 +8,7 @@ wrong is told in the outcome.
 import ctypes
 import hashlib
 import importlib.metadata
+import os
 import signal
 import socket
 import subprocess
@@ -18,7 +19,7 @@ from pathlib import Path
 
 from .. import dataset, language
 from ..config import UserError
-from .commands import INTERRUPTED
+from .commands import ENVIRONMENT, INTERRUPTED
 
 CHECK = 0.3  # seconds between two looks at a process; an interrupt is seen in between
 PR_SET_PDEATHSIG = 1  # of Linux, linux/prctl.h
@@ -130,7 +131,8 @@ def _finish(line, log):
     # Where the node is lost, its command is begun anew elsewhere: what is left of it must not go on.
     tie = (lambda: dying(PR_SET_PDEATHSIG, signal.SIGKILL)) if dying else None
     with open(log, "wb") as file:
-        process = subprocess.Popen(line, stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, start_new_session=True, preexec_fn=tie)
+        streams = {"stdin": subprocess.DEVNULL, "stdout": file, "stderr": subprocess.STDOUT}
+        process = subprocess.Popen(line, **streams, env=os.environ | ENVIRONMENT, start_new_session=True, preexec_fn=tie)
     try:
         while True:
             try:

@@ -10,6 +10,7 @@ import hashlib
 import json
 import logging
 import os
+import re
 import socket
 import sys
 import threading
@@ -85,7 +86,7 @@ class OnRay:
                     called_off = True
                     _call_off(left)
                 for task in done:
-                    yield left.pop(task), _outcome(task)
+                    yield left.pop(task), self._outcome(task)
         finally:
             if not called_off:
                 _call_off(left)
@@ -131,6 +132,20 @@ class OnRay:
             raise UserError("no node is left that can run it: " + "; ".join(self.unfit.values()))
         return {"ray.io/node-id": f"!in({','.join(self.unfit)})"}
 
+    def _outcome(self, task):
+        try:
+            return ray.get(task)
+        except ray.exceptions.TaskCancelledError as error:
+            raise Stopped from error
+        except ray.exceptions.RayTaskError as error:
+            # It did not come as far as to name its node; Ray knows the address.
+            address = re.search(r"ip=([\w.:]+)", str(error))
+            problem = f"node at {address[1] if address else 'an unknown address'}: {_line(error)}; it needs the project, installed, in the version that runs the table"
+            self.unfit |= {row["NodeID"]: problem for row in ray.nodes() if address and row["NodeManagerAddress"] == address[1]}
+            raise UserError(problem) from error
+        except ray.exceptions.RayError as error:
+            raise UserError(f"Ray: {_line(error)}") from error
+
     def _judge(self, command, outcome):
         with open(command.log, "a") as log:
             log.write(f"on {outcome.node}:\n{outcome.output or outcome.problem}\n")
@@ -165,17 +180,6 @@ def _knock(address):
 def _alive():
     """Lists the cluster's nodes -> {id: host}."""
     return {row["NodeID"]: row["NodeManagerHostname"] for row in ray.nodes() if row["Alive"]}
-
-
-def _outcome(task):
-    try:
-        return ray.get(task)
-    except ray.exceptions.TaskCancelledError as error:
-        raise Stopped from error
-    except ray.exceptions.RayTaskError as error:
-        raise UserError(f"node at {error.ip}: {_line(error)}; it needs the project under the same path, installed, in the same version") from error
-    except ray.exceptions.RayError as error:
-        raise UserError(f"Ray: {_line(error)}") from error
 
 
 def _call_off(tasks):
