@@ -403,7 +403,7 @@ mod tests {
             &["'lads-sweep'", "lads-results", "lads-tables"],
         );
         let newer = tables_file(2).to_string();
-        refused(&newer, None, &["version 2", "version 1"]);
+        refused(&newer, None, &["version 2", "reads 1"]);
         refused(
             r#"{"format": "lads-results", "format_version": 9}"#,
             None,
