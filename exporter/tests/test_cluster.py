@@ -82,7 +82,8 @@ def without_times(tables):
 
 
 def test_a_lost_node_changes_no_number(folder, cluster, capsys):
-    lost = cluster.add_node(**NODE)
+    # What lies in its temporary folder when it is killed stays there.
+    lost = cluster.add_node(**NODE, env_vars={"TMPDIR": str(folder)})
     pid, killed = raylet(lost), []
 
     def kill():

@@ -15,7 +15,6 @@ from lads_exporter import bundle, config, contract as contracts, dataset, langua
 from lads_exporter.codebook import nearest
 from lads_exporter.kinds import denoising
 from lads_exporter.systems import averaging, cluster, folding, lisa, vae
-from lads_exporter.tables import definition
 from lads_exporter.training import Stage, Trainer
 
 DIFFUSION = {"steps": 150, "batch": 64, "learning_rate": 1e-2, "warmup": 5, "final": 0.1, "weight_decay": 0.0}
@@ -324,11 +323,6 @@ def test_a_system_layer_replaces_the_system_and_only_values_that_are_there():
     for change, named in (({"kind": "nonsense"}, "unknown system; known: lads, vae"), ({"kind": "lisa"}, "low_level_layers"), ({"kind": "lang_dt", "beta": 1.0}, "unknown key 'beta'")):
         with pytest.raises(config.UserError, match=named):
             config.from_tables(tables[0] | {"system": change}, *tables[1:], "test")
-
-
-@pytest.mark.parametrize("table", ["kitchen", "kitchen-sizes", "lorel", "lorel-image"])
-def test_every_table_that_ships_is_sound(table):
-    assert definition.load(f"tables/{table}.toml").systems
 
 
 @pytest.mark.parametrize("environment", ["lorel", "kitchen", "lorel-image"])

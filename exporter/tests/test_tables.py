@@ -183,10 +183,14 @@ def test_wilson_interval():
 
 
 def test_the_tables_that_ship_are_sound():
-    for name in ("kitchen", "lorel"):
+    both, states = ["shipping", "paper"], {"lads", "lang_dt", "lisa", "vae", "cluster"}
+    rows = {"kitchen": (both, states), "lorel": (both, states), "lorel-image": (["shipping"], states - {"cluster"}), "kitchen-sizes": (["shipping"], {"base"})}
+    for name, (tracks, systems) in rows.items():
         table = definition.load(f"tables/{name}.toml")
-        assert [track.name for track in table.tracks] == ["shipping", "paper"]
-        assert {row.id for row in table.systems} >= {"lads", "lang_dt", "lisa", "vae", "cluster"}
+        assert [track.name for track in table.tracks] == tracks
+        assert {row.id for row in table.systems} >= systems
+        files = [path for track in table.tracks for row in table.rows(track) for path in table.configuration(track, row)]
+        assert all(path.is_absolute() and ".." not in path.parts for path in files)
 
 
 def test_systems_with_a_camera_share_the_encoder(folder):

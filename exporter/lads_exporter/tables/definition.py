@@ -4,6 +4,7 @@ Everything in it is checked before anything runs: unknown keys, systems and conf
 """
 
 import dataclasses
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,7 +61,8 @@ class Table:
     frames: str = ""  # of the dataset's states, for systems that observe by a camera
 
     def path(self, name):
-        return self.folder / name
+        """Returns a whole path, which means the same in every folder that a command runs in."""
+        return Path(os.path.normpath(self.folder / name))
 
     def system(self, id):
         return next(row for row in self.systems if row.id == id)
@@ -106,7 +108,7 @@ def load(path):
     table["evaluation"] = _row(Evaluation, table["evaluation"], f"{path}[evaluation]")
     for key, many in (("track", "tracks"), ("system", "systems")):
         table[many] = [_row(parts[key], row, f"{path}[[{key}]] {row.get('id', row.get('name', ''))}") for row in table.pop(key)]
-    found = _row(Table, table | {"folder": path.parent}, path)
+    found = _row(Table, table | {"folder": path.parent.resolve()}, path)
     _check(found, path)
     return found
 

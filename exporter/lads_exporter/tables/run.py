@@ -67,6 +67,7 @@ def floor(table, place, jobs, engine):
 
 
 def open_engine(name, place, at_once):
+    """Makes the engine that runs the jobs' commands; Ray is imported where it is asked for only."""
     if name == "local":
         return Local(at_once or 1)
     from .on_ray import OnRay
