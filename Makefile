@@ -9,7 +9,7 @@ ARGS   ?=
 JOB    ?=
 INPUTS ?= models/lorel.onnx models/lorel-image.results.json
 ENV    ?= kitchen
-DATA   ?= data/$(ENV).safetensors
+DATA   ?= data/$(ENV:-sizes=).safetensors
 COLLECT_kitchen := --episodes-per-instruction 50
 COLLECT_lorel   := --episodes 50000
 COLLECT_lorel-image := --episodes 3000
@@ -242,7 +242,7 @@ train: $(VENV)/stamp
 export: $(VENV)/stamp
 	$(PY) -m lads_exporter export --run runs/$(ENV) -o models/$(ENV).onnx
 
-## table: every system of the paper's tables, ENV=kitchen, lorel or lorel-image: trained, exported, evaluated, into models/TABLES.md; hours, and the
+## table: every system of the paper's tables, ENV=kitchen, lorel, lorel-image or kitchen-sizes (Figure 6): trained, exported, evaluated, into models/TABLES.md; hours, and the
 ##        same command goes on where it was stopped. TABLE_ARGS="--jobs 2" trains two at a time, "--engine ray" on a cluster (docs/cluster.md)
 table: setup $(VENV)/stamp $(DATA) $(if $(filter %-image,$(ENV)),$(DATA:.safetensors=.frames))
 	cargo build --release -p lads-sim $(if $(filter %-image,$(ENV)),--features camera) --bin lads-run
@@ -252,7 +252,7 @@ table: setup $(VENV)/stamp $(DATA) $(if $(filter %-image,$(ENV)),$(DATA:.safeten
 	$(MAKE) frames DATA=$*.safetensors
 
 $(DATA):
-	$(MAKE) collect ENV=$(ENV)
+	$(MAKE) collect ENV=$(ENV:-sizes=)
 
 ## reference: the policy of $(MODEL) in PyTorch and the official environment, 20 episodes of each instruction, for `lads-run verify`;
 ##         ARGS="--noise none" on the LOReL table; a policy with a camera needs the built program, which draws for it (--lads-run)

@@ -194,7 +194,7 @@ MEASURES = {
 def markdown(found):
     """Renders TABLES.md."""
     lines = ["# The paper's tables", ""]
-    lines += ["Every system trained here, exported as one bundle, and run by the same runtime in `lads-run`. Written by `make table ENV=kitchen|lorel`"]
+    lines += ["Every system trained here, exported as one bundle, and run by the same runtime in `lads-run`. Written by `make table`"]
     lines += ["(`python -m lads_exporter table`) from tables.json; do not edit. The paper's numbers stand beside ours, on other data than its own."]
     for name, table in found["tables"].items():
         asked = table["protocol"]
