@@ -122,7 +122,7 @@ def _export(arguments):
         raise UserError(f"{arguments.run} was trained with other weights of {encoded.encoder}")
     system = systems.of(setting.config)
     networks = system.Networks(setting, encoded)
-    networks.load_state_dict(saved["networks"])
+    training.load_networks(networks, saved["networks"], arguments.run)
     names = system.Training.stages(setting.config)
     provenance = {
         "dataset_sha256": identity["dataset_sha256"],

@@ -94,14 +94,15 @@ def golden_tensors(rollout, instruction, channels):
 
 
 def golden(model, candidates):
-    """Records the first candidate whose decisions are clear, or the clearest one, as safetensors bytes. `model` has its contract in it.
+    """Records the first candidate whose decisions are clear, or the clearest one, as safetensors bytes. `model` has its contract in it. Where none
+    is clear to its end, the one that is for longest is recorded up to there.
 
     A candidate is an instruction's index, None for a policy without, and {name of a channel: [T, ...]}, or the array of the one
     observation. An episode longer than the context is cut; a close decision would make the self-test depend on rounding.
     """
     runner = twin.Twin(model)
     rows = {row["name"]: row for row in contracts.of_role(runner.contract, "observation")}
-    best, clearest = 0.0, None
+    best, clearest, longest = 0.0, None, (0, None, None)
     tried = 0
     for instruction, given in candidates:
         given = given if isinstance(given, dict) else {next(iter(rows)): given}
@@ -113,6 +114,12 @@ def golden(model, candidates):
             best, clearest = rollout.margin, golden_tensors(rollout, instruction, channels)
         if best >= GOLDEN_MARGIN:
             break
+        longest = max(longest, (rollout.clear_until(LEAST_MARGIN), instruction, channels), key=lambda row: row[0])
+    steps, instruction, channels = longest
+    if best < LEAST_MARGIN and steps:
+        channels = {name: rows[:steps] for name, rows in channels.items()}
+        rollout = twin.open_loop(runner, instruction, channels)
+        best, clearest = rollout.margin, golden_tensors(rollout, instruction, channels)
     if best < LEAST_MARGIN:
         raise UserError(
             f"none of {tried} episodes decides with a margin of {LEAST_MARGIN} at every decision (best {best:.4f}); train longer or give more episodes"

@@ -190,6 +190,10 @@ def write(bundle, output, run=None, over=(), episodes=20, traced=2, seed=0, nois
     """
     if episodes < 1 or not 1 <= traced <= episodes:
         raise config.UserError(f"{episodes} episodes of which {traced} traced: give at least 1 of each, and no more traced than episodes")
+    if not 0 <= seed < 1 << 64:
+        raise config.UserError(f"--seed {seed}: must be a whole number from 0 to 2^64 - 1")
+    if Path(output).is_dir() or not Path(output).absolute().parent.is_dir():
+        raise config.UserError(f"{output}: it is a folder, or lies in none; name a file in a folder that is there")
     data = Path(bundle).read_bytes()
     try:
         model = onnx.load_from_string(data)

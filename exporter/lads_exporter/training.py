@@ -33,6 +33,8 @@ from .frames import FrameCorpus
 from .hindsight import relabel
 from .systems.sighted import FRAMES
 
+# What reading a damaged file with PyTorch ends with.
+UNREADABLE = (OSError, RuntimeError, EOFError, ValueError, TypeError, LookupError, AttributeError, pickle.UnpicklingError)
 LOG_EVERY, VALIDATE_EVERY, SAVE_SECONDS = 50, 500, 120
 CHECKPOINT, CURVES, SUMMARY = "checkpoint.pt", "curves.csv", "summary.json"
 COLUMNS = ("stage", "step", "learning_rate", "ms_per_step", "loss", "bc", "commitment", "align", "ce", "kl", "noise", "language", "perplexity",
@@ -139,7 +141,7 @@ class Trainer:
         for key, value in self.identity.items():
             if saved["identity"][key] != value:
                 raise UserError(f"{path} was made with another {key.removesuffix('_sha256')}; train into a new folder")
-        self.networks.load_state_dict(saved["networks"])
+        load_networks(self.networks, saved["networks"], path)
         self.position, self.curves, self.seconds = saved["position"], saved["curves"], saved["seconds"]
         return saved["optimizer"]
 
@@ -279,12 +281,13 @@ class SharedEncoder:
         try:
             saved = torch.load(self.path, map_location=self.trainer.corpus.device, weights_only=True)
             made_of, frames, state, seconds = (saved[key] for key in ("made_of", "frames", "state", "seconds"))
-        except (OSError, RuntimeError, EOFError, ValueError, TypeError, KeyError, pickle.UnpicklingError) as error:
+            seconds = float(seconds)
+        except UNREADABLE as error:
             raise UserError(f"{self.path}: no encoder of frames ({type(error).__name__}); it stays as it is: move it away to train one") from error
         if made_of != self.made_of:
             raise UserError(f"{self.path}: its encoder was made with another configuration, dataset or seed; name another file")
-        self.trainer.networks.frames.load_state_dict(frames)
-        self.trainer.networks.state.load_state_dict(state)
+        load_networks(self.trainer.networks.frames, frames, self.path)
+        load_networks(self.trainer.networks.state, state, self.path)
         self.trainer.seconds[FRAMES] = seconds
         return True
 
@@ -324,11 +327,23 @@ def _read(path, device="cpu"):
     """Reads a checkpoint's contents."""
     try:
         saved = torch.load(path, map_location=device, weights_only=True)
-    except (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError) as error:
+    except UNREADABLE as error:
         raise UserError(f"{path}: half written or damaged ({type(error).__name__}); it stays as it is: move its folder away and train anew") from error
-    if not isinstance(saved, dict) or "networks" not in saved:
-        raise UserError(f"{path} was made by an earlier version of this exporter; train it again")
+    try:
+        saved["networks"], saved["identity"]["tables"], saved["position"]["stage"]
+    except (KeyError, TypeError, IndexError) as error:
+        raise UserError(f"{path} is damaged, or was made by an earlier version of this exporter ({error!r}); train it again") from error
     return saved
+
+
+def load_networks(networks, state, path):
+    """Loads weights, which must be those of these networks and finite."""
+    try:
+        networks.load_state_dict(state)
+    except (RuntimeError, TypeError, AttributeError) as error:
+        raise UserError(f"{path}: its weights are not those of its configuration ({str(error).splitlines()[0]}); it is damaged: train it again") from error
+    if not all(bool(torch.isfinite(value).all()) for value in networks.state_dict().values() if value.is_floating_point()):
+        raise UserError(f"{path}: a weight is not a finite number; it is damaged: train it again")
 
 
 def load_run(folder, *over):

@@ -358,7 +358,7 @@ class Rollout:
 
     def __init__(self, twin):
         self.twin, self.count = twin, _len_of_noise(twin.contract)
-        self.actions, self.selected, self.margins, self.logits, self.draws = [], [], [], [], []
+        self.actions, self.selected, self.margins, self.decided_at, self.logits, self.draws = [], [], [], [], [], []
 
     def step(self, channels):
         action, index = self.twin.step(channels)
@@ -370,11 +370,17 @@ class Rollout:
         if self.twin.fresh:
             best = np.sort(self.twin.logits)[-2:]
             self.margins.append(float(best[1] - best[0]))
+            self.decided_at.append(len(self.actions) - 1)
 
     @property
     def margin(self):
         """Returns the smallest lead of the best over the second best logit at any selection."""
         return min(self.margins, default=float("inf"))
+
+    def clear_until(self, margin):
+        """Returns the number of steps before the first selection with a smaller lead."""
+        close = (step for step, lead in zip(self.decided_at, self.margins) if lead < margin)
+        return next(close, len(self.actions))
 
     def tensors(self):
         """Returns `actions` [T, A], and where there are any `selected` [T] and `noise` [T, N]: all draws of a step in order, then zeros."""

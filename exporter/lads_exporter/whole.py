@@ -221,7 +221,7 @@ def _trained(model, contract, run, over):
     encoded = language.encode(setting.config.language, [row["text"] for row in setting.instructions])
     system = systems.of(setting.config)
     networks = system.Networks(setting, encoded)
-    networks.load_state_dict(saved["networks"])
+    training.load_networks(networks, saved["networks"], run)
     networks.eval()
     if not _alike(_weights(system.export(networks, setting, encoded).model), _weights(model)):
         raise UserError(f"{run} is not the run that the bundle was exported from; name that one, and with --system what it was exported with")

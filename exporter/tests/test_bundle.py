@@ -197,3 +197,20 @@ def test_close_decisions_make_no_golden_episode(tiny):
             tensor.raw_data = bytes(len(tensor.raw_data))
     with pytest.raises(UserError, match="margin"):
         bundle.golden(flat, [(0, random_policy.observations(setting, 8, 0))])
+
+
+def test_an_episode_is_recorded_up_to_its_first_close_decision(tiny, monkeypatch):
+    setting, _, _, model = tiny
+    seen = random_policy.observations(setting, setting.config.high_level.context_steps, 3)
+    whole = open_loop(Twin(model), 0, {"observation": seen})
+    period = setting.config.encoder.horizon
+    # The least margin that is asked is between the first decision's and a later one's.
+    later = next(number for number, lead in enumerate(whole.margins) if lead < whole.margins[0])
+    monkeypatch.setattr(bundle, "LEAST_MARGIN", whole.margins[0])
+    monkeypatch.setattr(bundle, "GOLDEN_MARGIN", whole.margins[0])
+    golden = load_safetensors(bundle.golden(model, [(0, seen)]))
+    assert len(golden["actions"]) == later * period > 0
+    assert np.array_equal(golden["actions"], np.stack(whole.actions)[: later * period])
+    monkeypatch.setattr(bundle, "LEAST_MARGIN", 2 * whole.margins[0])
+    with pytest.raises(UserError, match="margin"):
+        bundle.golden(model, [(0, seen)])

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+import math
 import struct
 
 import numpy as np
@@ -241,9 +242,18 @@ def test_a_file_of_another_encoder_is_refused(tmp_path, files):
     trainer, _, _ = trainer_for(tmp_path / "run", files, apart=True)
     shared = tmp_path / "encoder.pt"
     shared.write_bytes(b"no encoder")
-    with pytest.raises(UserError, match="encoder.pt: no encoder of frames"):
-        trainer.run(quiet=True, encoder=shared)
-    assert shared.read_bytes() == b"no encoder"
+    for text in (b"no encoder", b"rown ] fox jumps"):
+        shared.write_bytes(text)
+        with pytest.raises(UserError, match="encoder.pt: no encoder of frames"):
+            trainer.run(quiet=True, encoder=shared)
+        assert shared.read_bytes() == text
+    made_of = training.SharedEncoder(shared, trainer).made_of
+    frames_of, state = (getattr(trainer.networks, name).state_dict() for name in ("frames", "state"))
+    broken = {name: value * math.nan for name, value in frames_of.items()}
+    for weights, wrong in (({}, "its weights are not those of its configuration"), (None, "its weights are not"), (broken, "a weight is not a finite number")):
+        torch.save({"made_of": made_of, "frames": weights, "state": state, "seconds": 1.0}, shared)
+        with pytest.raises(UserError, match=f"encoder.pt: {wrong}"):
+            trainer.run(quiet=True, encoder=shared)
     torch.save({"made_of": "something else", "frames": {}, "state": {}, "seconds": 1.0}, shared)
     with pytest.raises(UserError, match="encoder.pt: its encoder was made with another configuration"):
         trainer.run(quiet=True, encoder=shared)

@@ -157,6 +157,34 @@ def test_refusals(bundle, tmp_path):
         reference.write(bundle, tmp_path / "r.json", episodes=1, traced=2)
     with pytest.raises(config.UserError, match="not a bundle"):
         reference.write(__file__, tmp_path / "r.json")
+    for output in (tmp_path, tmp_path / "none" / "r.json"):
+        with pytest.raises(config.UserError, match="it is a folder, or lies in none"):
+            reference.write(bundle, output)
+    for seed in (-1, 1 << 70):
+        with pytest.raises(config.UserError, match=f"--seed {seed}: must be a whole number"):
+            reference.write(bundle, tmp_path / "r.json", seed=seed)
+    assert [path.name for path in tmp_path.iterdir()] == ["tiny.onnx"]
+
+
+@pytest.mark.parametrize("damage", [
+    lambda saved: saved.pop("networks"),
+    lambda saved: saved["networks"].pop("high_level.head.weight"),
+    lambda saved: saved["networks"]["high_level.head.weight"].fill_(float("nan")),
+    lambda saved: saved["position"].clear(),
+    lambda saved: saved["identity"].clear(),
+    None,
+])  # fmt: skip
+def test_a_damaged_checkpoint_is_named(policy, tmp_path, damage):
+    setting, encoded, lads, model = policy
+    state = {name: value.clone() for name, value in lads.state_dict().items()}
+    saved = {"identity": {"tables": setting.tables, "dataset_sha256": contracts.of(model)["provenance"]["dataset_sha256"]}, "networks": state, "position": {"stage": 9}}
+    if damage:
+        damage(saved)
+        torch.save(saved, tmp_path / "checkpoint.pt")
+    else:
+        (tmp_path / "checkpoint.pt").write_bytes(b"hello")
+    with pytest.raises(config.UserError, match="damaged|another|not those of its configuration|finite"):
+        whole.of(model, contracts.of(model), words(encoded), tmp_path)
 
 
 def test_a_completed_reference_is_the_one_that_is_made_whole(bundle, tmp_path):

@@ -144,7 +144,15 @@ def test_a_job_is_its_inputs(folder):
         (('id = "lang_dt"', 'id = "lads"'), "system 'lads' stands twice"),
         (('measure = "n_rate"', 'measure = "rate"'), "measure = 'rate': must be one of success, n_rate"),
         (('id = "lads"', 'id = "lads"\nsweep = { horizon = "5" }'), "system 'lads': sweep = .*: must be numbers by name"),
-        (("seeds = [0, 1]", "seeds = [0, -1]"), "seeds of 'paper': must be lists of whole numbers from 0 on"),
+        (("seeds = [0, 1]", "seeds = [0, -1]"), "seeds of 'paper': must be lists of different whole numbers from 0 on"),
+        (("seeds = [0, 1]", "seeds = [0, 0]"), "seeds of 'paper': must be lists of different whole numbers"),
+        (('id = "lads"', 'id = "lads"\nsweep = { horizon = nan }'), "system 'lads': sweep = .*: must be numbers by name"),
+        (("published = {}", 'published = { seen = ["a"] }'), r"system 'lang_dt': published = .*: must be \[mean, deviation\]"),
+        (('name = "tiny"', 'name = "../tiny"'), "name = '../tiny': must be letters"),
+        (('splits = ["seen", "unseen"]', 'splits = ["seen", "seen"]'), "split 'seen' stands twice"),
+        (("episodes = 5", "episodes = true"), "episodes = True: must be at least 1"),
+        (('noise = "none"', 'noise = "loud"'), "noise = 'loud': must be one of v0, v1, none"),
+        (("[evaluation]", "[evaluations]"), r"\[evaluation\] is missing"),
         (("[[track]]", "[track]"), r"tracks are a list of tables, \[\[track\]\]"),
         (("episodes = 5", "episode = 5"), "unknown key 'episode'; key 'episodes' is missing"),
     ],
@@ -161,6 +169,69 @@ def test_a_command_takes_one_thread_whatever_the_machine_has(tmp_path, monkeypat
     log = tmp_path / "log.txt"
     Local().run(Command(sys.executable, ["-c", "import os; print(os.environ['OMP_NUM_THREADS'])"], [], [], log))
     assert log.read_text() == "1\n"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A table of one job, finished -> its folder."""
+    folder = tiny_table.write(tmp_path_factory.mktemp("finished"))
+    table = TABLE[: TABLE.rindex("[[system]]")].replace("seeds = [0, 1]", "seeds = [0]")
+    (folder / "table.toml").write_text(table.replace('splits = ["seen", "unseen"]', 'splits = ["seen"]').replace('headings = ["seen", "unseen"]', 'headings = ["seen"]'))
+    assert play(folder)
+    return folder
+
+
+@pytest.mark.parametrize("damage", [
+    lambda file: file["tables"]["tiny"]["jobs"][0].update(identity=["a"]),
+    lambda file: file["tables"]["tiny"]["jobs"][0].update(splits=None),
+    lambda file: file["tables"]["tiny"]["jobs"][0]["splits"]["seen"].pop("n_rate"),
+    lambda file: file["tables"]["tiny"]["jobs"][0]["splits"]["seen"].update(n_rate=float("nan")),
+    lambda file: file["tables"]["tiny"]["jobs"][0]["splits"]["seen"].update(full_success_count=1 << 20),
+    lambda file: file["tables"]["tiny"]["jobs"][0]["splits"]["seen"].update(k_rate=[1.0]),
+    lambda file: file["tables"]["tiny"]["jobs"][0].update(bundle_sha256=None),
+    lambda file: file["tables"]["tiny"].update(jobs=2 * file["tables"]["tiny"]["jobs"]),
+    lambda file: file["tables"]["tiny"].update(jobs=["identity"]),
+    lambda file: file["tables"]["tiny"].update(uniform_scores="none"),
+    lambda file: file["tables"].update(other={"jobs": [], "uniform_scores": None}),
+    lambda file: file.update(tables=[]),
+    lambda file: file.update(format_version=2),
+])  # fmt: skip
+def test_damaged_tables_are_refused_and_stay(finished, tmp_path, damage):
+    file = json.loads((finished / "models/tables.json").read_text())
+    damage(file)
+    (tmp_path / "tables.json").write_text(json.dumps(file))
+    with pytest.raises(UserError, match="tables.json: not this exporter's tables .*; it stays as it is"):
+        play(finished, runs=tmp_path / "runs", models=tmp_path)
+    assert json.loads((tmp_path / "tables.json").read_text().replace("NaN", "0")) == json.loads(json.dumps(file).replace("NaN", "0"))
+    assert not (tmp_path / "TABLES.md").exists() and not (tmp_path / "runs").exists()
+
+
+def test_a_split_more_is_measured_where_it_is_missing(finished):
+    """Tests that numbers without one of the table's splits are not taken for it."""
+    table = definition.load(finished / "table.toml")
+    known = render.recorded(finished / "models", table, jobs.all_jobs(table, place_of(finished)))
+    assert len(known[0]) == 1 and known[1] and known[2] == 0
+    more = (finished / "table.toml").read_text().replace('splits = ["seen"]', 'splits = ["seen", "unseen"]').replace('headings = ["seen"]', 'headings = ["seen", "unseen"]')
+    (finished / "more.toml").write_text(more)
+    table = definition.load(finished / "more.toml")
+    assert render.recorded(finished / "models", table, jobs.all_jobs(table, place_of(finished))) == ({}, None, 0)
+
+
+@pytest.mark.parametrize("change, message", [
+    ({"data": "table.toml"}, r"table\.toml: no dataset of lads-collect"),
+    ({"runs": "table.toml"}, r"--runs .*table\.toml: it is no folder"),
+    ({"models": "table.toml"}, r"--models .*table\.toml: it is no folder"),
+])  # fmt: skip
+def test_paths_that_are_something_else_are_named_before_anything_runs(folder, change, message):
+    with pytest.raises(UserError, match=message):
+        play(folder, **{option: folder / name for option, name in change.items()})
+    assert not (folder / "runs").exists()
+
+
+def test_a_program_that_does_not_start_is_the_job_s_failure(folder):
+    (folder / "no-program").write_text("text")
+    with pytest.raises(UserError, match=r"3 of 3 jobs failed:\n  paper LADS seed 0: .*no-program: cannot be run \(Permission denied\)"):
+        play(folder, lads_run=folder / "no-program")
 
 
 def test_an_unknown_kind_of_system_is_named(folder):

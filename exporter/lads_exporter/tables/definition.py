@@ -4,6 +4,8 @@ Everything in it is checked before anything runs: unknown keys, systems and conf
 """
 
 import dataclasses
+import math
+import re
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +14,7 @@ from .. import config
 from ..config import UserError
 
 MEASURES = ("success", "n_rate")
+NOISE = ("v0", "v1", "none")
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +102,10 @@ def load(path):
     path = config.find(path)
     table = dict(config.read_toml(path))
     parts = {"evaluation": Evaluation, "track": Track, "system": System}
-    missing = [key for key in parts if key not in table]
-    if missing:
-        raise UserError(f"{path}: [{missing[0]}] is missing")
+    missing = [heading for key, heading in (("evaluation", "[evaluation]"), ("track", "[[track]]"), ("system", "[[system]]")) if key not in table]
+    unknown = [key for key in ("tracks", "systems", "folder") if key in table]
+    if missing or unknown:
+        raise UserError(f"{path}: " + "; ".join([*(f"{heading} is missing" for heading in missing), *(f"unknown key {key!r}" for key in unknown)]))
     for key in ("track", "system"):
         if not isinstance(table[key], list) or not all(isinstance(row, dict) for row in table[key]):
             raise UserError(f"{path}: {key}s are a list of tables, [[{key}]]")
@@ -119,19 +123,31 @@ def _check(table, path):
         problems.append(f"measure = {table.measure!r}: must be one of {', '.join(MEASURES)}")
     if len(table.splits) != len(table.headings):
         problems.append("splits and headings must be as many")
-    if table.evaluation.episodes < 1:
-        problems.append(f"evaluation.episodes = {table.evaluation.episodes}: must be at least 1")
+    if not re.fullmatch(r"[A-Za-z0-9][\w-]*", table.name):
+        problems.append(f"name = {table.name!r}: must be letters, digits, _ and -, for it names a folder")
+    asked = table.evaluation
+    if type(asked.episodes) is not int or asked.episodes < 1:
+        problems.append(f"evaluation.episodes = {asked.episodes}: must be at least 1")
+    if type(asked.seed) is not int or asked.seed < 0:
+        problems.append(f"evaluation.seed = {asked.seed}: must be a whole number from 0 on")
+    if asked.noise not in NOISE:
+        problems.append(f"evaluation.noise = {asked.noise!r}: must be one of {', '.join(NOISE)}")
+    for what, names in (("split", table.splits), ("track", [row.name for row in table.tracks])):
+        problems += [f"{what} {name!r} stands twice" for name in {name for name in names if names.count(name) > 1}]
     for row in (*table.tracks, *table.systems):
         lists = [row.seeds] if isinstance(row, Track) else row.seeds.values()
-        if not all(isinstance(seeds, list) and seeds and all(type(seed) is int and seed >= 0 for seed in seeds) for seeds in lists):
-            problems.append(f"seeds of {getattr(row, 'id', None) or row.name!r}: must be lists of whole numbers from 0 on")
+        if not all(isinstance(seeds, list) and seeds and all(type(seed) is int and seed >= 0 for seed in seeds) and len(set(seeds)) == len(seeds) for seeds in lists):
+            problems.append(f"seeds of {getattr(row, 'id', None) or row.name!r}: must be lists of different whole numbers from 0 on")
     ids, tracks = [row.id for row in table.systems], [row.name for row in table.tracks]
     problems += [f"system {id!r} stands twice" for id in {id for id in ids if ids.count(id) > 1}]
     for row in table.systems:
         problems += [f"system {row.id!r}: unknown track {name!r}; known: {', '.join(tracks)}" for name in [*row.tracks, *row.seeds] if name not in tracks]
         problems += [f"system {row.id!r}: the paper has no split {name!r}" for name in row.published if name not in table.splits]
-        if not all(type(value) in (int, float) for value in row.sweep.values()):
+        number = lambda value: type(value) in (int, float) and math.isfinite(value)
+        if not all(number(value) for value in row.sweep.values()):
             problems.append(f"system {row.id!r}: sweep = {row.sweep!r}: must be numbers by name")
+        if not all(isinstance(values, list) and len(values) <= 2 and all(map(number, values)) for values in row.published.values()):
+            problems.append(f"system {row.id!r}: published = {row.published!r}: must be [mean, deviation], [mean] or [] by split")
         if row.weights and row.weights not in ids:
             problems.append(f"system {row.id!r}: weights = {row.weights!r}: unknown system; known: {', '.join(ids)}")
     for track in table.tracks:

@@ -16,6 +16,7 @@ from .. import card, config, language
 from ..config import UserError
 from ..training import CHECKPOINT, CURVES, SUMMARY
 from .commands import Command, Rollouts
+from .render import check_scores
 
 CHANGES_NOTHING = ("sampler", "passes", "guidance", "temperature", "clip", "rule")  # of [system]: what only an export depends on
 SUMMARISED = ("perplexity", "codebook_size", "plan_elements_in_use", "validation", "steps")  # of a training's summary, in the table's file
@@ -187,7 +188,12 @@ def checked_results(table, path, sha256=None):
     wrong = [f"{name} is {got}, not {wanted}" for name, got, wanted in pairs if got != wanted]
     if wrong:
         raise UserError(f"{path}: of another protocol ({'; '.join(wrong)}); it stays as it is: move it away, and the same command measures anew")
-    return {name: {key: found["splits"][name][key] for key in SCORES} for name in table.splits}
+    scores = {name: {key: found["splits"][name][key] for key in SCORES} for name in table.splits}
+    try:
+        check_scores(scores, path)
+    except (ValueError, TypeError) as error:
+        raise UserError(f"{error}; move the file away, and the same command measures anew") from error
+    return scores
 
 
 def all_jobs(table, place):

@@ -7,6 +7,7 @@ import os
 import subprocess
 import threading
 
+from ..config import UserError
 from .commands import ENVIRONMENT, INTERRUPTED, Stopped
 
 
@@ -26,7 +27,11 @@ class Local:
             if self.stopped:
                 raise Stopped
             with open(command.log, "ab") as file:
-                process = subprocess.Popen(command.line(), stdout=file, stderr=subprocess.STDOUT, start_new_session=True, env=os.environ | ENVIRONMENT)
+                line = command.line()
+                try:
+                    process = subprocess.Popen(line, stdout=file, stderr=subprocess.STDOUT, start_new_session=True, env=os.environ | ENVIRONMENT)
+                except OSError as error:
+                    raise UserError(f"{line[0]}: cannot be run ({error.strerror}); build it anew: cargo build --release -p lads-sim") from error
             self.running.add(process)
         code = process.wait()
         with self.lock:

@@ -16,6 +16,7 @@ from ..config import UserError
 from ..output import write_atomically
 
 FORMAT, VERSION = "lads-tables", 1
+K_RATES = 4
 JSON, MARKDOWN = "tables.json", "TABLES.md"
 NUMBERS = ("identity", "bundle_sha256", "training_s", "summary", "splits")  # of a job
 Z = 1.959963984540054  # of 95 %
@@ -51,10 +52,10 @@ def summarise(splits):
     }
 
 
-def expert(place):
+def expert(data):
     """Computes how often the scripted expert carried out all of an instruction while the data were collected; None where no expert made
     them."""
-    with safe_open(place.data, "numpy") as file:
+    with safe_open(data, "numpy") as file:
         notes = file.metadata() or {}
     counts = [json.loads(notes.get(key, "0")) for key in ("attempts", "discarded")]
     if not all(isinstance(count, dict) for count in counts):  # one for each instruction, where an expert followed them
@@ -70,11 +71,14 @@ def _protocol(table):
 
 def recorded(models, table, jobs):
     """Finds what the file has of a table -> ({job: its numbers}, scores of uniform random actions or None, number of rows that are of no job)."""
-    entry = read(Path(models) / JSON)["tables"].get(table.name, {"jobs": []})
+    entry = read(Path(models) / JSON)["tables"].get(table.name, {"jobs": [], "uniform_scores": None})
     rows = {row["identity"]: row for row in entry["jobs"]}
-    found = {job: {part: rows[job.identity][part] for part in NUMBERS[1:]} for job in jobs if job.identity in rows}
-    uniform = entry["uniform_scores"] if entry.get("protocol") == _protocol(table) else None
-    return found, uniform, len(rows) - len(found)
+    whole = lambda scores: set(table.splits) <= set(scores)
+    found = {job: {part: rows[job.identity][part] for part in NUMBERS[1:]} for job in jobs if job.identity in rows and whole(rows[job.identity]["splits"])}
+    uniform = entry["uniform_scores"]
+    if uniform is not None and not (entry.get("protocol") == _protocol(table) and whole(uniform)):
+        uniform = None
+    return found, uniform, len(rows.keys() - {job.identity for job in jobs})
 
 
 def entry(table, place, jobs, uniform):
@@ -104,7 +108,7 @@ def entry(table, place, jobs, uniform):
         "threads": place.threads,
         "uniform": {name: summarise([uniform[name]]) for name in table.splits} if uniform else None,
         "uniform_scores": uniform,
-        "expert": expert(place),
+        "expert": expert(place.data),
         "tracks": tracks,
         "jobs": [{"track": job.track.name, "system": job.system.id, "seed": job.seed, "identity": job.identity} | found for job, found in jobs if found],
     }
@@ -112,25 +116,57 @@ def entry(table, place, jobs, uniform):
 
 
 def read(path):
+    """Reads the file of all tables; refuses one that is something else or damaged, and says where."""
     if not path.is_file():
         return {"format": FORMAT, "format_version": VERSION, "tables": {}}
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-        rows = [row for table in found["tables"].values() for row in table["jobs"]]
-        ours = found["format"] == FORMAT and found["format_version"] == VERSION and all(set(NUMBERS) <= set(row) for row in rows)
-    except (ValueError, KeyError, TypeError, AttributeError):
-        ours = False
-    if not ours:
-        raise UserError(f"{path}: not this exporter's tables; it stays as it is: name another folder with --models")
+        if (found["format"], found["format_version"]) != (FORMAT, VERSION):
+            raise ValueError(f"{found['format']} {found['format_version']}, not {FORMAT} {VERSION}")
+        for name, table in found["tables"].items():
+            _check(name, table)
+        markdown(found)
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, OSError) as error:
+        why = f"{type(error).__name__}: {error}" if isinstance(error, LookupError) else error
+        raise UserError(f"{path}: not this exporter's tables ({why}); it stays as it is: mend it, or name another folder with --models") from error
     return found
+
+
+def _check(name, table):
+    """Raises ValueError where the jobs of a table are not what `entry` writes."""
+    identities = [row["identity"] for row in table["jobs"]]
+    if len(set(identities)) < len(identities):
+        raise ValueError(f"table {name}: a job stands twice")
+    for row in table["jobs"]:
+        where = f"table {name}: job {row['track']} {row['system']} seed {row['seed']}"
+        texts = all(isinstance(row[key], str) for key in ("identity", "bundle_sha256"))
+        if not (texts and is_number(row["training_s"]) and isinstance(row["summary"], dict) and row["splits"]):
+            raise ValueError(f"{where}: its identity, bundle, time, summary or splits are damaged")
+        check_scores(row["splits"], where)
+    check_scores(table["uniform_scores"] or {}, f"table {name}: uniform random actions")
+
+
+def is_number(value, most=math.inf):
+    """Says whether a value is a number from 0 to `most`."""
+    return type(value) in (int, float) and math.isfinite(value) and 0 <= value <= most
+
+
+def check_scores(splits, where):
+    """Raises ValueError where scores by split cannot be those of episodes."""
+    for split, score in splits.items():
+        counts = type(score["episodes"]) is int and type(score["full_success_count"]) is int and 0 <= score["full_success_count"] <= score["episodes"]
+        rates = [score["full_success"], *score["k_rate"]]
+        if not (counts and len(score["k_rate"]) == K_RATES and all(is_number(rate, 1) for rate in rates) and is_number(score["n_rate"], K_RATES) and is_number(score["n_rate_standard_error"])):
+            raise ValueError(f"{where}: the scores of split {split} are damaged")
 
 
 def write(models, table, place, jobs, uniform):
     path = Path(models) / JSON
     found = read(path)
     found["tables"][table.name] = entry(table, place, jobs, uniform)
+    page = markdown(found)
     write_atomically(path, (json.dumps(found, indent=1) + "\n").encode())
-    write_atomically(Path(models) / MARKDOWN, markdown(found).encode())
+    write_atomically(Path(models) / MARKDOWN, page.encode())
 
 
 def _published(values, measure):

@@ -11,6 +11,8 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from pathlib import Path
 
+from safetensors import SafetensorError
+
 from .. import dataset, frames as frame_file
 from ..config import UserError
 from . import render
@@ -80,7 +82,7 @@ def run(path, data=None, frames=None, runs="runs/tables", lads_run="target/relea
     if at_once is not None and at_once < 1:
         raise UserError(f"--jobs {at_once}: must be at least 1")
     table = load(path)
-    place = _place(table, data, frames, runs, lads_run)
+    place = _place(table, data, frames, runs, lads_run, models)
     jobs = all_jobs(table, place)
     with open_engine(engine, place, at_once) as opened:
         return _run(table, place, jobs, models, opened)
@@ -137,13 +139,21 @@ def _run(table, place, jobs, models, engine):
     return not engine.stopped
 
 
-def _place(table, data, frames, runs, lads_run):
+def _place(table, data, frames, runs, lads_run, models):
     data = Path(data) if data else table.path(table.data)
     frames = Path(frames) if frames else table.path(table.frames) if table.frames else None
     lads_run = Path(lads_run)
     problems = []
     if not data.is_file():
         problems.append(f"no dataset at {data}; collect one first (make collect ENV={table.name})")
+    else:
+        try:
+            render.expert(data)
+        except (SafetensorError, OSError, ValueError, AttributeError) as error:
+            problems.append(f"{data}: no dataset of lads-collect ({error}); collect one (make collect ENV={table.name})")
+    for option, folder in (("--runs", runs), ("--models", models)):
+        if Path(folder).exists() and not Path(folder).is_dir():
+            problems.append(f"{option} {folder}: it is no folder; name one")
     if not lads_run.is_file():
         problems.append(f"no program at {lads_run}; build it first: cargo build --release -p lads-sim")
     if frames and not table.frames:

@@ -137,6 +137,9 @@ pub struct Answers {
     pub differing_episodes: usize,
     /// First difference beyond the tolerances.
     pub first_difference: Option<Answer>,
+    /// Whether plans are vectors that the reference does not record.
+    #[serde(skip)]
+    pub(crate) unrecorded_plan_vectors: bool,
     /// Largest reference margin at which a decision whose logits are known may differ: two logits may be off.
     #[serde(skip)]
     pub(crate) close_call: f64,
@@ -339,8 +342,12 @@ impl<'t> Traced<'t> {
                 }
                 None => {}
             }
-            if let Some(reference) = vectors.next() {
-                found(step, answers.plan_vector(&reply.plan_vector, reference));
+            match vectors.next() {
+                Some(reference) => found(step, answers.plan_vector(&reply.plan_vector, reference)),
+                None if reply.plan.is_none() && !reply.plan_vector.is_empty() => {
+                    answers.unrecorded_plan_vectors = true;
+                }
+                None => {}
             }
             if same_plan {
                 found(step, answers.action(&reply.action, done));

@@ -345,6 +345,11 @@ fn uncompared(contract: &Compared, policy: &Answers, environment: &Physics) -> V
     let counts = [
         ("action", policy.compared_steps, true),
         ("logit", policy.compared_decisions, policy.decisions > 0),
+        (
+            "plan",
+            policy.compared_plan_vectors,
+            policy.unrecorded_plan_vectors,
+        ),
         ("state", environment.states, true),
     ];
     let none = counts

@@ -342,6 +342,10 @@ impl Reference {
                 {
                     return wrong("its plans are not one per decision");
                 }
+                let vectors = episode.trace.iter().flat_map(|trace| &trace.plan_vectors);
+                if vectors.copied().any(|element| !element.is_finite()) {
+                    return wrong("an element of a plan is not a finite number");
+                }
                 if !logits.is_multiple_of(decisions.len().max(1)) {
                     return wrong(
                         "the logits of a trace are not the same number for each decision",

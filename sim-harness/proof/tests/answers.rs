@@ -174,6 +174,16 @@ fn plans_that_are_vectors_are_judged_element_by_element() {
         (same.differing_episodes, same.compared_plan_vectors),
         (0, STEPS)
     );
+    let mut damaged = file.clone();
+    let trace = &mut damaged["instructions"][0]["episodes"][0]["trace"];
+    trace["plan_vectors"] = text(&[f32::NAN; 2 * STEPS], f32::to_le_bytes).into();
+    let error = Reference::read(damaged.to_string().as_bytes(), Path::new("r.json"));
+    assert!(
+        error
+            .unwrap_err()
+            .to_string()
+            .contains("not a finite number")
+    );
     let near = judged(|reply| reply.plan_vector[1] += 1e-4);
     assert!(near.differing_episodes == 0 && near.largest_plan_difference > 9e-5);
     let far = "step 3: an element of the plan is off by";
