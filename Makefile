@@ -9,7 +9,7 @@ ARGS   ?=
 JOB    ?=
 INPUTS ?= models/lorel.onnx models/lorel-image.results.json
 ENV    ?= kitchen
-DATA   ?= data/$(ENV:-sizes=).safetensors
+DATA   ?= data/$(patsubst %-sizes,%,$(ENV)).safetensors
 COLLECT_kitchen := --episodes-per-instruction 50
 COLLECT_lorel   := --episodes 50000
 COLLECT_lorel-image := --episodes 3000
@@ -252,7 +252,7 @@ table: setup $(VENV)/stamp $(DATA) $(if $(filter %-image,$(ENV)),$(DATA:.safeten
 	$(MAKE) frames DATA=$*.safetensors
 
 $(DATA):
-	$(MAKE) collect ENV=$(ENV:-sizes=)
+	$(MAKE) collect ENV=$(patsubst %-sizes,%,$(ENV))
 
 ## reference: the policy of $(MODEL) in PyTorch and the official environment, 20 episodes of each instruction, for `lads-run verify`;
 ##         ARGS="--noise none" on the LOReL table; a policy with a camera needs the built program, which draws for it (--lads-run)
