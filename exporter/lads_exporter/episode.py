@@ -23,7 +23,7 @@ import numpy as np
 import onnx
 from safetensors.numpy import save as save_safetensors
 
-from . import bundle, contract as contracts, random_policy, twin
+from . import contract as contracts, random_policy, twin
 from .config import UserError
 from .output import write_atomically
 

@@ -1,6 +1,5 @@
 """Tests that commands of the exporter in the documents parse, and that their inputs that the project brings are there."""
 
-import re
 import shlex
 from pathlib import Path
 

@@ -157,7 +157,7 @@ def check_scores(splits, where):
         counts = type(score["episodes"]) is int and type(score["full_success_count"]) is int and 0 <= score["full_success_count"] <= score["episodes"]
         rates = [score["full_success"], *score["k_rate"]]
         if not (counts and len(score["k_rate"]) == K_RATES and all(is_number(rate, 1) for rate in rates) and is_number(score["n_rate"], K_RATES) and is_number(score["n_rate_standard_error"])):
-            raise ValueError(f"{where}: the scores of split {split} are damaged")
+            raise ValueError(f"{where}: the scores of split {split} are damaged, or of fewer than two episodes")
 
 
 def write(models, table, place, jobs, uniform):

@@ -7,9 +7,8 @@ that are not of one evaluation, or not all of them.
 import math
 
 from ..config import UserError
-from .render import wilson
+from .render import K_RATES, wilson
 
-K_RATES = 4
 OWN = ("instructions", "splits", "latency_us", "time")  # of a part; all else is the same in all
 
 

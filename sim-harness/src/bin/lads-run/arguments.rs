@@ -390,3 +390,31 @@ pub struct Wanted<'a> {
     /// Whether a sentence outside the table must come with the sub-tasks that judge it.
     pub judged: bool,
 }
+
+impl<'a> Wanted<'a> {
+    /// The policy's episodes as asked, without anything else: no traces and pictures, no faults, no plans from a file.
+    pub fn of(
+        policy: &'a PolicyArguments,
+        language: &'a LanguageArguments,
+        episodes: &'a EpisodeArguments,
+        threads: usize,
+    ) -> Self {
+        Self {
+            policy,
+            language,
+            instruction: episodes.instruction.as_deref(),
+            episodes: episodes.episodes,
+            seed: episodes.seed,
+            noise: episodes.noise.as_deref(),
+            sample: episodes.sample,
+            uniform: false,
+            faults: Faults::default(),
+            plans: None,
+            traced: 0,
+            pictures: Pictures::None,
+            threads,
+            of_table: None,
+            judged: false,
+        }
+    }
+}

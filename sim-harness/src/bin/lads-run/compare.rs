@@ -15,7 +15,6 @@ mod with {
     use std::process::ExitCode;
     use std::sync::atomic::AtomicBool;
 
-    use lads_sim::faults::Faults;
     use lads_sim::output;
     use lads_sim::report::inputs::{self, Found};
     use lads_sim::report::{Behaviour, Comparison, Split, System};
@@ -135,23 +134,11 @@ mod with {
             encode_language: false,
             encoder: None,
         };
-        let episodes = &asked.episodes;
         Wanted {
-            policy,
-            language: PLAIN,
-            instruction: episodes.instruction.as_deref(),
-            episodes: episodes.episodes,
-            seed: episodes.seed,
-            noise: episodes.noise.as_deref(),
-            sample: episodes.sample,
-            uniform: false,
-            faults: Faults::default(),
-            plans: None,
             traced: u32::MAX,
             pictures: Pictures::Decisions,
-            threads,
             of_table: Some("report"),
-            judged: false,
+            ..Wanted::of(policy, PLAIN, &asked.episodes, threads)
         }
     }
 

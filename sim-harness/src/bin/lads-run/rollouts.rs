@@ -34,13 +34,6 @@ pub fn run(asked: &Rollouts, extra: &Extra<'_>, stop: &AtomicBool) -> Result<Exi
     let threads = threads(episodes.threads, extra.viewer)?;
     check_outputs(asked, extra)?;
     let wanted = Wanted {
-        policy: &asked.policy,
-        language: &asked.language,
-        instruction: episodes.instruction.as_deref(),
-        episodes: episodes.episodes,
-        seed: episodes.seed,
-        noise: episodes.noise.as_deref(),
-        sample: episodes.sample,
         uniform: extra.uniform,
         faults: asked.faults.faults(),
         plans: files.plans.as_deref(),
@@ -50,13 +43,12 @@ pub fn run(asked: &Rollouts, extra: &Extra<'_>, stop: &AtomicBool) -> Result<Exi
             (None, Some(_)) => Pictures::Decisions,
             (None, None) => Pictures::None,
         },
-        threads,
         of_table: match (&files.plans, extra.report) {
             (Some(_), _) => Some("--plans"),
             (None, Some(_)) => Some("--report"),
             (None, None) => None,
         },
-        judged: false,
+        ..Wanted::of(&asked.policy, &asked.language, episodes, threads)
     };
     bench::with(&wanted, stop, |bench| {
         let recording = record::prepare(extra.record, &bench.evaluation, bench.open)?;

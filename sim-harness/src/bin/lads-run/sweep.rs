@@ -14,7 +14,6 @@ use std::sync::atomic::AtomicBool;
 
 use lads_sim::evaluate::Setup;
 use lads_sim::output;
-use lads_sim::rollout::Pictures;
 use lads_sim::sight::is_image;
 
 use crate::arguments::{Sweep as Asked, Wanted};
@@ -96,21 +95,8 @@ pub fn run(asked: &Asked, stop: &AtomicBool) -> Result<ExitCode, End> {
     output::apart(&given(inputs), &outputs).map_err(refused)?;
     output::check(&[], &outputs).map_err(refused)?;
     let wanted = Wanted {
-        policy: &asked.policy,
-        language: &asked.language,
-        instruction: episodes.instruction.as_deref(),
-        episodes: episodes.episodes,
-        seed: episodes.seed,
-        noise: episodes.noise.as_deref(),
-        sample: episodes.sample,
-        uniform: false,
-        faults: Faults::default(),
-        plans: None,
-        traced: 0,
-        pictures: Pictures::None,
-        threads,
-        of_table: None,
         judged: true,
+        ..Wanted::of(&asked.policy, &asked.language, episodes, threads)
     };
     bench::with(&wanted, stop, |bench| {
         if bench.evaluation.contract.observations().any(is_image) {
