@@ -16,22 +16,13 @@ from .kinds.sighted import FrameEncoder
 from .model import HighLevelPolicy, LowLevelPolicy, Normalizer
 
 
-class Eyes(nn.Module):
-    """Reads a frame [r, c, 3] as both levels do: its normalised features [F]."""
-
-    def __init__(self, frames, normalizer):
-        super().__init__()
-        self.frames, self.normalizer = frames, normalizer
-
-    def forward(self, frame):
-        return self.normalizer(self.frames(frame[None])[0])
-
-
 class Acting(nn.Module):
-    """Networks that act: what reads an observation (the normaliser, or `Eyes`), high level, codes [M, D], low level. In eval mode."""
+    """Networks that act: the encoder of frames of those with a camera, normaliser, high level, codes [M, D], low level. In eval mode."""
 
-    def __init__(self, normalizer, high_level, codes, low_level):
+    def __init__(self, normalizer, high_level, codes, low_level, frames=None):
         super().__init__()
+        if frames is not None:
+            self.frames = frames
         self.normalizer, self.high_level, self.low_level = normalizer, high_level, low_level
         self.register_buffer("codes", codes)
         self.eval()
@@ -57,9 +48,8 @@ def nearness(regressed, codes):
 
 def from_lads(lads, regressed=False):
     """Takes the acting part of trained networks; `regressed` says that the high level regresses its plans."""
-    reads = Eyes(lads.frames, lads.normalizer) if hasattr(lads, "frames") else lads.normalizer
     high_level = Nearest(lads.high_level, lads.codebook.codes) if regressed else lads.high_level
-    return Acting(reads, high_level, lads.codebook.codes, lads.low_level)
+    return Acting(lads.normalizer, high_level, lads.codebook.codes, lads.low_level, getattr(lads, "frames", None))
 
 
 def _tensors(model):
@@ -142,9 +132,9 @@ def from_bundle(model, contract):
     try:
         normalizer = Normalizer(_lengths(contract)[0])
         normalizer.mean.copy_(tensors["observation_mean"])
-        reads = Eyes(_frame_encoder(tensors, contract), normalizer) if "features" in contract["family"] else normalizer
+        frames = _frame_encoder(tensors, contract) if "features" in contract["family"] else None
         slope = _slope(model)
         low_level = _low_level(tensors, contract, slope)
-        return Acting(reads.eval(), _high_level(tensors, contract), tensors["codebook"], low_level)
+        return Acting(normalizer, _high_level(tensors, contract), tensors["codebook"], low_level, frames)
     except (KeyError, IndexError, ValueError, RuntimeError) as error:
         raise UserError(f"the bundle's weights are not those of a {contract['family']['kind']} policy of this exporter: {error}") from error

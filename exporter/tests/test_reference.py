@@ -296,8 +296,9 @@ def test_a_camera_s_policy_comes_back_out_of_its_bundle(sighted):
     trained, loaded = weights.from_lads(networks), weights.from_bundle(model, contract)
     drawn = torch.from_numpy(np.random.default_rng(1).integers(0, 256, (12, 16, 3), np.uint8))
     with torch.no_grad():
-        assert (trained.normalizer(drawn) - loaded.normalizer(drawn)).abs().max() < 1e-5
-        assert loaded.normalizer(drawn).shape == (contract["family"]["features"],)
+        assert (trained.frames(drawn[None]) - loaded.frames(drawn[None])).abs().max() < 1e-5
+        assert loaded.frames(drawn[None]).shape == (1, contract["family"]["features"])
+        assert torch.equal(trained.normalizer.mean, loaded.normalizer.mean)
 
 
 def test_a_reference_of_a_camera_keeps_states_and_digests(sighted, program, tmp_path):
