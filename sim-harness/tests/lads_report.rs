@@ -271,6 +271,9 @@ fn bad_inputs_are_named_at_once_and_nothing_is_written() {
         "{second}"
     );
 
+    let again = lorel.parent().unwrap().join("./lorel.results.json");
+    let twice = compare(&[&lorel, &again], &page, &[]).output().unwrap();
+    assert_refused(&twice, &["lorel.results.json", "given twice"]);
     let results = compare(&[&lorel], &lorel, &[]).output().unwrap();
     assert_refused(&results, &["lorel.results.json"]);
     let none = compare(&[&lorel], &page, &["--episodes", "0"])

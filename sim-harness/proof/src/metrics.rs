@@ -19,6 +19,9 @@ pub const K_RATES: usize = 4;
 /// The 0.975 quantile of the standard normal distribution, for two-sided 95 % intervals; exact to f64.
 const Z_95: f64 = 1.959963984540054;
 
+/// Difference of two rates that is rounding.
+const ROUNDING: f64 = 1e-9;
+
 /// A two-sided 95 % confidence interval of a proportion, written to JSON as `[low, high]`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Interval(pub f64, pub f64);
@@ -160,6 +163,52 @@ impl Score {
             ..Self::of([])
         }
     }
+
+    /// Checks that episodes can have these scores, which those of a file may not; the error names the first field that is wrong.
+    pub fn check(&self) -> Result<(), String> {
+        let Self {
+            episodes,
+            full_success_count: count,
+            ..
+        } = *self;
+        if count > episodes {
+            return Err(format!("{count} successes in {episodes} episodes"));
+        }
+        let amounts = [
+            ("n_rate", self.n_rate),
+            ("n_rate_standard_error", self.n_rate_standard_error),
+        ];
+        for (name, amount) in amounts {
+            if let Some(amount) = amount.filter(|it| !(it.is_finite() && *it >= 0.0)) {
+                return Err(format!("{name} is {amount}"));
+            }
+        }
+        let success = (self.full_success, self.full_success_interval);
+        let k_rates = self.k_rate.into_iter().zip(self.k_rate_interval);
+        let rates = [("full_success", success)].into_iter();
+        for (name, (rate, Interval(low, high))) in rates.chain(k_rates.map(|it| ("k_rate", it))) {
+            if !(0.0 <= low && low <= high && high <= 1.0) {
+                return Err(format!("the interval of {name} is {low} to {high}"));
+            }
+            let inside = |rate: &f64| (low - ROUNDING..=high + ROUNDING).contains(rate);
+            if let Some(rate) = rate.filter(|rate| !inside(rate)) {
+                return Err(format!(
+                    "{name} is {rate}, outside its interval of {low} to {high}"
+                ));
+            }
+        }
+        let of_count = share(count, episodes);
+        match (self.full_success, of_count) {
+            (Some(said), Some(is)) if (said - is).abs() > ROUNDING => Err(format!(
+                "full_success is {said} and {count} of {episodes} are {is}"
+            )),
+            _ if !self.k_rate.is_sorted_by(|a, b| a >= b) => Err(format!(
+                "k_rate grows with K: {:?}",
+                self.k_rate.map(Option::unwrap_or_default)
+            )),
+            _ => Ok(()),
+        }
+    }
 }
 
 fn share(count: usize, episodes: usize) -> Option<f64> {
@@ -218,6 +267,41 @@ mod tests {
             }
         }
         assert_eq!(wilson(0, 0), Interval(0.0, 1.0));
+    }
+
+    #[test]
+    fn scores_that_no_episodes_have_are_named() {
+        type Change = fn(&mut Score);
+        let score = Score::of([episode(4, 0), episode(2, 1), episode(0, 0)]);
+        let unasked = Score::unasked(3, 7);
+        for possible in [&score, &unasked, &Score::of([])] {
+            assert_eq!(possible.check(), Ok(()));
+        }
+        let changes: [(&str, Change); 9] = [
+            ("4 successes in 3", |it| it.full_success_count = 4),
+            ("n_rate is -1", |it| it.n_rate = Some(-1.0)),
+            ("n_rate_standard_error is NaN", |it| {
+                it.n_rate_standard_error = Some(f64::NAN);
+            }),
+            ("full_success is 7", |it| it.full_success = Some(7.0)),
+            ("full_success is 0.5 and 1 of 3", |it| {
+                it.full_success = Some(0.5);
+            }),
+            ("interval of full_success is NaN", |it| {
+                it.full_success_interval = Interval(f64::NAN, 1.0);
+            }),
+            ("interval of k_rate is 0.5 to 2", |it| {
+                it.k_rate_interval[0] = Interval(0.5, 2.0);
+            }),
+            ("k_rate is 0, outside", |it| it.k_rate[0] = Some(0.0)),
+            ("k_rate grows", |it| it.k_rate.swap(0, 3)),
+        ];
+        for (said, change) in changes {
+            let mut changed = score.clone();
+            change(&mut changed);
+            let error = changed.check().unwrap_err();
+            assert!(error.contains(said), "'{said}' is not in: {error}");
+        }
     }
 
     fn episode(completed: usize, un_instructed: usize) -> Outcome {

@@ -1,7 +1,7 @@
 //! Files of numbers that a comparison takes: results of `lads-run --json`, and tables of `python -m lads_exporter table`.
 //!
-//! Only the fields that are needed are read, so that a file with more of them is taken too. What can fail: a file that cannot be read, is
-//! no JSON, or is of another format or version.
+//! Only the fields that are needed are read, so that a file with more of them is taken too, and only the tables that are asked for. What can
+//! fail: a file that cannot be read, is no JSON, is of another format or version, or has no scores or impossible ones.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -22,6 +22,9 @@ const TABLES: &str = "lads-tables";
 
 /// Versions of a file of tables that are read.
 const TABLES_VERSION: u32 = 1;
+
+/// What to do about one table of a file that cannot be read.
+const REMAKE: &str = "write it again with make table, or name another with --table";
 
 /// Why a table has no figures of what a policy did.
 const A_TABLE: &str = "a table holds success rates only; give a bundle";
@@ -65,10 +68,29 @@ pub enum InputError {
         /// Where the form is another one.
         wrong: serde_json::Error,
     },
+    /// A table is missing something or has another kind.
+    #[error("its table {table} is damaged or of an older version ({wrong}); {REMAKE}")]
+    Table {
+        /// Name of the table.
+        table: String,
+        /// Where the form is another one.
+        wrong: serde_json::Error,
+    },
+    /// Scores that no episodes have.
+    #[error("its scores of {of} are impossible ({wrong}); make it again")]
+    Score {
+        /// System and split.
+        of: String,
+        /// The field that is wrong.
+        wrong: String,
+    },
+    /// No episode was run.
+    #[error("it has no split with episodes, so there is nothing to compare")]
+    Empty,
     /// There is no table to compare.
-    #[error("it has no table '{asked}' with a finished system; it has {tables}")]
+    #[error("it has no table{asked} with a finished system; it has {tables}")]
     NoTable {
-        /// Name that was asked for.
+        /// Name that was asked for, in quotes after a space; empty where none was.
         asked: String,
         /// Names of the file's tables.
         tables: String,
@@ -95,19 +117,38 @@ fn parse(text: &str, name: &str, table: Option<&str>) -> Result<Found, InputErro
             read,
         })
     };
-    match value["format"].as_str() {
+    let found = match value["format"].as_str() {
         Some(FORMAT) => {
             versioned(FORMAT, FORMAT_VERSION)?;
-            results(value, name)
+            results(value, name)?
         }
         Some(TABLES) => {
             versioned(TABLES, TABLES_VERSION)?;
-            tables(value, name, table)
+            tables(value, name, table)?
         }
-        found => Err(InputError::Format {
-            found: found.map_or("not stated".to_owned(), |found| format!("'{found}'")),
-        }),
+        found => {
+            return Err(InputError::Format {
+                found: found.map_or("not stated".to_owned(), |found| format!("'{found}'")),
+            });
+        }
+    };
+    for system in found.values().flatten() {
+        check(system)?;
     }
+    Ok(found)
+}
+
+/// Checks that a system has episodes, and scores that they can have.
+fn check(system: &System) -> Result<(), InputError> {
+    for split in &system.splits {
+        let checked = split.score.check();
+        checked.map_err(|wrong| InputError::Score {
+            of: format!("{}, {}", system.name, split.name),
+            wrong,
+        })?;
+    }
+    let ran = system.splits.iter().any(|split| split.score.episodes > 0);
+    ran.then_some(()).ok_or(InputError::Empty)
 }
 
 #[derive(Deserialize)]
@@ -211,7 +252,7 @@ pub fn short(path: &str, ending: &str) -> String {
 
 #[derive(Deserialize)]
 struct TablesFile {
-    tables: BTreeMap<String, TableFound>,
+    tables: BTreeMap<String, Value>,
 }
 
 #[derive(Deserialize)]
@@ -279,21 +320,25 @@ fn tables(value: Value, name: &str, asked: Option<&str>) -> Result<Found, InputE
     let file: TablesFile =
         serde_json::from_value(value).map_err(|wrong| InputError::Field { format, wrong })?;
     let mut found = Found::new();
-    let wanted = file.tables.iter();
-    for (table, content) in wanted.filter(|(table, _)| asked.is_none_or(|asked| *table == asked)) {
-        let systems = content.systems(table, name);
-        if systems.is_empty() {
+    let tables: Vec<String> = file.tables.keys().cloned().collect();
+    for (table, content) in file.tables {
+        if asked.is_some_and(|asked| table != asked) {
             continue;
         }
-        found
-            .entry(content.environment.clone())
-            .or_default()
-            .extend(systems);
+        let content: TableFound =
+            serde_json::from_value(content).map_err(|wrong| InputError::Table {
+                table: table.clone(),
+                wrong,
+            })?;
+        let systems = content.systems(&table, name);
+        if !systems.is_empty() {
+            let same = found.entry(content.environment).or_default();
+            same.extend(systems);
+        }
     }
     if found.is_empty() {
-        let tables: Vec<&str> = file.tables.keys().map(String::as_str).collect();
         return Err(InputError::NoTable {
-            asked: asked.unwrap_or("of any name").to_owned(),
+            asked: asked.map_or_else(String::new, |asked| format!(" '{asked}'")),
             tables: if tables.is_empty() {
                 "none".to_owned()
             } else {
@@ -419,5 +464,42 @@ mod tests {
             Some("libero"),
             &["'libero'", "kitchen, lorel"],
         );
+        let none = serde_json::json!({"format": "lads-tables", "format_version": 1, "tables": {}});
+        refused(
+            &none.to_string(),
+            None,
+            &["no table with a finished system", "it has none"],
+        );
+    }
+
+    #[test]
+    fn a_damaged_table_is_named_and_does_not_keep_the_others_from_being_read() {
+        let mut file = tables_file(1);
+        let kitchen = file["tables"]["kitchen"].as_object_mut().unwrap();
+        kitchen.remove("environment");
+        let error = parsed(&file, None).err().unwrap().to_string();
+        for part in ["table kitchen", "environment", "make table", "--table"] {
+            assert!(error.contains(part), "'{part}' is not in: {error}");
+        }
+        assert!(parsed(&file, Some("lorel")).is_ok());
+    }
+
+    #[test]
+    fn impossible_scores_are_refused_with_their_system() {
+        let mut file = tables_file(1);
+        file["tables"]["lorel"]["tracks"][0]["rows"][0]["splits"]["seen"]["success"] = 7.0.into();
+        let error = parsed(&file, None).err().unwrap().to_string();
+        for part in ["LADS, seen", "successes in 20 episodes"] {
+            assert!(error.contains(part), "'{part}' is not in: {error}");
+        }
+    }
+
+    #[test]
+    fn results_without_episodes_are_refused() {
+        let file = serde_json::json!({"format": FORMAT, "format_version": FORMAT_VERSION, "environment": {"id": "e"},
+            "bundle_sha256": "0", "seed": 0, "noise": "none", "decision": {"rule": "argmax"}, "episodes_per_instruction": 1,
+            "splits": {}, "instructions": []});
+        let error = parsed(&file, None).err().unwrap().to_string();
+        assert!(error.contains("nothing to compare"), "{error}");
     }
 }

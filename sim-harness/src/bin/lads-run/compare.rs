@@ -52,7 +52,16 @@ mod with {
         output::check(&given, &[("-o", &asked.output)]).map_err(refused)?;
 
         let (mut opened, mut wrong) = (Vec::new(), Vec::new());
-        for path in &asked.inputs {
+        for (place, path) in asked.inputs.iter().enumerate() {
+            if asked
+                .inputs
+                .iter()
+                .take(place)
+                .any(|before| same(before, path))
+            {
+                wrong.push(about(path, "it is given twice; name each input once"));
+                continue;
+            }
             match open(path, asked, threads, stop) {
                 Ok(input) => opened.push((path.as_path(), input)),
                 Err(End::Refused(line)) => wrong.push(about(path, &line)),
@@ -89,6 +98,12 @@ mod with {
         let line = format!("{environment}: {count} {systems} compared in {path}\n");
         print(&line)?;
         Ok(ExitCode::SUCCESS)
+    }
+
+    /// Whether two paths lead to one file.
+    fn same(a: &Path, b: &Path) -> bool {
+        let [a, b] = [a, b].map(|path| path.canonicalize().ok());
+        a.is_some() && a == b
     }
 
     /// Puts the input's name before what is wrong with it, unless it begins with it.
