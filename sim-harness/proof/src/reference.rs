@@ -154,6 +154,46 @@ pub struct Episode {
     pub trace: Option<Trace>,
 }
 
+impl Episode {
+    /// Refuses numbers that no episode of `decisions` decisions can have.
+    fn check(&self, decisions: usize, period: Option<usize>) -> Result<(), &'static str> {
+        if [self.plans.len(), self.margins.len()] != [decisions; 2] {
+            return Err("its plans are not one per decision");
+        }
+        let Some(trace) = &self.trace else {
+            return Ok(());
+        };
+        let lists: [&[f32]; 4] = [
+            &trace.observations,
+            &trace.actions,
+            &trace.logits,
+            &trace.plan_vectors,
+        ];
+        let states = self.final_state.iter().chain(&trace.states);
+        let finite = lists.into_iter().flatten().all(|it| it.is_finite())
+            && states.chain(&self.margins).all(|it| it.is_finite());
+        if !finite {
+            return Err("it holds a number that is not finite");
+        }
+        if !trace.logits.len().is_multiple_of(decisions.max(1)) {
+            return Err("the logits of a trace are not the same number for each decision");
+        }
+        let codes = trace.logits.len() / decisions.max(1);
+        let encoded = trace.encoded.as_deref().unwrap_or_default();
+        let mut indices = self.plans.iter().chain(encoded);
+        if codes > 0 && indices.any(|&plan| plan as usize >= codes) {
+            return Err("an index of a plan has no logit");
+        }
+        let segments = period.map_or(0, |period| self.steps / period);
+        let margins = trace.encoded_margins.as_ref().map(Vec::len);
+        let counted = [trace.encoded.as_ref().map(Vec::len), margins];
+        if counted.into_iter().flatten().any(|it| it != segments) {
+            return Err("what its trajectory encoder sees is not one plan per whole segment");
+        }
+        Ok(())
+    }
+}
+
 /// A completed sub-task.
 #[derive(Debug, Deserialize)]
 pub struct Completion {
@@ -321,7 +361,8 @@ impl Reference {
             );
         }
         for instruction in &self.instructions {
-            let wrong = |what: &str| Err(format!("instruction '{}': {what}", instruction.id));
+            let wrong =
+                |what: &'static str| Err(format!("instruction '{}': {what}", instruction.id));
             if instruction.episodes.len() != self.episodes_per_instruction as usize {
                 return wrong("its number of episodes is not the heading's");
             }
@@ -329,28 +370,16 @@ impl Reference {
                 let decisions = self.decided_at(episode);
                 let in_order = decisions.is_sorted()
                     && decisions.last().is_none_or(|&last| last < episode.steps);
-                let logits = episode.trace.as_ref().map_or(0, |trace| trace.logits.len());
                 let traced = number < u64::from(self.traced_episodes);
                 if episode.number != number || episode.trace.is_some() != traced {
                     return wrong(
                         "its episodes are not in order, or not traced as the heading says",
                     );
                 }
-                if episode.plans.len() != decisions.len()
-                    || episode.margins.len() != decisions.len()
-                    || !in_order
-                {
+                if !in_order {
                     return wrong("its plans are not one per decision");
                 }
-                let vectors = episode.trace.iter().flat_map(|trace| &trace.plan_vectors);
-                if vectors.copied().any(|element| !element.is_finite()) {
-                    return wrong("an element of a plan is not a finite number");
-                }
-                if !logits.is_multiple_of(decisions.len().max(1)) {
-                    return wrong(
-                        "the logits of a trace are not the same number for each decision",
-                    );
-                }
+                episode.check(decisions.len(), self.period).or_else(wrong)?;
             }
         }
         Ok(())

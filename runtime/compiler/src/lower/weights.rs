@@ -78,10 +78,7 @@ impl<'s> Weights<'s> {
 
     /// Stores the `[k, n]` matrix of the layer that was made from `node`, in the panels that `Linear` reads.
     pub fn packed(&mut self, tensor: &Arc<Tensor>, node: &str) -> Result<Packed, String> {
-        let data = tensor.as_f32().ok_or("reads integers as numbers")?;
-        let &[k, n] = &tensor.shape[..] else {
-            return Err("has weights that are not a matrix".into());
-        };
+        let (data, [k, n]) = matrix(tensor)?;
         // One step for inputs of any size would be too coarse for the small ones.
         let asked = self.storage.of(self.entry, node);
         let format = if asked.is_scaled() && is_uneven(squares(data, n)) {
@@ -247,6 +244,18 @@ fn columns(data: &[f32], n: usize) -> impl Iterator<Item = impl Iterator<Item = 
 }
 
 /// Converts every weight to another format.
+/// Returns the elements and the shape of a matrix of weights.
+fn matrix(tensor: &Tensor) -> Result<(&[f32], [usize; 2]), String> {
+    let data = tensor.as_f32().ok_or("reads integers as numbers")?;
+    let &[k, n] = &tensor.shape[..] else {
+        return Err("has weights that are not a matrix".into());
+    };
+    if data.iter().any(|w| !w.is_finite()) {
+        return Err("has weights that are not finite; train or export it again".into());
+    }
+    Ok((data, [k, n]))
+}
+
 fn converted<T>(
     data: &[f32],
     format: WeightFormat,
@@ -300,6 +309,22 @@ mod tests {
             assert_eq!(format(wanted, &uneven), expected);
         }
     }
+
+    #[test]
+    fn weights_that_are_not_finite_are_refused_in_every_format() {
+        for w in [f32::NAN, f32::INFINITY] {
+            let matrix = Arc::new(Tensor::f32(&[2, 1], vec![0.5, w]));
+            for wanted in WeightFormat::ALL {
+                let storage = Storage::of_weights(wanted);
+                let mut weights = Weights::new(&storage);
+                let error = weights.packed(&matrix, "layer").err().unwrap();
+                assert!(error.contains("not finite"), "{error}");
+                let error = weights.windows(&matrix, 1).err().unwrap();
+                assert!(error.contains("not finite"), "{error}");
+            }
+        }
+    }
+
     #[test]
     fn convolutions_take_integers_unless_their_channels_differ() {
         // Three channels, of which the last weighs most; a kernel of two pixels, of which one does.

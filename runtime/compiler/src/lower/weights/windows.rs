@@ -8,7 +8,7 @@ use lads_kernels::{
     depthwise_packed_len, stored,
 };
 
-use super::{Form, Weights, is_uneven, squares, words};
+use super::{Form, Weights, is_uneven, matrix, squares, words};
 use crate::tensor::Tensor;
 
 /// A matrix of a convolution in integers.
@@ -24,10 +24,7 @@ impl Weights<'_> {
     /// Stores the `[k, n]` matrix of a convolution for the kernel `Conv`: the panels of each group
     /// of outputs in turn, all of the same length.
     pub fn windows(&mut self, tensor: &Arc<Tensor>, groups: usize) -> Result<WeightSpan, String> {
-        let data = tensor.as_f32().ok_or("reads integers as numbers")?;
-        let &[k, all] = &tensor.shape[..] else {
-            return Err("has weights that are not a matrix".into());
-        };
+        let (data, [k, all]) = matrix(tensor)?;
         self.once(tensor, Form::Windows(groups), |this| {
             let n = all / groups;
             let len = conv_packed_len([k, n]);
@@ -47,10 +44,7 @@ impl Weights<'_> {
         channels: usize,
         node: &str,
     ) -> Result<WeightFormat, String> {
-        let data = tensor.as_f32().ok_or("reads integers as numbers")?;
-        let &[_, n] = &tensor.shape[..] else {
-            return Err("has weights that are not a matrix".into());
-        };
+        let (data, [_, n]) = matrix(tensor)?;
         let mut inputs = vec![0.0; channels];
         for (l, squares) in squares(data, n).into_iter().enumerate() {
             inputs[l % channels] += squares;
@@ -72,13 +66,8 @@ impl Weights<'_> {
         format: WeightFormat,
         [groups, len]: [usize; 2],
     ) -> Result<Integers, String> {
-        let numbers = |tensor: &'_ Arc<Tensor>| tensor.as_f32().map(<[f32]>::to_vec);
-        let (Some(data), Some(bias)) = (numbers(tensor), numbers(bias)) else {
-            return Err("reads integers as numbers".into());
-        };
-        let &[k, all] = &tensor.shape[..] else {
-            return Err("has weights that are not a matrix".into());
-        };
+        let bias = bias.as_f32().ok_or("reads integers as numbers")?;
+        let (data, [k, all]) = matrix(tensor)?;
         let n = all / groups;
         let scales: Vec<f32> = (0..all)
             .map(|j| conv_scale(format, data.iter().skip(j).step_by(all).copied(), len))
@@ -91,22 +80,11 @@ impl Weights<'_> {
         let columns = self.store(&columns)?;
         let runs = [k / len, len];
         let w = self.once(tensor, Form::Integers(format, [groups, len]), |this| {
+            let groups = [groups, n];
             let words = if format == WeightFormat::Int8 {
-                words(&quantised(
-                    &data,
-                    &scales,
-                    [groups, n],
-                    runs,
-                    stored::to_int8,
-                )?)
+                words(&quantised(data, &scales, groups, runs, stored::to_int8))
             } else {
-                words(&quantised(
-                    &data,
-                    &scales,
-                    [groups, n],
-                    runs,
-                    stored::to_int16,
-                )?)
+                words(&quantised(data, &scales, groups, runs, stored::to_int16))
             };
             this.store(&words)
         })?;
@@ -115,10 +93,7 @@ impl Weights<'_> {
 
     /// Stores the `[kernel, c]` matrix of a convolution for the kernel `Depthwise`.
     pub fn channels(&mut self, tensor: &Arc<Tensor>) -> Result<WeightSpan, String> {
-        let data = tensor.as_f32().ok_or("reads integers as numbers")?;
-        let &[kernel, c] = &tensor.shape[..] else {
-            return Err("has weights that are not a matrix".into());
-        };
+        let (data, [kernel, c]) = matrix(tensor)?;
         self.once(tensor, Form::Channels, |this| {
             let mut packed = vec![0.0; depthwise_packed_len([kernel, c])];
             depthwise_pack(data, [kernel, c], &mut packed);
@@ -142,10 +117,7 @@ fn quantised<T: Copy + Default>(
     [groups, n]: [usize; 2],
     runs: [usize; 2],
     to: fn(f32, f32) -> T,
-) -> Result<Vec<T>, String> {
-    if data.iter().any(|w| !w.is_finite()) {
-        return Err("has weights that are not finite".into());
-    }
+) -> Vec<T> {
     let len = conv_integers_len(runs, n);
     let mut panels = vec![T::default(); groups * len];
     for (i, panels) in panels.chunks_mut(len).enumerate() {
@@ -157,5 +129,5 @@ fn quantised<T: Copy + Default>(
             .collect();
         conv_integers_pack(&own, runs, n, panels);
     }
-    Ok(panels)
+    panels
 }
