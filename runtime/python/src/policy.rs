@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use lads_compiler::{Bundle, CacheFormat, Formats, Options, WeightFormat};
-use lads_core::{Data, Isa};
+use lads_core::{Data, Isa, similarity};
 use lads_host::Opened;
 use numpy::{PyArray1, PyArrayDyn, PyArrayMethods};
 use pyo3::prelude::*;
@@ -13,8 +13,8 @@ use pyo3::types::{PyBytes, PyDict, PyTuple};
 
 use crate::arrays;
 use crate::cell::{Checked, Working};
-use crate::controller::{Controller, Settings};
-use crate::errors::{OpenError, SelfTestError, WorkspaceError, opening};
+use crate::controller::{Controller, Settings, Told};
+use crate::errors::{InstructionError, OpenError, SelfTestError, WorkspaceError, opening};
 
 /// A policy that was read and checked. It never changes and may be used by any number of threads.
 #[pyclass(frozen, module = "lads")]
@@ -242,6 +242,50 @@ impl Policy {
         fields.set_item("tolerance", golden.tolerance())?;
         let class = py.import("lads.contract")?.getattr("Golden")?;
         class.call((), Some(&fields)).map(Some)
+    }
+
+    /// Returns the word embeddings of a known instruction, by its id or text: float32 [words, dim].
+    fn words<'py>(
+        &self,
+        py: Python<'py>,
+        instruction: &str,
+    ) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
+        let contract = self.checked.view().contract();
+        let found = self.checked.opened().instruction(instruction);
+        let found = found.map_err(|error| InstructionError::new_err(error.to_string()))?;
+        let known = contract.instruction(found as usize);
+        let words = known.map_or(&[][..], |known| known.words);
+        let dim = contract.word_dim();
+        shaped(py, words, &[words.len() / dim.max(1), dim])
+    }
+
+    /// Finds the known instruction that word embeddings float32 [words, dim] are most similar to ->
+    /// lads.Nearest.
+    ///
+    /// A policy follows any words, nonsense too: follow only what is `accepted`, at the similarity
+    /// that the contract asks for.
+    fn nearest<'py>(
+        &self,
+        py: Python<'py>,
+        words: &Bound<'py, PyAny>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let contract = self.checked.view().contract();
+        let Told::Words(words) = Told::of(&self.checked, words)? else {
+            return Err(InstructionError::new_err(
+                "nearest compares word embeddings; give an array float32 [words, dim], as lads.language.Encoder makes it",
+            ));
+        };
+        let known = contract.instructions().map(|known| known.words);
+        let found = similarity::nearest(&words, known, contract.word_dim());
+        let Some((place, alike)) = found else {
+            return Err(InstructionError::new_err(
+                "the policy knows no instruction that words could be compared with; give none",
+            ));
+        };
+        let known = self.contract(py)?.getattr(py, "instructions")?;
+        let known = known.bind(py).get_item(place)?;
+        let class = py.import("lads.contract")?.getattr("Nearest")?;
+        class.call1((known, f64::from(alike), alike >= contract.acceptance()))
     }
 
     /// Replays the golden episode on this machine and compares the indices in force and the actions -> lads.SelfTest.

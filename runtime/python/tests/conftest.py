@@ -38,6 +38,15 @@ def bundles(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def language_cache(tmp_path_factory):
+    """A folder for LADS_CACHE with the language encoder of the shipped policies, exported once."""
+    graph, language = pytest.importorskip("lads_exporter.language_graph"), pytest.importorskip("lads_exporter.language")
+    folder = tmp_path_factory.mktemp("cache")
+    assert graph.write(language.DEFAULT, folder / "language" / language.DEFAULT)
+    return folder
+
+
+@pytest.fixture(scope="session")
 def kitchen():
     """The small kitchen policy: instructions, plans, a KV cache."""
     return lads.open(PROJECT / "models/kitchen-small.onnx")

@@ -21,7 +21,8 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
-def test_snippets_run_as_typed(name, folder, monkeypatch, capsys):
+def test_snippets_run_as_typed(name, folder, language_cache, monkeypatch, capsys):
+    monkeypatch.setenv("LADS_CACHE", str(language_cache))
     # FrankaKitchen-v1 asserts on the MuJoCo of the tests; the exporter has what it lacks.
     from gymnasium_robotics.utils import mujoco_utils
     from lads_exporter import official
@@ -39,5 +40,6 @@ def test_snippets_run_as_typed(name, folder, monkeypatch, capsys):
     if name == "docs/python.md":
         said = capsys.readouterr().out
         assert "its dtype is float64" in said and "INCONCLUSIVE" in said and "success 1.000" in said, said
+        assert "drawer" in said, said
         assert "double-precision evaluation" in said and "\njoints" in said, said
         assert (folder / "certificate.html").exists() and (folder / "certificate.json").exists()

@@ -2,7 +2,7 @@
 
 `open` reads a policy, a bundle (.onnx) or a compiled image (.lads), and `import_onnx` any other ONNX policy; `Policy.controller` runs it;
 `Controller.step` turns an observation into an action. `lads.gym` evaluates a controller in any environment of Gymnasium's API,
-`lads.vector` steps many of them over threads, and `verify` compares one with the policy that was trained. Every refusal is an exception
+`lads.vector` steps many of them over threads, `lads.language` turns a sentence in any words into an instruction, and `verify` compares one with the policy that was trained. Every refusal is an exception
 of `lads.errors`.
 """
 
@@ -15,15 +15,15 @@ from ._lads import Controller, Policy, Selected, StepReport, __version__, forked
 from .errors import LadsError
 
 if TYPE_CHECKING:
-    from . import gym, vector
-    from .contract import Channel, Context, Contract, Element, Golden, Instruction, Language, SelfTest
+    from . import gym, language, vector
+    from .contract import Channel, Context, Contract, Element, Golden, Instruction, Language, Nearest, SelfTest
     from .recording import Recorder
     from .verification import Certificate, Reply, verify
 
 # What a control loop does not need is imported when it is first asked for: that is three quarters of the time of an import.
 _LATER = {
-    **dict.fromkeys(("gym", "vector"), None),
-    **dict.fromkeys(("Channel", "Context", "Contract", "Element", "Golden", "Instruction", "Language", "SelfTest"), "contract"),
+    **dict.fromkeys(("gym", "language", "vector"), None),
+    **dict.fromkeys(("Channel", "Context", "Contract", "Element", "Golden", "Instruction", "Language", "Nearest", "SelfTest"), "contract"),
     **dict.fromkeys(("Certificate", "Reply", "verify"), "verification"),
     "Recorder": "recording",
 }
@@ -57,6 +57,7 @@ __all__ = [
     "Instruction",
     "LadsError",
     "Language",
+    "Nearest",
     "Policy",
     "Recorder",
     "Reply",
@@ -68,6 +69,7 @@ __all__ = [
     "from_image",
     "gym",
     "import_onnx",
+    "language",
     "open",
     "template",
     "vector",

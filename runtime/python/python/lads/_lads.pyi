@@ -7,7 +7,7 @@ from typing import Any, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from .contract import Contract, Golden, SelfTest
+from .contract import Contract, Golden, Nearest, SelfTest
 from .vector import Report
 
 Array: TypeAlias = NDArray[Any]
@@ -85,6 +85,8 @@ class Policy:
     @property
     def notes(self) -> tuple[str, ...]: ...
     def inspect(self) -> dict[str, Any]: ...
+    def words(self, instruction: str) -> Floats: ...
+    def nearest(self, words: Floats) -> Nearest: ...
     def self_test(self) -> SelfTest: ...
     def controller(
         self,

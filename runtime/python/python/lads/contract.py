@@ -115,6 +115,17 @@ class Contract:
         return next(channel for channel in self.channels if channel.role == "action")
 
 
+@dataclass(frozen=True)
+class Nearest:
+    """The known instruction that a sentence is most similar to."""
+
+    instruction: Instruction
+    similarity: float
+    """Mean over the sentence's words of the cosine with the instruction's word that is most like each; -1 to 1."""
+    accepted: bool
+    """Whether the contract lets a sentence of this similarity be followed."""
+
+
 @dataclass(frozen=True, eq=False)
 class Golden:
     """The recorded episode of the self-test."""

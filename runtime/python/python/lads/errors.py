@@ -34,6 +34,10 @@ class InstructionError(LadsError, ValueError):
     """An instruction is unknown, malformed or missing."""
 
 
+class LanguageError(LadsError, ValueError):
+    """The language encoder is missing, damaged or another one, or a sentence is empty or too long."""
+
+
 class StepError(LadsError, RuntimeError):
     """A control step gave no action, such as one beyond the end of the context."""
 
