@@ -9,8 +9,8 @@ use lads_benches::sweep::Sweep;
 use lads_host::Aligned;
 use lads_kernels::stored::{round_to_f16, to_f16, to_int16};
 use lads_kernels::{
-    Activation, Attention, Cache, CacheFormat, Isa, LayerNorm, Linear, Panels, WeightFormat,
-    attention_scratch_len, keys_len, pack, packed_len,
+    Activation, Attention, Cache, CacheFormat, Isa, LayerNorm, Linear, Panels, Scaled,
+    WeightFormat, attention_scratch_len, keys_len, pack, packed_len,
 };
 
 /// Returns `count` elements that are neither zero nor all the same.
@@ -95,6 +95,13 @@ fn attention(criterion: &mut Criterion) {
     );
     let halves = |x: &[f32]| -> Vec<u16> { x.iter().map(|&x| round_to_f16(x)).collect() };
     let [half_keys, half_values] = [halves(&keys), halves(&values)];
+    let integers = |x: &[f32]| -> Vec<i8> { x.iter().map(|&x| (x * 127.0) as i8).collect() };
+    let [key_integers, value_integers] = [integers(&keys), integers(&values)];
+    let scales = numbers(CacheFormat::Int8.scales(capacity, heads));
+    let scaled = |integers| Scaled {
+        integers,
+        scales: &scales,
+    };
     let caches = [
         Cache::F32 {
             keys: &keys,
@@ -103,6 +110,10 @@ fn attention(criterion: &mut Criterion) {
         Cache::F16 {
             keys: &half_keys,
             values: &half_values,
+        },
+        Cache::Int8 {
+            keys: scaled(&key_integers),
+            values: scaled(&value_integers),
         },
     ];
     for (format, cache) in CacheFormat::ALL.into_iter().zip(caches) {

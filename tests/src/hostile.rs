@@ -90,7 +90,7 @@ fn images() -> &'static [Vec<u32>] {
             storage: Some(
                 Storage::of_weights(WeightFormat::Int8)
                     .with_part("low_level/act", WeightFormat::F16)
-                    .with_cache(CacheFormat::F16),
+                    .with_cache(CacheFormat::Int8),
             ),
             force: true,
             ..Options::default()

@@ -17,7 +17,6 @@ mod weights;
 use std::collections::{HashMap, HashSet};
 
 use lads_image::op::{self, CacheFormat, IntSlot, Operand, Place, Space, Span, StateSpan};
-use lads_kernels::keys_len;
 
 use crate::contract::Network;
 use crate::error::CompileError;
@@ -44,7 +43,7 @@ pub(crate) struct Lowered {
 }
 
 /// Layout of a KV cache: for each layer keys, in whole blocks of sixteen tokens, then values,
-/// `[capacity, heads * head_dim]`.
+/// `[capacity, heads * head_dim]`, each followed by its scales, if the format has any.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Cache {
     pub format: CacheFormat,
@@ -75,27 +74,22 @@ impl Cache {
         head_dim: 0,
     };
 
-    fn width(&self) -> usize {
-        self.heads * self.head_dim
-    }
-
     /// Returns the number of words of one layer's keys and of its values.
-    fn words(&self) -> Option<[usize; 2]> {
-        let keys = keys_len(self.capacity, self.width());
-        let values = self.width().checked_mul(self.capacity)?;
-        Some([keys, values].map(|elements| self.format.words(elements)))
+    fn words(&self) -> [usize; 2] {
+        self.format
+            .words(self.capacity, [self.heads, self.head_dim])
     }
 
     /// Returns the number of words of all layers.
     pub fn len(&self) -> Option<u32> {
-        let [keys, values] = self.words()?;
+        let [keys, values] = self.words();
         let layer = values.checked_add(keys)?;
         u32::try_from(layer.checked_mul(self.layers)?).ok()
     }
 
     pub(crate) fn spans(&self, layer: usize) -> [StateSpan; 2] {
         // Of a cache whose length was asked for, and fits 32 bits.
-        let [keys, values] = self.words().unwrap_or_default().map(|words| words as u32);
+        let [keys, values] = self.words().map(|words| words as u32);
         let offset = layer as u32 * (keys + values);
         [
             StateSpan { offset, len: keys },

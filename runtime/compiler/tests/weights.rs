@@ -166,6 +166,7 @@ fn what_only_chooses_plans_may_take_fewer_bits_and_no_tolerance() {
     let exact = compile_with(&bundle, &Options::exact()).unwrap();
     let (reference, margins) = replayed(&exact, Isa::detect());
     let halves = Storage::default().with_cache(CacheFormat::F16);
+    let integers = Storage::default().with_cache(CacheFormat::Int8);
     let mixed = Storage::of_weights(WeightFormat::F16)
         .with_part("low_level/act", WeightFormat::F32)
         .with_cache(CacheFormat::F16);
@@ -182,6 +183,7 @@ fn what_only_chooses_plans_may_take_fewer_bits_and_no_tolerance() {
     };
     for (storage, text) in [
         (&halves, "f32 weights and an f16 cache"),
+        (&integers, "f32 weights and an int8 cache"),
         (&mixed, "f16 weights (low_level/act f32) and an f16 cache"),
     ] {
         assert_eq!(

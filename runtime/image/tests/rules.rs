@@ -147,17 +147,23 @@ fn each_rule_of_an_op_is_enforced() {
         });
     };
     assert_eq!(fault(StepDecide, shrink), Some(Fault::Capacity));
-    let halved = |spare: u32| {
+    let smaller = |format: CacheFormat, [keys, values]: [u32; 2]| {
         fault(StepDecide, |ops| {
             edit_first!(ops, Attention, op => {
-                op.format = CacheFormat::F16;
-                op.cache_k.len = op.cache_k.len.div_ceil(2);
-                op.cache_v.len = op.cache_v.len.div_ceil(2) - spare;
+                let heads = [op.heads, op.head_dim].map(|count| count as usize);
+                let capacity = op.cache_v.len as usize / (heads[0] * heads[1]);
+                op.format = format;
+                [op.cache_k.len, op.cache_v.len] = format.words(capacity, heads).map(|words| words as u32);
+                op.cache_k.len -= keys;
+                op.cache_v.len -= values;
             });
         })
     };
-    assert_eq!(halved(0), None);
-    assert_eq!(halved(1), Some(Fault::Capacity));
+    for format in [CacheFormat::F16, CacheFormat::Int8] {
+        assert_eq!(smaller(format, [0, 0]), None);
+        assert_eq!(smaller(format, [1, 0]), shape);
+        assert_eq!(smaller(format, [0, 1]), Some(Fault::Capacity));
+    }
 }
 
 #[test]

@@ -10,13 +10,16 @@
 //! p[r] = exp(s[r] - max s) / sum over r of exp(s[r] - max s)
 //! y    = sum over r of p[r] * V[r]
 //! ```
+//!
+//! The scales of a cache of integers multiply the scores and the probabilities, sixteen rows at
+//! once, so that the loops over the cache are those of floats.
 
 use crate::cache::{Cache, Cached, keys_len};
 use crate::dispatch::{Isa, Kernel};
 use crate::lanes::{Block, LANES};
 use crate::norm::exponentials;
 use crate::simd::{Simd, prefetch_ahead};
-use crate::stored::{F16, F32};
+use crate::stored::{F16, F32, Int8};
 
 /// Number of queries that share one pass over the cache.
 const TOGETHER: usize = 2;
@@ -56,10 +59,19 @@ impl Attention<'_> {
             return;
         }
         match self.cache {
-            Cache::F32 { keys, values } => self.over::<F32>(isa, keys, values, q, y, scratch),
+            Cache::F32 { keys, values } => {
+                self.over::<F32>(isa, [keys, values], None, q, y, scratch);
+            }
             Cache::F16 { keys, values } => {
                 if cfg!(feature = "half-cache") {
-                    self.over::<F16>(isa, keys, values, q, y, scratch);
+                    self.over::<F16>(isa, [keys, values], None, q, y, scratch);
+                }
+            }
+            Cache::Int8 { keys, values } => {
+                if cfg!(feature = "integer-cache") {
+                    let integers = [keys.integers, values.integers];
+                    let scales = Some([keys.scales, values.scales]);
+                    self.over::<Int8>(isa, integers, scales, q, y, scratch);
                 }
             }
         }
@@ -69,8 +81,8 @@ impl Attention<'_> {
     fn over<C: Cached>(
         &self,
         isa: Isa,
-        keys: &[C::Bits],
-        values: &[C::Bits],
+        [keys, values]: [&[C::Bits]; 2],
+        scales: Option<[&[f32]; 2]>,
         q: &[f32],
         y: &mut [f32],
         scratch: &mut [f32],
@@ -105,12 +117,29 @@ impl Attention<'_> {
                 blocks,
                 p,
             });
+            let heads = self.heads;
+            if let Some([scales, _]) = scales {
+                isa.run(Scaled {
+                    heads,
+                    scales,
+                    blocks,
+                    p,
+                });
+            }
             isa.run(Probabilities {
-                heads: self.heads,
+                heads,
                 visible,
                 blocks,
                 p,
             });
+            if let Some([_, scales]) = scales {
+                isa.run(Scaled {
+                    heads,
+                    scales,
+                    blocks,
+                    p,
+                });
+            }
             let sums = Sums::<C> {
                 op: self,
                 values: values.get(..rows * width).unwrap_or(&[]),
@@ -199,6 +228,30 @@ impl Kernel for Probabilities<'_> {
             let scale = 1.0 / exponentials(p);
             for p in p {
                 *p *= scale;
+            }
+        }
+    }
+}
+
+/// Multiplies scores or probabilities by the scales of the rows that they are of; what lies beyond
+/// the visible rows becomes anything, and is not read.
+struct Scaled<'a> {
+    heads: usize,
+    /// Scales, `[heads][capacity / 16][16]`.
+    scales: &'a [f32],
+    blocks: usize,
+    p: &'a mut [Block],
+}
+
+impl Kernel for Scaled<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let (scales, _) = self.scales.as_chunks::<LANES>();
+        let of_head = scales.len().checked_div(self.heads).unwrap_or(0).max(1);
+        let of_all = scales.chunks_exact(of_head).cycle();
+        for (p, scales) in self.p.chunks_exact_mut(self.blocks.max(1)).zip(of_all) {
+            for (p, scales) in p.iter_mut().zip(scales) {
+                simd.store(simd.mul(simd.load(p), simd.load(scales)), p);
             }
         }
     }

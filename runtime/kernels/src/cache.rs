@@ -1,21 +1,23 @@
-//! Layout of the key-value cache, in 32 bits or in 16.
+//! Layout of the key-value cache, in 32 bits, in 16 or in 8.
 //!
 //! Keys are stored in blocks of sixteen tokens, each block transposed,
 //! `[capacity / 16][width][16]`, the last block a whole one; values are stored one contiguous row
 //! per token, `[capacity][width]`. Both are written once per token, by [`Append`], and read by
 //! [`Attention`](crate::Attention) in every later control step; with half precision they take half
-//! the memory and half the time to read, and are decoded in registers. Sums are always 32-bit
+//! the memory and half the time to read, as integers a quarter, and are decoded in registers.
+//! Integers have a scale for each row and head, `[heads][capacity / 16][16]`. Sums are always 32-bit
 //! floats.
 //!
-//! Nothing here can fail: rows beyond a cache's end are not written, and a number that half
-//! precision cannot hold becomes infinite (and results computed from it are not finite, which the
-//! controller refuses to send to motors).
+//! Nothing here can fail: rows beyond a cache's end are not written, and a number that the format
+//! cannot hold makes infinite or NaN what is computed from it, which the controller refuses to send
+//! to motors.
 
 use crate::dispatch::{Isa, Kernel};
 use crate::elementwise::assign;
+use crate::integers::scales;
 use crate::lanes::{Block, LANES};
 use crate::simd::{Portable, Simd};
-use crate::stored::{self, F16, F32, Stored};
+use crate::stored::{self, F16, F32, INT8_LARGEST, Int8, Stored};
 
 /// Storage format of the elements of a cache.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
@@ -25,40 +27,73 @@ pub enum CacheFormat {
     F32,
     /// IEEE 754 half precision, rounded to the nearest number of 11 bits.
     F16,
+    /// 8-bit integers -127 to 127, with a 32-bit float as scale for each row and head: the largest
+    /// magnitude becomes 127, the others the nearest integers.
+    Int8,
 }
 
 impl CacheFormat {
     /// All cache formats, the most exact first.
-    pub const ALL: [Self; 2] = [Self::F32, Self::F16];
+    pub const ALL: [Self; 3] = [Self::F32, Self::F16, Self::Int8];
 
     /// Returns the size of an element in bytes.
     pub const fn bytes(self) -> usize {
         match self {
             Self::F32 => 4,
             Self::F16 => 2,
+            Self::Int8 => 1,
         }
     }
 
-    /// Returns the name of the format: `f32` or `f16`.
+    /// Returns the name of the format: `f32`, `f16` or `int8`.
     pub const fn name(self) -> &'static str {
         match self {
             Self::F32 => "f32",
             Self::F16 => "f16",
+            Self::Int8 => "int8",
         }
     }
 
     /// Returns the number of elements in four bytes.
     pub const fn per_word(self) -> usize {
-        match self {
-            Self::F32 => 1,
-            Self::F16 => 2,
-        }
+        size_of::<f32>() / self.bytes()
     }
 
-    /// Returns the number of 4-byte words that `elements` elements take.
-    pub const fn words(self, elements: usize) -> usize {
-        elements.div_ceil(self.per_word())
+    /// Returns the number of 4-byte words of the keys and of the values of a cache of `capacity`
+    /// rows of `heads` heads: elements, then scales.
+    pub const fn words(self, capacity: usize, [heads, head_dim]: [usize; 2]) -> [usize; 2] {
+        let width = heads.saturating_mul(head_dim);
+        let keys = keys_len(capacity, width).div_ceil(self.per_word());
+        let values = capacity.saturating_mul(width).div_ceil(self.per_word());
+        let scales = self.scales(capacity, heads);
+        [keys.saturating_add(scales), values.saturating_add(scales)]
     }
+
+    /// Returns the number of scales of the keys of a cache, and of its values.
+    pub const fn scales(self, capacity: usize, heads: usize) -> usize {
+        match self {
+            Self::F32 | Self::F16 => 0,
+            Self::Int8 => keys_len(capacity, heads),
+        }
+    }
+}
+
+/// Integers with their scales, to read.
+#[derive(Debug, Clone, Copy)]
+pub struct Scaled<'c> {
+    /// The elements.
+    pub integers: &'c [i8],
+    /// Scale of each row and head, `[heads][capacity / 16][16]`.
+    pub scales: &'c [f32],
+}
+
+/// Integers with their scales, to write.
+#[derive(Debug)]
+pub struct ScaledMut<'c> {
+    /// The elements.
+    pub integers: &'c mut [i8],
+    /// Scale of each row and head, `[heads][capacity / 16][16]`.
+    pub scales: &'c mut [f32],
 }
 
 /// A key-value cache to read: keys, [`keys_len`] elements, and values, `[capacity, width]`.
@@ -77,6 +112,13 @@ pub enum Cache<'c> {
         keys: &'c [u16],
         /// Values, `[capacity, width]`.
         values: &'c [u16],
+    },
+    /// A cache in [`CacheFormat::Int8`].
+    Int8 {
+        /// Keys, [`keys_len`] elements.
+        keys: Scaled<'c>,
+        /// Values, `[capacity, width]`.
+        values: Scaled<'c>,
     },
 }
 
@@ -97,6 +139,13 @@ pub enum CacheMut<'c> {
         /// Values, `[capacity, width]`.
         values: &'c mut [u16],
     },
+    /// A cache in [`CacheFormat::Int8`].
+    Int8 {
+        /// Keys, [`keys_len`] elements.
+        keys: ScaledMut<'c>,
+        /// Values, `[capacity, width]`.
+        values: ScaledMut<'c>,
+    },
 }
 
 impl CacheMut<'_> {
@@ -105,37 +154,67 @@ impl CacheMut<'_> {
         match self {
             Self::F32 { keys, values } => Cache::F32 { keys, values },
             Self::F16 { keys, values } => Cache::F16 { keys, values },
+            Self::Int8 { keys, values } => Cache::Int8 {
+                keys: keys.as_ref(),
+                values: values.as_ref(),
+            },
+        }
+    }
+}
+
+impl ScaledMut<'_> {
+    fn as_ref(&self) -> Scaled<'_> {
+        Scaled {
+            integers: self.integers,
+            scales: self.scales,
         }
     }
 }
 
 /// A format that a cache may have.
 pub(crate) trait Cached: Stored<Bits: Copy> {
-    /// Converts sixteen numbers to the stored format.
-    fn stored<S: Simd>(simd: S, from: &Block) -> [Self::Bits; LANES];
-    /// Decodes one stored number.
+    /// Decodes one stored number, but for its scale.
     fn number(bits: Self::Bits) -> f32;
 }
 
+/// A format of floats, which have no scales.
+trait Float: Cached {
+    /// Converts sixteen numbers to the stored format.
+    fn stored<S: Simd>(simd: S, from: &Block) -> [Self::Bits; LANES];
+}
+
 impl Cached for F32 {
-    #[inline(always)]
-    fn stored<S: Simd>(_: S, from: &Block) -> Block {
-        *from
-    }
     #[inline(always)]
     fn number(bits: f32) -> f32 {
         bits
     }
 }
 
+impl Float for F32 {
+    #[inline(always)]
+    fn stored<S: Simd>(_: S, from: &Block) -> Block {
+        *from
+    }
+}
+
 impl Cached for F16 {
+    #[inline(always)]
+    fn number(bits: u16) -> f32 {
+        stored::from_f16(bits)
+    }
+}
+
+impl Float for F16 {
     #[inline(always)]
     fn stored<S: Simd>(simd: S, from: &Block) -> [u16; LANES] {
         simd.round_to_f16(simd.load(from))
     }
+}
+
+impl Cached for Int8 {
     #[inline(always)]
-    fn number(bits: u16) -> f32 {
-        stored::from_f16(bits)
+    fn number(bits: i8) -> f32 {
+        bits.into()
     }
 }
 
@@ -158,6 +237,8 @@ pub struct Append<'x> {
     pub v_stride: usize,
     /// Number of elements of a row.
     pub width: usize,
+    /// Number of heads that share a row.
+    pub heads: usize,
     /// Row of the cache for the first token.
     pub first: usize,
 }
@@ -177,12 +258,22 @@ impl Append<'_> {
                     });
                 }
             }
+            CacheMut::Int8 { keys, values } => {
+                if cfg!(feature = "integer-cache") {
+                    let append = self;
+                    isa.run(Quantised {
+                        append,
+                        keys,
+                        values,
+                    });
+                }
+            }
         }
     }
 
     /// Writes keys and values row by row, sixteen elements at a time.
     #[inline(always)]
-    fn write<C: Cached, S: Simd>(&self, simd: S, keys: &mut [C::Bits], values: &mut [C::Bits]) {
+    fn write<C: Float, S: Simd>(&self, simd: S, keys: &mut [C::Bits], values: &mut [C::Bits]) {
         let width = self.width.max(1);
         let rows = values
             .get_mut(self.first * width..)
@@ -217,6 +308,73 @@ fn block(x: &[f32]) -> Block {
     let mut block = [0.0; LANES];
     assign(&mut block, x);
     block
+}
+
+/// Kernel that quantises numbers to 8 bits, head by head.
+struct Quantised<'a, 'c> {
+    append: &'a Append<'a>,
+    keys: &'a mut ScaledMut<'c>,
+    values: &'a mut ScaledMut<'c>,
+}
+
+impl Kernel for Quantised<'_, '_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Append {
+            k,
+            k_stride,
+            v,
+            v_stride,
+            width,
+            heads,
+            first,
+        } = *self.append;
+        let head_dim = width.checked_div(heads).unwrap_or(0).max(1);
+        let rows = self.keys.scales.len().checked_div(heads).unwrap_or(0);
+        let tokens = k.chunks(k_stride.max(1)).zip(v.chunks(v_stride.max(1)));
+        for (row, (k, v)) in (first..rows).zip(tokens) {
+            // Beyond the heads lies what is between a row and the next.
+            let of_heads = k.chunks_exact(head_dim).zip(v.chunks_exact(head_dim));
+            for (head, (k, v)) in of_heads.take(heads).enumerate() {
+                let (column, scale) = (head * head_dim, head * rows + row);
+                let key = (row / LANES * width + column) * LANES + row % LANES;
+                self.keys.set(simd, k, [key, LANES], scale);
+                let value = row * width + column;
+                self.values.set(simd, v, [value, 1], scale);
+            }
+        }
+    }
+}
+
+impl ScaledMut<'_> {
+    /// Writes the elements of a head, from position `first` on, `step` apart, and their scale.
+    #[inline(always)]
+    fn set<S: Simd>(&mut self, simd: S, x: &[f32], [first, step]: [usize; 2], scale: usize) {
+        let (blocks, rest) = x.as_chunks::<LANES>();
+        let last = block(rest);
+        // Loops, because iterators that take closures are not compiled for the instruction set.
+        let mut largest = simd.larger(simd.zeros(), simd.load(&last));
+        for block in blocks {
+            largest = simd.larger(largest, simd.load(block));
+        }
+        let (per_number, per_unit) = scales(simd.largest(largest), INT8_LARGEST);
+        let per_number = simd.splat(per_number);
+        let to = self.integers.get_mut(first..).unwrap_or(&mut []);
+        for (to, block) in to.chunks_mut(LANES * step).zip(blocks) {
+            let integers = simd.whole(simd.mul(simd.load(block), per_number));
+            for (to, integer) in to.iter_mut().step_by(step).zip(integers) {
+                *to = integer as i8;
+            }
+        }
+        let to = to.get_mut(blocks.len() * LANES * step..).unwrap_or(&mut []);
+        let integers = simd.whole(simd.mul(simd.load(&last), per_number));
+        for ((to, integer), _) in to.iter_mut().step_by(step).zip(integers).zip(rest) {
+            *to = integer as i8;
+        }
+        if let Some(to) = self.scales.get_mut(scale) {
+            *to = per_unit;
+        }
+    }
 }
 
 /// Kernel that rounds numbers to half precision.

@@ -58,7 +58,7 @@ mod strided;
 mod subnormal;
 
 pub use attention::{Attention, attention_scratch_len};
-pub use cache::{Append, Cache, CacheFormat, CacheMut, keys_len};
+pub use cache::{Append, Cache, CacheFormat, CacheMut, Scaled, ScaledMut, keys_len};
 pub use conv::{Conv, Sweep, conv_pack, conv_packed_len};
 pub use conv_integers::{IntegerConv, conv_integers_len, conv_integers_pack, conv_scale};
 pub use depthwise::{Depthwise, depthwise_pack, depthwise_packed_len};

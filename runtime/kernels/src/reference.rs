@@ -9,7 +9,8 @@ mod images;
 
 use crate::stored::from_f16;
 use crate::{
-    Activation, Attention, Axis, BinaryKind, Cache, MatMul, ReduceKind, StridedCopy, UnaryKind,
+    Activation, Attention, Axis, BinaryKind, Cache, MatMul, ReduceKind, Scaled, StridedCopy,
+    UnaryKind,
 };
 
 pub use images::{conv, depthwise, integer_conv, pool, resize};
@@ -104,11 +105,11 @@ pub fn attention(op: &Attention, q: &[f32], y: &mut [f32]) {
             let score: f64 = (head..head + op.head_dim)
                 .map(|c| {
                     f64::from(q[query * op.q_stride + c])
-                        * f64::from(op.cache.key(key(width, row, c)))
+                        * f64::from(op.cache.key(width, op.heads, [row, c]))
                 })
                 .sum();
             let p = libm::exp(score * f64::from(op.scale));
-            sum += p * f64::from(op.cache.value(row * width + col));
+            sum += p * f64::from(op.cache.value(width, op.heads, [row, col]));
             total += p;
         }
         *y = (sum / total) as f32;
@@ -116,19 +117,29 @@ pub fn attention(op: &Attention, q: &[f32], y: &mut [f32]) {
 }
 
 impl Cache<'_> {
-    fn key(&self, at: usize) -> f32 {
+    fn key(&self, width: usize, heads: usize, [row, col]: [usize; 2]) -> f32 {
+        let at = key(width, row, col);
         match self {
             Self::F32 { keys, .. } => keys[at],
             Self::F16 { keys, .. } => from_f16(keys[at]),
+            Self::Int8 { keys, .. } => scaled(keys, at, [width, heads], [row, col]),
         }
     }
 
-    fn value(&self, at: usize) -> f32 {
+    fn value(&self, width: usize, heads: usize, [row, col]: [usize; 2]) -> f32 {
+        let at = row * width + col;
         match self {
             Self::F32 { values, .. } => values[at],
             Self::F16 { values, .. } => from_f16(values[at]),
+            Self::Int8 { values, .. } => scaled(values, at, [width, heads], [row, col]),
         }
     }
+}
+
+/// Returns the number at a position of a cache of integers.
+fn scaled(of: &Scaled, at: usize, [width, heads]: [usize; 2], [row, col]: [usize; 2]) -> f32 {
+    let scales = &of.scales[col * heads / width * (of.scales.len() / heads)..];
+    f32::from(of.integers[at]) * scales[row]
 }
 
 /// Returns the position of element `col` of key `row`.

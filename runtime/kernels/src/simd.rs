@@ -63,6 +63,8 @@ pub(crate) trait Simd: Copy {
     fn round_to_f16(self, v: Self::V) -> [u16; LANES];
     /// Loads sixteen brain floats, see [`stored::from_bf16`].
     fn load_bf16(self, from: &[u16; LANES]) -> Self::V;
+    /// Loads sixteen 8-bit integers as floats.
+    fn load_bytes(self, from: &[i8; LANES]) -> Self::V;
     /// Returns the same two integers in every lane.
     #[expect(
         clippy::trivially_copy_pass_by_ref,
@@ -240,6 +242,15 @@ impl Simd for Portable {
     #[inline(always)]
     fn load_bf16(self, from: &[u16; LANES]) -> Block {
         from.map(stored::from_bf16)
+    }
+
+    #[inline(always)]
+    fn load_bytes(self, from: &[i8; LANES]) -> Block {
+        let mut to = [0.0; LANES];
+        for (to, &from) in to.iter_mut().zip(from) {
+            *to = from.into();
+        }
+        to
     }
 
     #[inline(always)]

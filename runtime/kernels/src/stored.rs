@@ -101,6 +101,8 @@ pub(crate) trait Stored {
 pub(crate) struct F32;
 pub(crate) struct F16;
 pub(crate) struct Bf16;
+/// Integers that are read as floats; their scale is applied elsewhere.
+pub(crate) struct Int8;
 
 impl Stored for F32 {
     type Bits = f32;
@@ -123,6 +125,14 @@ impl Stored for Bf16 {
     #[inline(always)]
     fn load<S: Simd>(simd: S, from: &[u16; LANES]) -> S::V {
         simd.load_bf16(from)
+    }
+}
+
+impl Stored for Int8 {
+    type Bits = i8;
+    #[inline(always)]
+    fn load<S: Simd>(simd: S, from: &[i8; LANES]) -> S::V {
+        simd.load_bytes(from)
     }
 }
 
@@ -221,7 +231,7 @@ pub fn to_bf16(x: f32) -> Option<u16> {
 const INT16_LARGEST: f32 = 16383.0;
 
 /// Largest quantised `Int8` magnitude.
-const INT8_LARGEST: f32 = 127.0;
+pub(crate) const INT8_LARGEST: f32 = 127.0;
 
 /// Returns the scale of one output's weights in `Int8`: their largest magnitude / 127; 1 if all are
 /// zero.

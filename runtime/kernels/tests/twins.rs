@@ -6,9 +6,9 @@ mod support;
 use lads_kernels::reference as naive;
 use lads_kernels::{
     Activation, Append, Attention, Axis, BinaryKind, Cache, CacheFormat, CacheMut, Input, Isa,
-    LayerNorm, Linear, MatMul, Panels, ReduceKind, StridedCopy, Unary, UnaryKind, WeightFormat,
-    arg_max, arg_min, attention_scratch_len, binary, keys_len, pack, packed_len, reduce, softmax,
-    stored,
+    LayerNorm, Linear, MatMul, Panels, ReduceKind, Scaled, ScaledMut, StridedCopy, Unary,
+    UnaryKind, WeightFormat, arg_max, arg_min, attention_scratch_len, binary, keys_len, pack,
+    packed_len, reduce, softmax, stored,
 };
 use proptest::prelude::*;
 use proptest::sample::select;
@@ -60,12 +60,16 @@ fn close(got: &[f32], expected: &[f32], bound: f32) {
     close_up_to(got, expected, bound, &vec![0.0; got.len()]);
 }
 
-/// Returns the bits of a number in a cache of this format.
-fn bits(format: CacheFormat, x: f32) -> u32 {
-    match format {
+/// Returns the bits of a head's numbers in a cache of this format, and its scale.
+fn bits(format: CacheFormat, head: &[f32]) -> (Vec<u32>, Option<f32>) {
+    let largest = head.iter().fold(0.0_f32, |largest, x| largest.max(x.abs()));
+    let number = |x: &f32| match format {
         CacheFormat::F32 => x.to_bits(),
-        CacheFormat::F16 => stored::round_to_f16(x).into(),
-    }
+        CacheFormat::F16 => stored::round_to_f16(*x).into(),
+        CacheFormat::Int8 => u32::from((x * (127.0 / largest)).round_ties_even() as i8 as u8),
+    };
+    let scale = (format == CacheFormat::Int8).then_some(largest / 127.0);
+    (head.iter().map(number).collect(), scale)
 }
 
 /// A cache and its memory.
@@ -73,14 +77,28 @@ fn bits(format: CacheFormat, x: f32) -> u32 {
 enum Stored {
     F32([Vec<f32>; 2]),
     F16([Vec<u16>; 2]),
+    /// Keys and values, each with their scales.
+    Int8([(Vec<i8>, Vec<f32>); 2]),
 }
 
 impl Stored {
-    fn new(format: CacheFormat, keys: Vec<f32>, values: Vec<f32>) -> Self {
+    /// Makes a cache of `rows` rows of these keys and values, whose scales of integers are some.
+    fn new(
+        format: CacheFormat,
+        [rows, heads]: [usize; 2],
+        keys: Vec<f32>,
+        values: Vec<f32>,
+    ) -> Self {
         let halves = |x: Vec<f32>| x.into_iter().map(stored::round_to_f16).collect();
+        let integers = |x: Vec<f32>| {
+            let scales = self::values(format.scales(rows, heads), 9);
+            let scales = scales.into_iter().map(|scale| scale / 127.0).collect();
+            (x.into_iter().map(|x| (x * 127.0) as i8).collect(), scales)
+        };
         match format {
             CacheFormat::F32 => Self::F32([keys, values]),
             CacheFormat::F16 => Self::F16([keys, values].map(halves)),
+            CacheFormat::Int8 => Self::Int8([keys, values].map(integers)),
         }
     }
 
@@ -88,6 +106,12 @@ impl Stored {
         match self {
             Self::F32([keys, values]) => Cache::F32 { keys, values },
             Self::F16([keys, values]) => Cache::F16 { keys, values },
+            Self::Int8(both) => {
+                let [keys, values] = both
+                    .each_ref()
+                    .map(|(integers, scales)| Scaled { integers, scales });
+                Cache::Int8 { keys, values }
+            }
         }
     }
 
@@ -95,6 +119,20 @@ impl Stored {
         match self {
             Self::F32([keys, values]) => CacheMut::F32 { keys, values },
             Self::F16([keys, values]) => CacheMut::F16 { keys, values },
+            Self::Int8(both) => {
+                let [keys, values] = both
+                    .each_mut()
+                    .map(|(integers, scales)| ScaledMut { integers, scales });
+                CacheMut::Int8 { keys, values }
+            }
+        }
+    }
+
+    /// Returns the scales of keys and of values; none of floats.
+    fn scales(&self) -> [&[f32]; 2] {
+        match self {
+            Self::F32(_) | Self::F16(_) => [&[]; 2],
+            Self::Int8(both) => both.each_ref().map(|(_, scales)| &scales[..]),
         }
     }
 
@@ -106,6 +144,9 @@ impl Stored {
             Self::F16(both) => both
                 .each_ref()
                 .map(|x| x.iter().map(|&x| x.into()).collect()),
+            Self::Int8(both) => both
+                .each_ref()
+                .map(|(x, _)| x.iter().map(|&x| u32::from(x as u8)).collect()),
         }
     }
 }
@@ -166,22 +207,29 @@ proptest! {
         for (i, &k) in values(past * width, seed ^ 1).iter().enumerate() {
             keys_before[naive::key(width, i / width, i % width)] = k;
         }
-        let before = Stored::new(format, keys_before, values_before);
-        let append = Append { k: new_k, k_stride: stride, v: new_v, v_stride: stride, width, first: past };
+        let before = Stored::new(format, [capacity, heads], keys_before, values_before);
+        let append = Append { k: new_k, k_stride: stride, v: new_v, v_stride: stride, width, heads, first: past };
         let mut caches = Isa::all().map(|isa| {
             let mut cache = before.clone();
             append.run(isa, &mut cache.writable());
             cache
         });
         let cache = caches.next().unwrap();
-        prop_assert!(caches.all(|other| other.bits() == cache.bits()));
+        prop_assert!(caches.all(|other| other.bits() == cache.bits() && other.scales() == cache.scales()));
         let ([keys, rows], [keys_before, rows_before]) = (cache.bits(), before.bits());
         for (row, col) in (0..capacity).flat_map(|row| (0..width).map(move |col| (row, col))) {
             let (key, value) = (naive::key(width, row, col), row * width + col);
-            let expected = match row.checked_sub(past).filter(|&token| token < tokens) {
-                Some(token) => [new_k, new_v].map(|new| bits(format, new[token * stride + col])),
-                None => [keys_before[key], rows_before[value]],
+            let (head, place) = (col / head_dim, col % head_dim);
+            let scale = head * capacity.next_multiple_of(16) + row;
+            let (expected, scales) = match row.checked_sub(past).filter(|&token| token < tokens) {
+                Some(token) => {
+                    let start = token * stride + head * head_dim;
+                    let [(keys, of_keys), (values, of_values)] = [new_k, new_v].map(|new| bits(format, &new[start..][..head_dim]));
+                    ([keys[place], values[place]], [of_keys, of_values])
+                }
+                None => ([keys_before[key], rows_before[value]], before.scales().map(|scales| scales.get(scale).copied())),
             };
+            prop_assert_eq!(cache.scales().map(|scales| scales.get(scale).copied()), scales);
             prop_assert_eq!([keys[key], rows[value]], expected);
         }
         let q: Vec<f32> = values((queries - 1) * stride + width, seed ^ 3).iter().map(|q| q * 4.0).collect();
@@ -392,7 +440,8 @@ fn results_have_the_same_bits_everywhere() {
         eps: 1e-5,
     };
     let (keys, cache) = (values(keys_len(50, 64), 6), values(50 * 64, 4));
-    let caches = CacheFormat::ALL.map(|format| Stored::new(format, keys.clone(), cache.clone()));
+    let caches =
+        CacheFormat::ALL.map(|format| Stored::new(format, [50, 2], keys.clone(), cache.clone()));
     let attentions = caches.each_ref().map(|cache| Attention {
         heads: 2,
         head_dim: 32,
@@ -406,12 +455,12 @@ fn results_have_the_same_bits_everywhere() {
         layer.run(isa, &values(3 * k, 3), &mut y);
         norm.run(isa, &y, &mut z);
         softmax(isa, &z, n, &mut p);
-        let [attended, halves] = attentions.map(|attention| {
+        let [attended, halves, integers] = attentions.map(|attention| {
             let mut attended = vec![0.0; 128];
             attention.run(isa, &values(128, 5), &mut attended, &mut [0.0; 256]);
             attended
         });
-        [y, z, p, attended, halves]
+        [y, z, p, attended, halves, integers]
     });
     let digests = results.map(|x| digest(&x));
     let expected = [
@@ -420,6 +469,49 @@ fn results_have_the_same_bits_everywhere() {
         0x370e_3ea7_0ba2_cda6,
         0x3994_9bd4_e431_7df5,
         0x5976_8726_5e74_d609,
+        0xc888_dde9_4bbb_d896,
     ];
     assert_eq!(digests, expected, "{digests:#x?}");
+}
+
+/// What a format cannot hold must reach the controller, which refuses it, and not become a number.
+#[test]
+fn a_row_that_is_not_finite_makes_the_attention_to_it_so() {
+    let (width, capacity) = (32, 20);
+    for format in CacheFormat::ALL {
+        for wrong in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            for (in_key, place) in [(true, 3), (false, 3), (false, 31)] {
+                let zeros = || vec![0.0; keys_len(capacity, width)];
+                let empty = Stored::new(format, [capacity, 2], zeros(), zeros());
+                let [mut k, mut v] = [values(width, 1), values(width, 2)];
+                let of = if in_key { &mut k } else { &mut v };
+                of[place] = wrong;
+                let append = Append {
+                    k: &k,
+                    k_stride: width,
+                    v: &v,
+                    v_stride: width,
+                    width,
+                    heads: 2,
+                    first: 0,
+                };
+                let [y] = on_all(|isa| {
+                    let mut cache = empty.clone();
+                    append.run(isa, &mut cache.writable());
+                    let attention = Attention {
+                        heads: 2,
+                        head_dim: 16,
+                        scale: 0.25,
+                        q_stride: width,
+                        visible: 1,
+                        cache: cache.readable(),
+                    };
+                    let mut y = vec![0.0; width];
+                    attention.run(isa, &values(width, 3), &mut y, &mut [0.0; 64]);
+                    [y]
+                });
+                assert!(!y[place].is_finite(), "{format:?}, {wrong}: {y:?}");
+            }
+        }
+    }
 }

@@ -27,8 +27,8 @@ pub struct Policy {
 
 /// Opens a policy, a bundle (.onnx), which is compiled on the way, or a compiled image (.lads).
 ///
-/// `weights` and `low_level` are 'f32', 'f16', 'bf16', 'int16' or 'int8', `cache` is 'f32' or
-/// 'f16'. Without `weights`, formats that are left out are as the bundle was tuned
+/// `weights` and `low_level` are 'f32', 'f16', 'bf16', 'int16' or 'int8', `cache` is 'f32', 'f16' or
+/// 'int8'. Without `weights`, formats that are left out are as the bundle was tuned
 /// (`lads-run tune`), or 'f32' if it was not tuned; with it, `low_level` defaults to `weights` and
 /// `cache` to 'f32'. Fewer bits have to pass the gate: the golden episode replays with the same
 /// indices and with actions inside `tolerance` (in the action's units); with `force` they need not.

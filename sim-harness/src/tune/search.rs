@@ -12,6 +12,9 @@ use lads_proof::rounding::Rounding;
 pub(super) const WEIGHTS: [WeightFormat; 3] =
     [WeightFormat::Int8, WeightFormat::Int16, WeightFormat::F16];
 
+/// Formats of caches with fewer bits than 32, the smallest first.
+const CACHES: [CacheFormat; 2] = [CacheFormat::Int8, CacheFormat::F16];
+
 /// A group of entry graphs that read the same weights.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Group {
@@ -94,8 +97,8 @@ pub fn search<E>(
         found.choose(group.name(), kept, formats, trial)?;
     }
     if parts.has_cache {
-        let half = found.storage.clone().with_cache(CacheFormat::F16);
-        let formats = [(CacheFormat::F16.name(), half)];
+        let formats =
+            CACHES.map(|format| (format.name(), found.storage.clone().with_cache(format)));
         found.choose("cache".to_owned(), CacheFormat::F32.name(), formats, trial)?;
     }
     // Last, because a cache takes more than a layer.
@@ -231,18 +234,20 @@ mod tests {
             .with_part("choose", WeightFormat::Int8)
             .with_part("hear", WeightFormat::Int8)
             .with_part("act", WeightFormat::Int8)
-            .with_cache(CacheFormat::F16);
+            .with_cache(CacheFormat::Int8);
         assert_eq!(found.storage, all);
         assert_eq!(trials, 3);
         let stored: Vec<_> = found.choices.iter().map(|choice| &*choice.stored).collect();
-        assert_eq!(stored, ["int8", "int8", "f16"]);
+        assert_eq!(stored, ["int8", "int8", "int8"]);
     }
 
     #[test]
     fn the_layer_that_is_the_reason_keeps_its_bits() {
         let int8 = |storage: &Storage, node| storage.of("choose", node) == WeightFormat::Int8;
-        let (found, _) =
-            searched(|storage| !int8(storage, "b") && storage.of("act", "d") == WeightFormat::F32);
+        let (found, _) = searched(|storage| {
+            let weights = !int8(storage, "b") && storage.of("act", "d") == WeightFormat::F32;
+            weights && storage.cache != CacheFormat::Int8
+        });
         let wanted = Storage::default()
             .with_part("choose", WeightFormat::Int16)
             .with_part("hear", WeightFormat::Int16)
@@ -253,6 +258,7 @@ mod tests {
         assert_eq!(found.storage, wanted);
         assert_eq!(found.choices[0].stored, "int16, 2 of 3 layers int8");
         assert_eq!(found.choices[1].stored, "f32");
+        assert_eq!(found.choices[2].stored, "f16");
         let refused: Vec<_> = found.choices[1]
             .refused
             .iter()

@@ -5,14 +5,14 @@ use lads_kernels::attention_scratch_len;
 
 use super::{Operation, Work};
 use crate::access::{self, Access, AccessKind};
-use crate::check::{Checked, Checker, Fault, apart, exactly, overlap, product, require};
+use crate::check::{Checked, Checker, Fault, apart, exactly, overlap, require};
 use crate::codec::{record, word_enum_for};
 use crate::machine::{ExecError, Machine};
 use crate::place::{Span, StateSpan};
 
 pub use lads_kernels::CacheFormat;
 
-word_enum_for!(CacheFormat { F32 = 0, F16 = 1, });
+word_enum_for!(CacheFormat { F32 = 0, F16 = 1, Int8 = 2, });
 
 record! {
     /// Causal multi-head attention over the KV cache, which it appends to.
@@ -43,10 +43,11 @@ record! {
         /// Storage format of the cache.
         pub format: CacheFormat,
         /// Cached keys `[capacity / 16, heads * head_dim, 16]`, blocks of 16 tokens, the last one
-        /// whole: `lads_kernels::keys_len` elements of `format`.
+        /// whole: `lads_kernels::keys_len` elements of `format`, then their scales, if it has any:
+        /// `CacheFormat::words`.
         pub cache_k: StateSpan,
-        /// Cached values `[capacity, heads * head_dim]`, elements of `format`; does not overlap
-        /// `cache_k`.
+        /// Cached values `[capacity, heads * head_dim]`, elements of `format`, then their scales;
+        /// does not overlap `cache_k`.
         pub cache_v: StateSpan,
         /// Number of heads.
         pub heads: u32,
@@ -76,20 +77,22 @@ impl Operation for Attention {
             checker.arena(span)?;
             rows(span, self.tokens, stride, width)?;
         }
-        let built = self.format == CacheFormat::F32 || cfg!(feature = "half-cache");
+        let built = match self.format {
+            CacheFormat::F32 => true,
+            CacheFormat::F16 => cfg!(feature = "half-cache"),
+            CacheFormat::Int8 => cfg!(feature = "integer-cache"),
+        };
         require(built, Fault::LeftOut)?;
         checker.cache(self.cache_k)?;
         checker.cache(self.cache_v)?;
         let caches = [self.cache_k, self.cache_v].map(|span| [span.offset, span.len]);
         require(!overlap(caches[0], caches[1]), Fault::Overlap)?;
         let capacity = u32::try_from(checker.spaces.rows).map_err(|_| Fault::Capacity)?;
-        let holds = holds(self.cache_v.len, self.format, [capacity, width]);
-        require(holds && self.tokens <= capacity, Fault::Capacity)?;
-        let whole = capacity
-            .checked_next_multiple_of(16)
-            .ok_or(Fault::Capacity)?;
-        let holds = self::holds(self.cache_k.len, self.format, [whole, width]);
-        require(holds, Fault::Shape)?;
+        require(self.tokens <= capacity, Fault::Capacity)?;
+        let heads = [self.heads as usize, self.head_dim as usize];
+        let [keys, values] = self.format.words(capacity as usize, heads);
+        require(values == self.cache_v.len as usize, Fault::Capacity)?;
+        require(keys == self.cache_k.len as usize, Fault::Shape)?;
         if self.queries == 0 {
             let empty = self.q.len == 0 && self.y.len == 0 && self.scratch.len == 0;
             return require(empty, Fault::Shape);
@@ -128,6 +131,14 @@ impl Operation for Attention {
                 keys: bytemuck::try_cast_slice_mut(keys).map_err(cast)?,
                 values: bytemuck::try_cast_slice_mut(values).map_err(cast)?,
             },
+            #[cfg(feature = "integer-cache")]
+            CacheFormat::Int8 => {
+                let scales = self.scales() as usize;
+                kernels::CacheMut::Int8 {
+                    keys: split(keys, scales)?,
+                    values: split(values, scales)?,
+                }
+            }
             #[allow(unreachable_patterns, reason = "it is left out or not")]
             _ => return Err(ExecError::Span),
         };
@@ -138,6 +149,7 @@ impl Operation for Attention {
             v: row(self.v)?,
             v_stride: self.v_stride as usize,
             width,
+            heads,
             first: past,
         };
         append.run(machine.isa, &mut cache);
@@ -210,12 +222,42 @@ impl Operation for Attention {
                 ..Work::default()
             };
         }
-        let values = u64::from(self.cache_v.len).saturating_mul(self.format.per_word() as u64);
+        let values = u64::from(self.cache_v.len)
+            .saturating_sub(self.scales())
+            .saturating_mul(self.format.per_word() as u64);
         Work {
             // Scores, then the values that they weigh.
             multiply_adds: values.saturating_mul(2).saturating_mul(self.queries.into()),
             weight_words: 0,
             state_words: u64::from(self.cache_k.len).saturating_add(self.cache_v.len.into()),
+        }
+    }
+}
+
+/// Splits the words of keys or values into integers and so many scales.
+#[cfg(feature = "integer-cache")]
+fn split(words: &mut [f32], scales: usize) -> Result<kernels::ScaledMut<'_>, ExecError> {
+    let integers = words.len().checked_sub(scales).ok_or(ExecError::Span)?;
+    let (integers, scales) = words
+        .split_at_mut_checked(integers)
+        .ok_or(ExecError::Span)?;
+    let integers = bytemuck::try_cast_slice_mut(integers).map_err(|_| ExecError::Span)?;
+    Ok(kernels::ScaledMut { integers, scales })
+}
+
+impl Attention {
+    /// Returns the number of scales of the keys, and of the values: those of `r` rows of keys take
+    /// four bytes a head beside a byte for each element.
+    fn scales(&self) -> u64 {
+        match self.format {
+            CacheFormat::F32 | CacheFormat::F16 => 0,
+            CacheFormat::Int8 => {
+                let [heads, head_dim] = [self.heads, self.head_dim].map(u64::from);
+                let of_row = heads.saturating_mul(head_dim.saturating_add(4));
+                let bytes = u64::from(self.cache_k.len).saturating_mul(4);
+                let rows = bytes.checked_div(of_row).unwrap_or(0);
+                rows.saturating_mul(heads)
+            }
         }
     }
 }
@@ -230,16 +272,4 @@ fn rows(span: Span, rows: u32, stride: u32, width: u32) -> Checked {
         rows != 0 && width != 0 && apart && len == u64::from(span.len),
         Fault::Shape,
     )
-}
-
-/// Returns whether `len` words hold exactly the elements of a format of the cache with these
-/// dimensions.
-fn holds(len: u32, format: CacheFormat, dims: [u32; 2]) -> bool {
-    let elements = product(dims);
-    let held = u64::from(len).saturating_mul(format.per_word() as u64);
-    // The last word may be half empty.
-    let fits = held
-        .checked_sub(elements)
-        .is_some_and(|spare| spare < format.per_word() as u64);
-    elements != 0 && fits
 }

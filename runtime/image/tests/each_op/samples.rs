@@ -85,20 +85,24 @@ pub fn samples() -> Vec<Op> {
     };
     ops.push(norm.into());
     ops.extend([0, 1, 2].map(|queries| Op::from(attention(queries))));
-    let half = attention(2);
-    let half = Attention {
-        format: CacheFormat::F16,
-        cache_k: StateSpan {
-            len: half.cache_k.len / 2,
-            ..half.cache_k
-        },
-        cache_v: StateSpan {
-            len: half.cache_v.len / 2,
-            ..half.cache_v
-        },
-        ..half
-    };
-    ops.push(half.into());
+    for format in [CacheFormat::F16, CacheFormat::Int8] {
+        let exact = attention(2);
+        let heads = [exact.heads, exact.head_dim].map(|count| count as usize);
+        let [keys, values] = format.words(SPACES.rows, heads).map(|words| words as u32);
+        let smaller = Attention {
+            format,
+            cache_k: StateSpan {
+                len: keys,
+                ..exact.cache_k
+            },
+            cache_v: StateSpan {
+                len: values,
+                ..exact.cache_v
+            },
+            ..exact
+        };
+        ops.push(smaller.into());
+    }
     let (arena, weights): (Operand, Operand) = (span(10, 12).into(), weight(20, 12).into());
     for x in [arena, weights] {
         let unary = Unary {

@@ -14,10 +14,10 @@ use core::arch::aarch64::{
     vandq_s32, vbslq_f32, vcltq_f32, vcltzq_f32, vcombine_s8, vcombine_s16, vcvtq_f32_s32,
     vdupq_n_f32, vdupq_n_s32, vget_high_s8, vget_high_s16, vget_high_u16, vget_low_s8,
     vget_low_s16, vget_low_u16, vld1q_f32, vld1q_s8, vld1q_s16, vld1q_u16, vmaxq_s32, vmaxvq_s32,
-    vmlal_s16, vmovl_s8, vmovl_u16, vmovn_s16, vmovn_s32, vmulq_f32, vpaddq_s32,
-    vreinterpretq_f32_u32, vreinterpretq_s8_s16, vreinterpretq_s16_s8, vreinterpretq_s32_f32,
-    vrshrn_n_s16, vshlq_n_s8, vshlq_n_s32, vshlq_n_u32, vshrq_n_s8, vst1q_f32, vst1q_s16,
-    vst1q_u16, vzip1q_s16, vzip2q_s16,
+    vmlal_s16, vmovl_high_s8, vmovl_high_s16, vmovl_s8, vmovl_s16, vmovl_u16, vmovn_s16, vmovn_s32,
+    vmulq_f32, vpaddq_s32, vreinterpretq_f32_u32, vreinterpretq_s8_s16, vreinterpretq_s16_s8,
+    vreinterpretq_s32_f32, vrshrn_n_s16, vshlq_n_s8, vshlq_n_s32, vshlq_n_u32, vshrq_n_s8,
+    vst1q_f32, vst1q_s16, vst1q_u16, vzip1q_s16, vzip2q_s16,
 };
 use core::arch::asm;
 
@@ -161,6 +161,21 @@ impl<const DOT: bool> Simd for Neon<DOT> {
                 wide(vget_high_u16(low)),
                 wide(vget_low_u16(high)),
                 wide(vget_high_u16(high)),
+            ]
+        }
+    }
+
+    #[inline(always)]
+    fn load_bytes(self, from: &[i8; LANES]) -> Self::V {
+        // SAFETY: NEON is part of the target; a block is sixteen bytes.
+        unsafe {
+            let bytes = vld1q_s8(from.as_ptr());
+            let [low, high] = [vmovl_s8(vget_low_s8(bytes)), vmovl_high_s8(bytes)];
+            [
+                vcvtq_f32_s32(vmovl_s16(vget_low_s16(low))),
+                vcvtq_f32_s32(vmovl_high_s16(low)),
+                vcvtq_f32_s32(vmovl_s16(vget_low_s16(high))),
+                vcvtq_f32_s32(vmovl_high_s16(high)),
             ]
         }
     }
