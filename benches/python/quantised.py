@@ -4,7 +4,8 @@
 
 The contenders are the package `lads`, with the image that it makes of the bundle by itself, ONNX Runtime with the bundle's floats, and ONNX Runtime
 with what its own tool, `quantize_dynamic` at its defaults, makes of each entry: integers of 8 bits for the weights, and for the inputs anew in every
-step. In one more the low level keeps its floats. All run in this process, one thread, called from Python.
+step. In one more the low level keeps its floats. Where OpenVINO is installed (`pip install openvino nncf`) it is asked too, with the bundle's floats and
+with what its own tool, NNCF's `compress_weights` to INT8_SYM, makes of it. All run in this process, one thread, called from Python.
 
 First every contender is asked the reference's questions, open loop: how many decisions select PyTorch's index, and how far an action is off while the
 same plan is in force. Bytes are those of lads' image, and of the weights of ONNX Runtime's sessions. Then the time: in each round every contender steps through the same recorded episode, hot and then at 50 Hz, in the next round
@@ -15,6 +16,7 @@ What can fail ends with Python's exception.
 import argparse
 import base64
 import json
+import logging
 import tempfile
 import time
 from pathlib import Path
@@ -25,6 +27,12 @@ import onnx
 import onnxruntime
 from onnx.utils import Extractor
 from onnxruntime.quantization import quantize_dynamic
+
+try:
+    import nncf
+    import openvino
+except ImportError:
+    openvino = None
 
 HIGH = ("high_level/instruct", "high_level/start", "high_level/step")
 LOW = ("codebook/lookup", "low_level/act")
@@ -49,28 +57,21 @@ class Lads:
         self.controller.executed(action)
 
 
-class OnnxRuntime:
-    """Keys and values stay in ONNX Runtime's own tensors from step to step."""
+class Graphs:
+    """A bundle's entries, each a graph of its own that an engine runs; keys and values stay in the engine's own tensors from step to step."""
 
     def __init__(self, model, quantised=()):
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.log_severity_level = 3
         contract = json.loads(next(entry.value for entry in model.metadata_props if entry.key == "lads.contract"))
-        self.horizon, self.sessions, self.outputs, self.size = contract["family"]["horizon"], {}, {}, 0
+        self.horizon = contract["family"]["horizon"]
         self.known = [row["id"] for row in contract["instructions"]]
         limits = next(row for row in contract["channels"] if row["role"] == "action")["elements"]
         self.low, self.high = (np.array([row[side] for row in limits], np.float32) for side in ("min", "max"))
-        weights = {}
+        self.graphs, weights = {}, {}
         for entry in HIGH + LOW:
             names = lambda values, entry=entry: [value.name for value in values if value.name.startswith(entry + "/")]
             part = Extractor(model).extract_model(names(model.graph.input), names(model.graph.output))
-            if entry in quantised:
-                part = integers(part)
-            weights |= {tensor.name: len(tensor.raw_data) for tensor in part.graph.initializer}
-            session = onnxruntime.InferenceSession(part.SerializeToString(), options, providers=["CPUExecutionProvider"])
-            self.sessions[entry], self.outputs[entry] = session, [value.name for value in session.get_outputs()]
+            self.graphs[entry], own = self.load(part, entry in quantised)
+            weights |= own
         self.size = sum(weights.values())
         arrays = {row.name: row for row in model.graph.initializer}
         self.words = onnx.numpy_helper.to_array(arrays["weights/instruction.words"])
@@ -78,16 +79,14 @@ class OnnxRuntime:
 
     def run(self, entry, inputs):
         """Inputs by their names without the entry's -> outputs likewise."""
-        value = lambda it: it if isinstance(it, onnxruntime.OrtValue) else onnxruntime.OrtValue.ortvalue_from_numpy(it)
-        inputs = {f"{entry}/{name}": value(it) for name, it in inputs.items()}
-        found = self.sessions[entry].run_with_ort_values(self.outputs[entry], inputs)
-        return {name.removeprefix(entry + "/"): it for name, it in zip(self.outputs[entry], found, strict=True)}
+        found = self.infer(self.graphs[entry], {f"{entry}/{name}": value for name, value in inputs.items()})
+        return {name.removeprefix(entry + "/"): value for name, value in found.items()}
 
     def start(self, instruction):
         number = self.known.index(instruction)
         found = self.run("high_level/instruct", {"words": self.words[number][None].copy()})
         rows = int(self.lengths[number])
-        self.cache = {name.replace("present", "past_key_values"): it.numpy()[:, :, :rows].copy() for name, it in found.items()}
+        self.cache = {name.replace("present", "past_key_values"): self.array(it)[:, :, :rows].copy() for name, it in found.items()}
         self.time, self.done, self.plan, self.index = 0, None, None, None
 
     def step(self, observation):
@@ -98,15 +97,58 @@ class OnnxRuntime:
         logits = found.pop("logits")
         self.cache = {name.replace("present", "past_key_values"): it for name, it in found.items()}
         if self.time % self.horizon == 0:
-            self.index = int(logits.numpy().argmax())
+            self.index = int(self.array(logits).argmax())
             self.plan = self.run("codebook/lookup", {"index": np.array([self.index])})["plan"]
         action = self.run("low_level/act", {"observation": observation[None], "plan": self.plan})["action"]
-        self.done = np.clip(action.numpy()[0], self.low, self.high)
+        self.done = np.clip(self.array(action)[0], self.low, self.high)
         self.time += 1
         return self.done, self.index
 
     def executed(self, action):
         self.done = action
+
+
+class OnnxRuntime(Graphs):
+    array = staticmethod(onnxruntime.OrtValue.numpy)
+
+    def load(self, part, quantised):
+        """-> the graph, ready to run, and the bytes of its weights by their names."""
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        options.log_severity_level = 3
+        part = integers(part) if quantised else part
+        session = onnxruntime.InferenceSession(part.SerializeToString(), options, providers=["CPUExecutionProvider"])
+        weights = {tensor.name: len(tensor.raw_data) for tensor in part.graph.initializer}
+        return (session, [value.name for value in session.get_outputs()]), weights
+
+    def infer(self, graph, inputs):
+        session, outputs = graph
+        value = lambda it: it if isinstance(it, onnxruntime.OrtValue) else onnxruntime.OrtValue.ortvalue_from_numpy(it)
+        found = session.run_with_ort_values(outputs, {name: value(it) for name, it in inputs.items()})
+        return dict(zip(outputs, found, strict=True))
+
+
+class OpenVino(Graphs):
+    array = staticmethod(np.asarray)
+
+    def load(self, part, quantised):
+        """-> the graph, ready to run, and the bytes of its weights by their names."""
+        core = openvino.Core()
+        graph = core.read_model(part.SerializeToString())
+        if quantised:
+            nncf.set_log_level(logging.ERROR)
+            graph = nncf.compress_weights(graph, mode=nncf.CompressWeightsMode.INT8_SYM)
+        weights = {row.get_friendly_name(): row.get_byte_size() for row in graph.get_ops() if row.get_type_name() == "Constant"}
+        options = {"INFERENCE_NUM_THREADS": 1, "NUM_STREAMS": 1, "PERFORMANCE_HINT": "LATENCY", "INFERENCE_PRECISION_HINT": "f32"}
+        request = core.compile_model(graph, "CPU", options).create_infer_request()
+        return (request, [output.get_any_name() for output in graph.outputs]), weights
+
+    def infer(self, graph, inputs):
+        # Keys and values are copied from one step to the next, as by its own API for Python.
+        request, outputs = graph
+        found = request.infer(inputs, share_inputs=True)
+        return {name: found[name] for name in outputs}
 
 
 def integers(model):
@@ -180,6 +222,12 @@ def main():
         "ONNX Runtime int8": OnnxRuntime(model, HIGH + LOW),
         "ONNX Runtime int8, low level f32": OnnxRuntime(model, HIGH),
     }
+    if openvino:
+        contenders |= {
+            "OpenVINO f32": OpenVino(model),
+            "OpenVINO int8 weights": OpenVino(model, HIGH + LOW),
+            "OpenVINO int8 weights, low level f32": OpenVino(model, HIGH),
+        }
     size = {name: len(it.policy.image) if it is mine else it.size for name, it in contenders.items()}
     reference = json.loads((asked.reference or asked.model.with_suffix(".reference.json")).read_text())
     contract = mine.policy.contract
@@ -193,7 +241,8 @@ def main():
         for pace, period in paces.items():
             for name in list(contenders)[:: 1 if number % 2 == 0 else -1]:
                 rounds[pace, name].append(timed(contenders[name], known, seen, decided, period))
-    print(f"ONNX Runtime {onnxruntime.__version__}, {asked.rounds} rounds of {len(seen)} steps; ratio: lads over the other, median (quartiles)")
+    other = f"OpenVINO {openvino.__version__} with NNCF {nncf.__version__}" if openvino else "OpenVINO is not installed: pip install openvino nncf"
+    print(f"ONNX Runtime {onnxruntime.__version__}, {other}; {asked.rounds} rounds of {len(seen)} steps; ratio: lads over the other, median (quartiles)")
     columns = [f"{pace}: {kind}" for pace in paces for kind in ("ordinary, us", "ratio", "decision, us")]
     print("| | bytes | same index | largest action difference | " + " | ".join(columns) + " |")
     print("|" + "---|" * (4 + len(columns)))
