@@ -95,7 +95,12 @@ fn images() -> &'static [Vec<u32>] {
             force: true,
             ..Options::default()
         };
-        let mut images: Vec<Vec<u32>> = [Options::exact(), smaller]
+        let halves = Options {
+            storage: Some(Storage::of_weights(WeightFormat::Bf16).with_cache(CacheFormat::F16)),
+            force: true,
+            ..Options::default()
+        };
+        let mut images: Vec<Vec<u32>> = [Options::exact(), smaller, halves]
             .iter()
             .map(|options| words(&compile_with(&bundle, options).expect("it compiles")))
             .collect();

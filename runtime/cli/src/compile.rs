@@ -40,7 +40,7 @@ pub struct Request {
     #[arg(long, value_name = "FORMAT", value_parser = weight_format)]
     low_level: Option<WeightFormat>,
     /// Storage format of the KV cache: auto, as the bundle was tuned if no format of the weights is
-    /// given, else f32; f32; or f16 in half the memory. Fewer bits have to pass the same gate as
+    /// given, else f32; f32; f16 in half the memory; or int8 in a quarter. Fewer bits have to pass the same gate as
     /// weights
     #[arg(long, value_name = "FORMAT", default_value = "auto", value_parser = auto_or(cache_format))]
     cache: Choice<CacheFormat>,

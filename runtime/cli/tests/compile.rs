@@ -37,7 +37,7 @@ fn weights_of_fewer_bits_pass_a_gate() {
     for (flag, value, known) in [
         ("--weights", "f8", "f32, int16, f16, bf16, int8"),
         ("--low-level", "f64", "f32, int16, f16, bf16, int8"),
-        ("--cache", "bf16", "f32, f16"),
+        ("--cache", "bf16", "f32, f16, int8"),
         ("--tolerance", "0", "positive"),
     ] {
         refused(&compile(&[flag, value]), "", &[value, known]);

@@ -75,21 +75,21 @@ impl Cache {
     };
 
     /// Returns the number of words of one layer's keys and of its values.
-    fn words(&self) -> [usize; 2] {
+    fn words(&self) -> Option<[usize; 2]> {
         self.format
             .words(self.capacity, [self.heads, self.head_dim])
     }
 
     /// Returns the number of words of all layers.
     pub fn len(&self) -> Option<u32> {
-        let [keys, values] = self.words();
+        let [keys, values] = self.words()?;
         let layer = values.checked_add(keys)?;
         u32::try_from(layer.checked_mul(self.layers)?).ok()
     }
 
     pub(crate) fn spans(&self, layer: usize) -> [StateSpan; 2] {
         // Of a cache whose length was asked for, and fits 32 bits.
-        let [keys, values] = self.words().map(|words| words as u32);
+        let [keys, values] = self.words().unwrap_or_default().map(|words| words as u32);
         let offset = layer as u32 * (keys + values);
         [
             StateSpan { offset, len: keys },

@@ -10,7 +10,7 @@ use core::fmt;
 use lads_image::records::{self, ContractRecord, InstructionRecord, NoiseRule, SelectionRule};
 use lads_image::tables::Tables;
 
-use crate::errors::InputError;
+use crate::errors::{InputError, InstructionError};
 use crate::inputs::{self, Data, MAX_OBSERVATIONS};
 
 mod channel;
@@ -329,6 +329,28 @@ impl<'a> Contract<'a> {
     /// instruction.
     pub fn word_dim(&self) -> usize {
         self.words_shape(1)
+    }
+
+    /// Counts the words of an instruction, word embeddings `[n, dim]` row by row, and refuses those
+    /// that no instruction can be.
+    pub fn check_words(&self, words: &[f32]) -> Result<usize, InstructionError> {
+        self.instruction_channel()
+            .ok_or(InstructionError::NotTaken)?;
+        let (dim, most) = (self.word_dim(), self.words_len());
+        if words.len().checked_rem(dim) != Some(0) {
+            return Err(InstructionError::Length {
+                got: words.len(),
+                word_dim: dim,
+            });
+        }
+        let count = words.len().checked_div(dim).unwrap_or(0);
+        if count == 0 || count > most {
+            return Err(InstructionError::Words { got: count, most });
+        }
+        if let Some(index) = words.iter().position(|x| !x.is_finite()) {
+            return Err(InstructionError::NotFinite { index });
+        }
+        Ok(count)
     }
 
     fn words_shape(&self, axis: usize) -> usize {

@@ -153,7 +153,7 @@ fn each_rule_of_an_op_is_enforced() {
                 let heads = [op.heads, op.head_dim].map(|count| count as usize);
                 let capacity = op.cache_v.len as usize / (heads[0] * heads[1]);
                 op.format = format;
-                [op.cache_k.len, op.cache_v.len] = format.words(capacity, heads).map(|words| words as u32);
+                [op.cache_k.len, op.cache_v.len] = format.words(capacity, heads).unwrap().map(|words| words as u32);
                 op.cache_k.len -= keys;
                 op.cache_v.len -= values;
             });

@@ -8,7 +8,7 @@
 //! Integers have a scale for each row and head, `[heads][capacity / 16][16]`. Sums are always 32-bit
 //! floats.
 //!
-//! Nothing here can fail: rows beyond a cache's end are not written, and a number that the format
+//! Nothing here can fail: rows beyond a cache's last block are not written, and a number that the format
 //! cannot hold makes infinite or NaN what is computed from it, which the controller refuses to send
 //! to motors.
 
@@ -60,13 +60,19 @@ impl CacheFormat {
     }
 
     /// Returns the number of 4-byte words of the keys and of the values of a cache of `capacity`
-    /// rows of `heads` heads: elements, then scales.
-    pub const fn words(self, capacity: usize, [heads, head_dim]: [usize; 2]) -> [usize; 2] {
-        let width = heads.saturating_mul(head_dim);
-        let keys = keys_len(capacity, width).div_ceil(self.per_word());
-        let values = capacity.saturating_mul(width).div_ceil(self.per_word());
-        let scales = self.scales(capacity, heads);
-        [keys.saturating_add(scales), values.saturating_add(scales)]
+    /// rows of `heads` heads, elements and scales; `None` beyond the address space.
+    pub fn words(self, capacity: usize, [heads, head_dim]: [usize; 2]) -> Option<[usize; 2]> {
+        let width = heads.checked_mul(head_dim)?;
+        let rows = capacity.checked_next_multiple_of(LANES)?;
+        let scales = match self {
+            Self::F32 | Self::F16 => 0,
+            Self::Int8 => rows.checked_mul(heads)?,
+        };
+        let words = |rows: usize| {
+            let elements = rows.checked_mul(width)?;
+            elements.div_ceil(self.per_word()).checked_add(scales)
+        };
+        Some([words(rows)?, words(capacity)?])
     }
 
     /// Returns the number of scales of the keys of a cache, and of its values.

@@ -65,7 +65,8 @@ impl Told {
     pub fn of(policy: &Checked, given: &Bound<'_, PyAny>) -> PyResult<Self> {
         let contract = policy.view().contract();
         if let Ok(text) = given.cast::<PyString>() {
-            let found = policy.opened().instruction(&text.to_cow()?);
+            // A text with half a surrogate pair is no instruction's.
+            let found = policy.opened().instruction(&text.to_string_lossy());
             return match found {
                 Ok(id) => Ok(Self::Known(id)),
                 Err(error) => Err(InstructionError::new_err(error.to_string())),

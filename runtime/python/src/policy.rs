@@ -14,7 +14,7 @@ use pyo3::types::{PyBytes, PyDict, PyTuple};
 use crate::arrays;
 use crate::cell::{Checked, Working};
 use crate::controller::{Controller, Settings, Told};
-use crate::errors::{InstructionError, OpenError, SelfTestError, WorkspaceError, opening};
+use crate::errors::{self, InstructionError, OpenError, SelfTestError, WorkspaceError, opening};
 
 /// A policy that was read and checked. It never changes and may be used by any number of threads.
 #[pyclass(frozen, module = "lads")]
@@ -248,12 +248,15 @@ impl Policy {
     fn words<'py>(
         &self,
         py: Python<'py>,
-        instruction: &str,
+        instruction: &Bound<'py, PyAny>,
     ) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
         let contract = self.checked.view().contract();
-        let found = self.checked.opened().instruction(instruction);
-        let found = found.map_err(|error| InstructionError::new_err(error.to_string()))?;
-        let known = contract.instruction(found as usize);
+        let Told::Known(id) = Told::of(&self.checked, instruction)? else {
+            return Err(InstructionError::new_err(
+                "words takes the id or the text of a known instruction; policy.contract.instructions lists them",
+            ));
+        };
+        let known = contract.instruction(id as usize);
         let words = known.map_or(&[][..], |known| known.words);
         let dim = contract.word_dim();
         shaped(py, words, &[words.len() / dim.max(1), dim])
@@ -275,8 +278,12 @@ impl Policy {
                 "nearest compares word embeddings; give an array float32 [words, dim], as lads.language.Encoder makes it",
             ));
         };
-        let known = contract.instructions().map(|known| known.words);
-        let found = similarity::nearest(&words, known, contract.word_dim());
+        let checked = contract.check_words(&words);
+        checked.map_err(|error| errors::instruction(&error))?;
+        let found = py.detach(|| {
+            let known = contract.instructions().map(|known| known.words);
+            similarity::nearest(&words, known, contract.word_dim())
+        });
         let Some((place, alike)) = found else {
             return Err(InstructionError::new_err(
                 "the policy knows no instruction that words could be compared with; give none",

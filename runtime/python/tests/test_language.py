@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 
 import numpy as np
 import pytest
@@ -70,17 +71,27 @@ def test_known_words_are_nearest_to_themselves(kitchen):
         kitchen.nearest(known.id)
     with pytest.raises(InstructionError, match="3 elements each"):
         kitchen.nearest(np.zeros((2, 3), np.float32))
+    for wrong in (0, None, words, "\ud800"):
+        with pytest.raises(InstructionError):
+            kitchen.words(wrong)
+    # What the controller would refuse is not near anything.
+    dim = kitchen.contract.language.dim
+    for wrong, said in ((np.ones((99, dim)), "99 words"), (np.ones((0, dim)), "0 words"), (np.full((2, dim), np.nan), "not finite")):
+        with pytest.raises(InstructionError, match=said):
+            kitchen.nearest(wrong.astype(np.float32))
 
 
 def test_a_policy_without_instructions_hears_nothing(plain):
     with pytest.raises(LanguageError, match="takes no instructions"):
         Encoder(plain)
-    with pytest.raises(InstructionError, match="knows no instruction"):
+    with pytest.raises(InstructionError, match="takes no instruction"):
         plain.nearest(np.zeros((2, 3), np.float32))
 
 
 def test_sentences_that_cannot_be_heard_are_refused(policies, folder):
     encoder, pooled = Encoder(policies["kitchen"], folder), Encoder(policies["lorel"], folder)
+    with pytest.raises(LanguageError, match="cannot be pickled"):
+        pickle.dumps(encoder)
     refused = [(" ", "' ': an empty sentence"), ("", "an empty"), ("go " * 100, "the policy takes at most"), (7, "a str, not int"), ("go " * 600, "the language encoder takes at most")]
     for text, said in refused:
         with pytest.raises(LanguageError, match=said) as error:
@@ -89,7 +100,7 @@ def test_sentences_that_cannot_be_heard_are_refused(policies, folder):
     assert pooled.words("go " * 100).shape == (1, 384), "the mean is one word"
 
 
-def test_other_encoders_are_refused(policies, folder, tmp_path):
+def test_other_encoders_are_refused(policies, folder, tmp_path, monkeypatch):
     policy = policies["kitchen"]
     with pytest.raises(LanguageError, match="python -m lads_exporter language"):
         Encoder(policy, tmp_path / "nowhere")
@@ -109,7 +120,11 @@ def test_other_encoders_are_refused(policies, folder, tmp_path):
         ("version", None, {"format_version": 9}, "this program reads"),
         ("damaged", None, {"files": files}, "is not the manifest's"),
         ("sizes", None, {"layers": 3}, "not \\[3, "),
-        ("fields", None, {"layers": "7"}, "says"),
+        ("fields", None, {"layers": "7"}, "sizes or checksums"),
+        ("truth", None, {"layers": True}, "sizes or checksums"),
+        ("float", None, {"format_version": 1.0}, "this program reads"),
+        ("long", None, {"format": "z\n" * 10000}, "this program reads"),
+        ("deep", "[" * 200000, {}, "no manifest"),
         ("list", "[]", {}, "no manifest"),
         ("json", "{", {}, "no manifest"),
     ]
@@ -117,9 +132,17 @@ def test_other_encoders_are_refused(policies, folder, tmp_path):
         with pytest.raises(LanguageError, match=said) as error:
             Encoder(policy, changed(place, content, **fields))
         assert place in str(error.value) or place == "sizes", place
+        assert "\n" not in str(error.value) and len(str(error.value)) < 600
     # The right weights, and words of another sentence: the bundle's table was made otherwise.
     with pytest.raises(LanguageError, match="nearest layer off by"):
         Encoder(_Elsewhere(policy), folder)
+    for folder_, said in ((tmp_path / ("a" * 300), "cannot be read"), (7, "a path, not int"), ("nul\0", "cannot be read")):
+        with pytest.raises(LanguageError, match=said):
+            Encoder(policy, folder_)
+    for name in ("LADS_CACHE", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(LanguageError, match="set LADS_CACHE"):
+        Encoder(policy)
     for name in ("", "../up", "a/b", ".hidden"):
         with pytest.raises(LanguageError, match="names no folder"):
             default_folder(name)

@@ -174,6 +174,18 @@ impl Score {
         if count > episodes {
             return Err(format!("{count} successes in {episodes} episodes"));
         }
+        let rates = [self.n_rate, self.full_success]
+            .into_iter()
+            .chain(self.k_rate);
+        let known = rates.flatten().count();
+        // Without commanded sub-tasks there are episodes and no rates.
+        let least = if episodes == 0 { 0 } else { known };
+        if ![0, 2 + K_RATES].contains(&known) || known != least {
+            return Err(format!(
+                "{known} of {} rates of {episodes} episodes",
+                2 + K_RATES
+            ));
+        }
         let amounts = [
             ("n_rate", self.n_rate),
             ("n_rate_standard_error", self.n_rate_standard_error),
@@ -206,7 +218,15 @@ impl Score {
                 "k_rate grows with K: {:?}",
                 self.k_rate.map(Option::unwrap_or_default)
             )),
-            _ => Ok(()),
+            _ => {
+                let at_least: f64 = self.k_rate.iter().flatten().sum();
+                match self.n_rate {
+                    Some(rate) if rate < at_least - ROUNDING => Err(format!(
+                        "n_rate is {rate}, below the sum of k_rate, {at_least}"
+                    )),
+                    _ => Ok(()),
+                }
+            }
         }
     }
 }
@@ -277,7 +297,12 @@ mod tests {
         for possible in [&score, &unasked, &Score::of([])] {
             assert_eq!(possible.check(), Ok(()));
         }
-        let changes: [(&str, Change); 9] = [
+        let changes: [(&str, Change); 12] = [
+            ("5 of 6 rates of 3 episodes", |it| it.full_success = None),
+            ("6 of 6 rates of 0 episodes", |it| {
+                (it.episodes, it.full_success_count) = (0, 0);
+            }),
+            ("n_rate is 0.5, below the sum", |it| it.n_rate = Some(0.5)),
             ("4 successes in 3", |it| it.full_success_count = 4),
             ("n_rate is -1", |it| it.n_rate = Some(-1.0)),
             ("n_rate_standard_error is NaN", |it| {

@@ -21,6 +21,9 @@ const FORMAT: &str = "lads-reference";
 /// Versions of the JSON form that can be read. The first records neither contract nor logits, so that less can be proved by it.
 const FORMAT_VERSIONS: [u32; 2] = [1, 2];
 
+/// Largest float noise of a reference, relative to the largest of its own numbers that it moves.
+const MOST_NOISE: f64 = 0.01;
+
 /// Why a reference is refused.
 #[derive(Debug, Error)]
 #[non_exhaustive]
@@ -155,10 +158,25 @@ pub struct Episode {
 }
 
 impl Episode {
-    /// Refuses numbers that no episode of `decisions` decisions can have.
-    fn check(&self, decisions: usize, period: Option<usize>) -> Result<(), &'static str> {
-        if [self.plans.len(), self.margins.len()] != [decisions; 2] {
+    /// Refuses numbers that no episode can have whose plans come once a `period`, where it does not say when.
+    fn check(&self, period: Option<usize>) -> Result<(), &'static str> {
+        // Counted, not listed: a damaged number of steps could be any.
+        let decisions = match &self.decided_at {
+            Some(decided) => decided.len(),
+            None => period.map_or(0, |period| self.steps.div_ceil(period)),
+        };
+        let decided = self.decided_at.as_deref().unwrap_or_default();
+        let in_order = decided.is_sorted_by(|a, b| a < b)
+            && decided.last().is_none_or(|&last| last < self.steps);
+        if !in_order || [self.plans.len(), self.margins.len()] != [decisions; 2] {
             return Err("its plans are not one per decision");
+        }
+        let mut times = self.completions.iter().map(|done| done.step);
+        if !times.all(|step| (1..=self.steps).contains(&step)) {
+            return Err("a completion is at no step of its episode");
+        }
+        if self.margins.iter().any(|&margin| margin < 0.0) {
+            return Err("a margin is negative");
         }
         let Some(trace) = &self.trace else {
             return Ok(());
@@ -177,12 +195,6 @@ impl Episode {
         }
         if !trace.logits.len().is_multiple_of(decisions.max(1)) {
             return Err("the logits of a trace are not the same number for each decision");
-        }
-        let codes = trace.logits.len() / decisions.max(1);
-        let encoded = trace.encoded.as_deref().unwrap_or_default();
-        let mut indices = self.plans.iter().chain(encoded);
-        if codes > 0 && indices.any(|&plan| plan as usize >= codes) {
-            return Err("an index of a plan has no logit");
         }
         let segments = period.map_or(0, |period| self.steps / period);
         let margins = trace.encoded_margins.as_ref().map(Vec::len);
@@ -262,8 +274,9 @@ impl Trace {
         }
         let frames = if subject.sees { steps } else { 0 };
         let states = self.states.len() / subject.state_len.max(1);
-        let fits = self.observations.len() == steps * subject.observation_len
-            && self.actions.len() == steps * subject.action_len
+        // Saturating: a damaged number of steps could be any.
+        let fits = self.observations.len() == steps.saturating_mul(subject.observation_len)
+            && self.actions.len() == steps.saturating_mul(subject.action_len)
             && self.frames.len() == frames
             && self.states.len() == states * subject.state_len
             && self.plan_vectors.len().is_multiple_of(steps.max(1))
@@ -360,6 +373,8 @@ impl Reference {
                 "it has no instruction, no traced episode or decisions every 0 steps".to_owned(),
             );
         }
+        self.noise_is_little()?;
+        let codes = self.codes();
         for instruction in &self.instructions {
             let wrong =
                 |what: &'static str| Err(format!("instruction '{}': {what}", instruction.id));
@@ -367,22 +382,64 @@ impl Reference {
                 return wrong("its number of episodes is not the heading's");
             }
             for (number, episode) in (0..).zip(&instruction.episodes) {
-                let decisions = self.decided_at(episode);
-                let in_order = decisions.is_sorted()
-                    && decisions.last().is_none_or(|&last| last < episode.steps);
                 let traced = number < u64::from(self.traced_episodes);
                 if episode.number != number || episode.trace.is_some() != traced {
                     return wrong(
                         "its episodes are not in order, or not traced as the heading says",
                     );
                 }
-                if !in_order {
-                    return wrong("its plans are not one per decision");
+                episode.check(self.period).or_else(wrong)?;
+                let encoded = episode.trace.iter().flat_map(|it| &it.encoded).flatten();
+                let mut indices = episode.plans.iter().chain(encoded);
+                if codes.is_some_and(|codes| indices.any(|&plan| plan as usize >= codes)) {
+                    return wrong("an index of a plan has no logit");
                 }
-                episode.check(decisions.len(), self.period).or_else(wrong)?;
             }
         }
         Ok(())
+    }
+
+    /// Refuses float noise that would allow any answer.
+    fn noise_is_little(&self) -> Result<(), String> {
+        let noise = self.float_noise.unwrap_or_default();
+        let moved = [noise.action, noise.logit, noise.plan_vector];
+        let mut numbers = moved.iter().chain([&noise.relative]);
+        if !numbers.all(|&it| it.is_finite() && it >= 0.0) {
+            return Err("a number of its float noise is negative".to_owned());
+        }
+        let mut largest = [0.0_f64; 3];
+        for (_, trace) in self.traces() {
+            let lists = [&trace.actions, &trace.logits, &trace.plan_vectors];
+            for (largest, list) in largest.iter_mut().zip(lists) {
+                let all = list.iter().map(|&it| f64::from(it.abs()));
+                *largest = all.fold(*largest, f64::max);
+            }
+        }
+        let parts = ["actions", "logits", "plans"]
+            .iter()
+            .zip(moved)
+            .zip(largest);
+        for ((what, moved), largest) in parts {
+            if largest > 0.0 && moved > MOST_NOISE * largest {
+                return Err(format!(
+                    "its float noise moves its own {what} by {moved:.1e}, and the largest is {largest:.1e}: it would allow any"
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// Episodes that have a trace.
+    fn traces(&self) -> impl Iterator<Item = (&Episode, &Trace)> {
+        let episodes = self.instructions.iter().flat_map(|row| &row.episodes);
+        episodes.filter_map(|episode| Some((episode, episode.trace.as_ref()?)))
+    }
+
+    /// Number of logits of a decision; `None` where none were recorded.
+    fn codes(&self) -> Option<usize> {
+        let mut decided = self.traces().filter(|(_, trace)| !trace.logits.is_empty());
+        let (episode, trace) = decided.next()?;
+        trace.logits.len().checked_div(episode.plans.len())
     }
 
     /// Control steps at which the plans of an episode were decided.

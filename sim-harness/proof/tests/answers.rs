@@ -304,37 +304,74 @@ fn a_refusal_is_a_difference() {
     difference(&answers, "step 4: the observation is refused");
 }
 
+/// Asserts that a changed reference is refused with this text.
+#[track_caller]
+fn refused(change: &dyn Fn(&mut Value), part: &str) {
+    let mut file = file();
+    change(&mut file);
+    let error = Reference::read(file.to_string().as_bytes(), Path::new("r.json"))
+        .unwrap_err()
+        .to_string();
+    assert!(error.contains(part) && error.contains("r.json"), "{error}");
+}
+
+/// Changes the one episode.
+fn episode(change: fn(&mut Value)) -> impl Fn(&mut Value) {
+    move |file| change(&mut file["instructions"][0]["episodes"][0])
+}
+
 #[test]
-fn a_file_that_contradicts_itself_is_refused() {
-    let refused = |change: &dyn Fn(&mut Value), part: &str| {
-        let mut file = file();
-        change(&mut file);
-        let error = Reference::read(file.to_string().as_bytes(), Path::new("r.json"))
-            .unwrap_err()
-            .to_string();
-        assert!(error.contains(part) && error.contains("r.json"), "{error}");
-    };
-    refused(
-        &|file| file["instructions"][0]["episodes"][0]["decided_at"] = json!([0, 2]),
-        "one per decision",
-    );
-    refused(
-        &|file| file["instructions"][0]["episodes"][0]["decided_at"] = json!([0, 2, 9]),
-        "one per decision",
-    );
-    refused(
-        &|file| file["instructions"][0]["episodes"][0]["trace"]["logits"] = json!("AAAAAAAAAAA="),
-        "logits",
-    );
-    let episode = |change: fn(&mut Value)| {
-        move |file: &mut Value| change(&mut file["instructions"][0]["episodes"][0])
-    };
+fn numbers_that_no_episode_has_are_refused() {
     let no_logit = "has no logit";
     refused(&episode(|it| it["plans"] = json!([1, 999, 2])), no_logit);
     refused(
         &episode(|it| it["trace"]["encoded"] = json!([1, 0, 999])),
         no_logit,
     );
+    // More than any memory holds, where the plans come once a period.
+    refused(
+        &episode(|it| {
+            it["steps"] = json!(10_u64.pow(15));
+            it.as_object_mut().unwrap().remove("decided_at");
+        }),
+        "one per decision",
+    );
+    refused(
+        &episode(|it| it["decided_at"] = json!([0, 2, 2])),
+        "one per decision",
+    );
+    refused(
+        &episode(|it| it["margins"] = json!([1.0, -2.0, 0.5])),
+        "margin is negative",
+    );
+    for step in [0, STEPS + 1] {
+        refused(
+            &|file: &mut Value| {
+                let done = json!([{"sub_task": "drawer", "step": step}]);
+                file["instructions"][0]["episodes"][0]["completions"] = done;
+            },
+            "no step of its episode",
+        );
+    }
+    for (noise, said) in [
+        (
+            json!({"relative": 1e-6, "action": 1e30, "logit": 0.0}),
+            "its own actions by 1.0e30",
+        ),
+        (
+            json!({"relative": 1e-6, "action": 0.0, "logit": 9.0}),
+            "its own logits by 9",
+        ),
+        (
+            json!({"relative": 1e-6, "action": -1.0, "logit": 0.0}),
+            "negative",
+        ),
+    ] {
+        refused(
+            &|file: &mut Value| file["float_noise"] = noise.clone(),
+            said,
+        );
+    }
     let segments = "one plan per whole segment";
     refused(
         &episode(|it| it["trace"]["encoded"] = json!([1, 0])),
@@ -355,6 +392,22 @@ fn a_file_that_contradicts_itself_is_refused() {
             "not finite",
         );
     }
+}
+
+#[test]
+fn a_file_that_contradicts_itself_is_refused() {
+    refused(
+        &|file| file["instructions"][0]["episodes"][0]["decided_at"] = json!([0, 2]),
+        "one per decision",
+    );
+    refused(
+        &|file| file["instructions"][0]["episodes"][0]["decided_at"] = json!([0, 2, 9]),
+        "one per decision",
+    );
+    refused(
+        &|file| file["instructions"][0]["episodes"][0]["trace"]["logits"] = json!("AAAAAAAAAAA="),
+        "logits",
+    );
     refused(
         &|file| file["format_version"] = json!(3),
         "lads-reference 3",

@@ -85,8 +85,23 @@ pub enum InputError {
         wrong: String,
     },
     /// No episode was run.
-    #[error("it has no split with episodes, so there is nothing to compare")]
-    Empty,
+    #[error("{of} has no split with episodes, so there is nothing to compare; make it again")]
+    Empty {
+        /// Name of the system.
+        of: String,
+    },
+    /// The splits are not those of the instructions.
+    #[error(
+        "its split '{split}' has {scored} episodes in its scores and {listed} in its instructions; make it again"
+    )]
+    Split {
+        /// Name of the split.
+        split: String,
+        /// Number of episodes by the scores.
+        scored: usize,
+        /// Number of episodes that are listed.
+        listed: usize,
+    },
     /// There is no table to compare.
     #[error("it has no table{asked} with a finished system; it has {tables}")]
     NoTable {
@@ -148,7 +163,9 @@ fn check(system: &System) -> Result<(), InputError> {
         })?;
     }
     let ran = system.splits.iter().any(|split| split.score.episodes > 0);
-    ran.then_some(()).ok_or(InputError::Empty)
+    let of = || format!("'{}'", system.name);
+    ran.then_some(())
+        .ok_or_else(|| InputError::Empty { of: of() })
 }
 
 #[derive(Deserialize)]
@@ -195,6 +212,23 @@ fn results(value: Value, name: &str) -> Result<Found, InputError> {
     for instruction in &file.instructions {
         if !names.contains(&instruction.split.as_str()) {
             names.push(&instruction.split);
+        }
+    }
+    for split in names
+        .iter()
+        .copied()
+        .chain(file.splits.keys().map(String::as_str))
+    {
+        let own = file.instructions.iter().filter(|it| it.split == split);
+        let listed = own.map(|it| it.runs.len()).sum();
+        let scored = file.splits.get(split).map_or(0, |score| score.episodes);
+        if scored != listed {
+            let split = split.to_owned();
+            return Err(InputError::Split {
+                split,
+                scored,
+                listed,
+            });
         }
     }
     let split = |&name: &&str| {
@@ -395,7 +429,7 @@ mod tests {
 
     fn split(k_rate: [f64; 4]) -> Value {
         serde_json::json!({"episodes": 20, "success": 0.25, "success_interval": [0.11, 0.47], "success_by_seed": [0.25],
-            "n_rate": 1.0, "n_rate_standard_error": 0.5, "k_rate": k_rate})
+            "n_rate": 1.75, "n_rate_standard_error": 0.5, "k_rate": k_rate})
     }
 
     fn tables_file(version: u32) -> Value {
@@ -501,5 +535,12 @@ mod tests {
             "splits": {}, "instructions": []});
         let error = parsed(&file, None).err().unwrap().to_string();
         assert!(error.contains("nothing to compare"), "{error}");
+        let mut file = file;
+        file["splits"]["seen"] = serde_json::to_value(Score::unasked(3, 0)).unwrap();
+        let error = parsed(&file, None).err().unwrap().to_string();
+        assert!(
+            error.contains("'seen' has 3 episodes in its scores and 0"),
+            "{error}"
+        );
     }
 }

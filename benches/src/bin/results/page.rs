@@ -83,8 +83,11 @@ fn ratios(rows: &[Row]) -> String {
         );
         let target = row.target.map_or_else(
             || "–".into(),
-            // As it was set, not rounded.
-            |target| format!("≤ {target} {}", row.unit).trim().to_owned(),
+            |target| {
+                format!("≤ {} {}", bound(target), row.unit)
+                    .trim()
+                    .to_owned()
+            },
         );
         let met = match row.met() {
             Some(true) => "met",
@@ -466,4 +469,13 @@ fn meaning() -> &'static str {
      rten hands every call to a thread of its pool.\n\
      - **bare sweep**: a sum over as many bytes as the low level's weights have, with the widest vectors. No kernel that reads its weights can be faster.\n\
      - **p99.9** of fewer than a thousand calls is the longest.\n"
+}
+
+/// Formats a target by three digits at most.
+fn bound(target: f64) -> String {
+    let rounded = format!("{target:.3}");
+    rounded
+        .trim_end_matches('0')
+        .trim_end_matches('.')
+        .to_owned()
 }

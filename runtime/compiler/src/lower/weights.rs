@@ -243,7 +243,6 @@ fn columns(data: &[f32], n: usize) -> impl Iterator<Item = impl Iterator<Item = 
     (0..n).map(move |j| data.iter().skip(j).step_by(n).copied())
 }
 
-/// Converts every weight to another format.
 /// Returns the elements and the shape of a matrix of weights.
 fn matrix(tensor: &Tensor) -> Result<(&[f32], [usize; 2]), String> {
     let data = tensor.as_f32().ok_or("reads integers as numbers")?;
@@ -256,6 +255,7 @@ fn matrix(tensor: &Tensor) -> Result<(&[f32], [usize; 2]), String> {
     Ok((data, [k, n]))
 }
 
+/// Converts every weight to another format.
 fn converted<T>(
     data: &[f32],
     format: WeightFormat,

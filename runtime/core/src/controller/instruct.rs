@@ -31,20 +31,7 @@ impl Controller<'_, '_> {
             }
             Instruction::Words(words) => words,
         };
-        let (dim, most) = (contract.word_dim(), contract.words_len());
-        let count = words.len().checked_div(dim).unwrap_or(0);
-        if words.len().checked_rem(dim) != Some(0) {
-            return Err(InstructionError::Length {
-                got: words.len(),
-                word_dim: dim,
-            });
-        }
-        if count == 0 || count > most {
-            return Err(InstructionError::Words { got: count, most });
-        }
-        if let Some(index) = words.iter().position(|x| !x.is_finite()) {
-            return Err(InstructionError::NotFinite { index });
-        }
+        let count = contract.check_words(words)?;
         self.instructed = false;
         self.take_in(&[(channel, Data::F32(words))], count as u32)
             .map_err(InstructionError::Run)?;

@@ -90,7 +90,8 @@ impl Operation for Attention {
         let capacity = u32::try_from(checker.spaces.rows).map_err(|_| Fault::Capacity)?;
         require(self.tokens <= capacity, Fault::Capacity)?;
         let heads = [self.heads as usize, self.head_dim as usize];
-        let [keys, values] = self.format.words(capacity as usize, heads);
+        let words = self.format.words(capacity as usize, heads);
+        let [keys, values] = words.ok_or(Fault::Capacity)?;
         require(values == self.cache_v.len as usize, Fault::Capacity)?;
         require(keys == self.cache_k.len as usize, Fault::Shape)?;
         if self.queries == 0 {

@@ -88,7 +88,8 @@ pub fn samples() -> Vec<Op> {
     for format in [CacheFormat::F16, CacheFormat::Int8] {
         let exact = attention(2);
         let heads = [exact.heads, exact.head_dim].map(|count| count as usize);
-        let [keys, values] = format.words(SPACES.rows, heads).map(|words| words as u32);
+        let words = format.words(SPACES.rows, heads).unwrap();
+        let [keys, values] = words.map(|words| words as u32);
         let smaller = Attention {
             format,
             cache_k: StateSpan {

@@ -121,7 +121,7 @@ class Nearest:
 
     instruction: Instruction
     similarity: float
-    """Mean over the sentence's words of the cosine with the instruction's word that is most like each; -1 to 1."""
+    """Mean over the sentence's words, but for the end mark of several, of the cosine with the instruction's word that is most like each; -1 to 1."""
     accepted: bool
     """Whether the contract lets a sentence of this similarity be followed."""
 

@@ -26,9 +26,11 @@ def default_folder(encoder: str) -> Path:
     """Returns the folder into which the exporter writes an encoder: `language/NAME` in `$LADS_CACHE`, else in `lads` in `$XDG_CACHE_HOME` or `~/.cache`."""
     if not encoder or encoder.startswith(".") or any(c in "/\\:" or not c.isprintable() for c in encoder):
         raise LanguageError(f"the policy's language encoder is called {encoder!r}, which names no folder; export the bundle again")
-    own, shared = os.environ.get("LADS_CACHE"), os.environ.get("XDG_CACHE_HOME")
-    cache = Path(own) if own else (Path(shared) if shared else Path.home() / ".cache") / "lads"
-    return cache / "language" / encoder
+    own, shared, home = (os.environ.get(name) for name in ("LADS_CACHE", "XDG_CACHE_HOME", "HOME"))
+    cache = own or (shared and os.path.join(shared, "lads")) or (home and os.path.join(home, ".cache", "lads"))
+    if not cache:
+        raise LanguageError("no folder for the language encoder: none of LADS_CACHE, XDG_CACHE_HOME and HOME is set; set LADS_CACHE")
+    return Path(cache) / "language" / encoder
 
 
 class Encoder:
@@ -43,7 +45,10 @@ class Encoder:
         language, known = policy.contract.language, policy.contract.instructions
         if language is None or not known:
             raise LanguageError(f"{policy.path}: the policy takes no instructions, so no sentence can be put to it; leave the sentence out")
-        self._folder = default_folder(language.encoder) if folder is None else Path(folder)
+        try:
+            self._folder = default_folder(language.encoder) if folder is None else Path(os.fsdecode(folder))
+        except TypeError as error:
+            raise LanguageError(f"folder: a path, not {type(folder).__name__}; give where `python -m lads_exporter language` wrote the encoder") from error
         self._manifest = self._read(language)
         self._most = policy.contract.context.words
         self._tokenizer, self._network = self._load()
@@ -67,34 +72,43 @@ class Encoder:
     def _read(self, language):
         """Reads the manifest, and checks that it is of the policy's encoder."""
         path = self._folder / _MANIFEST
-        if not path.is_file():
+        try:
+            content = path.read_bytes()
+        except (FileNotFoundError, NotADirectoryError) as error:
             raise LanguageError(
                 f"the language encoder {language.encoder} is not in {self._folder}; export it once with `python -m lads_exporter language`"
-            )
+            ) from error
+        except (OSError, ValueError) as error:
+            raise LanguageError(f"{path}: it cannot be read ({_line(error)}); {_AGAIN}") from error
         try:
-            found = json.loads(path.read_bytes())
+            found = json.loads(content)
             version = (found["format"], found["format_version"])
             texts = [found["sha256"], *found["files"].values()]
             sizes = [found[key] for key in ("layers", "dim", "max_tokens")]
-            whole = all(isinstance(text, str) for text in texts) and all(isinstance(size, int) and size > 0 for size in sizes)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise LanguageError(f"{path}: no manifest of a language encoder ({error}); {_AGAIN}") from error
-        if version != (_FORMAT, _FORMAT_VERSION) or not whole:
-            raise LanguageError(f"{path}: says {version}, this program reads {(_FORMAT, _FORMAT_VERSION)}; {_AGAIN}")
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise LanguageError(f"{path}: no manifest of a language encoder ({_line(error)}); {_AGAIN}") from error
+        if version != (_FORMAT, _FORMAT_VERSION) or type(version[1]) is not int:
+            raise LanguageError(f"{path}: says {_shown(str(version))}, this program reads {(_FORMAT, _FORMAT_VERSION)}; {_AGAIN}")
+        # Not isinstance: true is an int.
+        if not all(isinstance(text, str) for text in texts) or not all(type(size) is int and size > 0 for size in sizes):
+            raise LanguageError(f"{path}: no manifest of a language encoder (its sizes or checksums are none); {_AGAIN}")
         if found["sha256"] != language.sha256:
             raise LanguageError(
-                f"the language encoder in {self._folder} has weights of sha256 {found['sha256'][:12]}, the policy's words were made by {language.encoder}"
+                f"the language encoder in {self._folder} has weights of sha256 {_shown(found['sha256'][:12])}, the policy's words were made by {language.encoder}"
                 f" with {language.sha256[:12]}; name the folder of that one, or export it with `python -m lads_exporter language`"
             )
         return found
+
+    def __reduce__(self):
+        raise LanguageError("an encoder cannot be pickled; make one in every process, of the policy, which can")
 
     def _file(self, name):
         """Reads a file of the folder, if it has the checksum that the manifest states."""
         path = self._folder / name
         try:
             content = path.read_bytes()
-        except OSError as error:
-            raise LanguageError(f"{path}: {error.strerror}; {_AGAIN}") from error
+        except (OSError, ValueError) as error:
+            raise LanguageError(f"{path}: {_line(error)}; {_AGAIN}") from error
         digest = hashlib.sha256(content).hexdigest()
         if self._manifest["files"].get(name) != digest:
             raise LanguageError(f"{path}: its sha256 {digest[:12]} is not the manifest's; {_AGAIN}")
@@ -112,13 +126,13 @@ class Encoder:
         except LanguageError:
             raise
         except Exception as error:
-            raise LanguageError(f"{self._folder / _TOKENIZER}: no tokeniser ({error}); {_AGAIN}") from error
+            raise LanguageError(f"{self._folder / _TOKENIZER}: no tokeniser ({_line(error)}); {_AGAIN}") from error
         model, options = self._file(_MODEL), onnxruntime.SessionOptions()
         options.log_severity_level = 4
         try:
             network = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
         except Exception as error:
-            raise LanguageError(f"{self._folder / _MODEL}: no network that runs ({error}); {_AGAIN}") from error
+            raise LanguageError(f"{self._folder / _MODEL}: no network that runs ({_line(error)}); {_AGAIN}") from error
         return tokenizer, network
 
     def _tokens(self, text):
@@ -127,7 +141,7 @@ class Encoder:
         try:
             found = self._tokenizer.encode(text)
         except Exception as error:
-            raise LanguageError(f"{_shown(text)}: the tokeniser failed ({error}); give text in UTF-8") from error
+            raise LanguageError(f"{_shown(text)}: the tokeniser failed ({_line(error)}); give text in UTF-8") from error
         if not text.strip() or all(found.special_tokens_mask):
             raise LanguageError(f"{_shown(text)}: an empty sentence; give an instruction")
         return found.ids
@@ -138,7 +152,7 @@ class Encoder:
         try:
             hidden = self._network.run(None, {self._network.get_inputs()[0].name: np.array(ids, np.int64)})[0]
         except Exception as error:
-            raise LanguageError(f"{failed} ({error}); {_AGAIN}") from error
+            raise LanguageError(f"{failed} ({_line(error)}); {_AGAIN}") from error
         if hidden.shape != (layers, len(ids), dim):
             raise LanguageError(f"{failed} (it gives {list(hidden.shape)} numbers, not {[layers, len(ids), dim]}); {_AGAIN}")
         return hidden
@@ -160,6 +174,11 @@ class Encoder:
     def _of(hidden, layer):
         found = hidden[-1].mean(0, keepdims=True) if layer is None else hidden[layer, 1:]
         return np.ascontiguousarray(found, np.float32)
+
+
+def _line(error):
+    """Returns what an engine or the system says, as one line of bounded length."""
+    return " ".join(str(error).split())[:200]
 
 
 def _shown(text):
