@@ -18,7 +18,9 @@ case $output in /*) ;; *) output=$PWD/$output ;; esac
 mkdir -p "$(dirname "$output")"
 
 features=static-library${LADS_OPS:+,$LADS_OPS}
-build=${CARGO_TARGET_DIR:-$root/target}/archive-build
+# A folder for each choice of operations: another archive that is built at the same time is not mistaken for this one.
+choice=${LADS_OPS+only-$LADS_OPS}
+build=${CARGO_TARGET_DIR:-$root/target}/archive-build/${choice:-all}
 # shellcheck disable=SC2086
 (cd "$root" && "$CARGO" rustc --quiet --locked ${CARGO_FLAGS:-} -p lads-ffi --profile archive ${LADS_OPS+--no-default-features} --features "$features" \
     --crate-type staticlib --target-dir "$build" ${target:+--target "$target"})
