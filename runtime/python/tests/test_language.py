@@ -76,7 +76,7 @@ def test_known_words_are_nearest_to_themselves(kitchen):
             kitchen.words(wrong)
     # What the controller would refuse is not near anything.
     dim = kitchen.contract.language.dim
-    for wrong, said in ((np.ones((99, dim)), "99 words"), (np.ones((0, dim)), "0 words"), (np.full((2, dim), np.nan), "not finite")):
+    for wrong, said in ((np.ones((99, dim)), "99 words"), (np.ones((0, dim)), "0 words"), (np.full((1, dim), np.nan), "not finite")):
         with pytest.raises(InstructionError, match=said):
             kitchen.nearest(wrong.astype(np.float32))
 

@@ -62,6 +62,8 @@ def test_it_is_compiled_as_asked(kitchen, tmp_path):
     assert len(half.image) < 0.7 * len(exact.image) and len(kitchen.image) < 0.9 * len(exact.image)
     assert kitchen.inspect()["stored"] == "f32 and int16 weights, f16 cache"
     assert half.inspect()["stored"] == "f16 weights, f16 cache" and half.self_test().tolerance == pytest.approx(0.05)
+    integers = lads.open(kitchen.path, weights="f32", cache="int8")
+    assert integers.inspect()["stored"] == "f32 weights, int8 cache" and integers.self_test().largest_error <= 1e-4
     mixed = lads.open(kitchen.path, weights="int16", low_level="f32")
     assert "int16" in mixed.inspect()["stored"]
     (tmp_path / "kitchen.lads").write_bytes(kitchen.image)
@@ -73,7 +75,7 @@ def test_it_is_compiled_as_asked(kitchen, tmp_path):
     ("options", "text"),
     [
         ({"weights": "f8"}, "weights 'f8': no such format; known are f32"),
-        ({"cache": "int8"}, "cache 'int8': no such format; known are"),
+        ({"cache": "int4"}, "cache 'int4': no such format; known are f32, f16, int8"),
         ({"tolerance": float("nan")}, "tolerance: it has to be a positive number"),
     ],
 )

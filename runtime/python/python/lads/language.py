@@ -94,7 +94,7 @@ class Encoder:
             raise LanguageError(f"{path}: no manifest of a language encoder (its sizes or checksums are none); {_AGAIN}")
         if found["sha256"] != language.sha256:
             raise LanguageError(
-                f"the language encoder in {self._folder} has weights of sha256 {_shown(found['sha256'][:12])}, the policy's words were made by {language.encoder}"
+                f"the language encoder in {self._folder} has weights of sha256 {_line(found['sha256'])[:12]}, the policy's words were made by {language.encoder}"
                 f" with {language.sha256[:12]}; name the folder of that one, or export it with `python -m lads_exporter language`"
             )
         return found
