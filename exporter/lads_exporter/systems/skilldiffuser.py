@@ -6,6 +6,7 @@ real steps under the option of the chunk that a window starts in. The observatio
 present observation and carries no noise, in training as when it acts; the option is left out of a share of the windows for guidance.
 Loss: half the squared error of the noise, half that of the actions between true embeddings. Departures from the published code, which at
 evaluation conditions on the option divided by H, clips to 1 what has variance 1, and trains with noise in the first row: none of these.
+Its configurations take the gradient of all of an option's copies (`option_gradient`), where LISA's take that of the first.
 """
 
 import copy
