@@ -118,28 +118,24 @@ impl Attention<'_> {
                 p,
             });
             let heads = self.heads;
-            if let Some([scales, _]) = scales {
-                isa.run(Scaled {
-                    heads,
-                    scales,
-                    blocks,
-                    p,
-                });
-            }
+            let scaled = |scales: Option<&[f32]>, p: &mut [Block]| {
+                if let Some(scales) = scales {
+                    isa.run(Scaled {
+                        heads,
+                        scales,
+                        blocks,
+                        p,
+                    });
+                }
+            };
+            scaled(scales.map(|[of_keys, _]| of_keys), p);
             isa.run(Probabilities {
                 heads,
                 visible,
                 blocks,
                 p,
             });
-            if let Some([_, scales]) = scales {
-                isa.run(Scaled {
-                    heads,
-                    scales,
-                    blocks,
-                    p,
-                });
-            }
+            scaled(scales.map(|[_, of_values]| of_values), p);
             let sums = Sums::<C> {
                 op: self,
                 values: values.get(..rows * width).unwrap_or(&[]),

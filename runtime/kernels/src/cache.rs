@@ -14,7 +14,7 @@
 
 use crate::dispatch::{Isa, Kernel};
 use crate::elementwise::assign;
-use crate::integers::scales;
+use crate::integers::scales_of;
 use crate::lanes::{Block, LANES};
 use crate::simd::{Portable, Simd};
 use crate::stored::{self, F16, F32, INT8_LARGEST, Int8, Stored};
@@ -64,13 +64,9 @@ impl CacheFormat {
     pub fn words(self, capacity: usize, [heads, head_dim]: [usize; 2]) -> Option<[usize; 2]> {
         let width = heads.checked_mul(head_dim)?;
         let rows = capacity.checked_next_multiple_of(LANES)?;
-        let scales = match self {
-            Self::F32 | Self::F16 => 0,
-            Self::Int8 => rows.checked_mul(heads)?,
-        };
         let words = |rows: usize| {
-            let elements = rows.checked_mul(width)?;
-            elements.div_ceil(self.per_word()).checked_add(scales)
+            let elements = rows.checked_mul(width)?.div_ceil(self.per_word());
+            elements.checked_add(self.scales(capacity, heads))
         };
         Some([words(rows)?, words(capacity)?])
     }
@@ -358,12 +354,7 @@ impl ScaledMut<'_> {
     fn set<S: Simd>(&mut self, simd: S, x: &[f32], [first, step]: [usize; 2], scale: usize) {
         let (blocks, rest) = x.as_chunks::<LANES>();
         let last = block(rest);
-        // Loops, because iterators that take closures are not compiled for the instruction set.
-        let mut largest = simd.larger(simd.zeros(), simd.load(&last));
-        for block in blocks {
-            largest = simd.larger(largest, simd.load(block));
-        }
-        let (per_number, per_unit) = scales(simd.largest(largest), INT8_LARGEST);
+        let (per_number, per_unit) = scales_of(simd, blocks, &last, INT8_LARGEST);
         let per_number = simd.splat(per_number);
         let to = self.integers.get_mut(first..).unwrap_or(&mut []);
         for (to, block) in to.chunks_mut(LANES * step).zip(blocks) {

@@ -102,12 +102,7 @@ impl Part {
         let (blocks, rest) = inputs.as_chunks::<LANES>();
         let mut last = [0.0; LANES];
         assign(&mut last, rest);
-        // Loops, because iterators that take closures are not compiled for the instruction set.
-        let mut largest = simd.larger(simd.zeros(), simd.load(&last));
-        for block in blocks {
-            largest = simd.larger(largest, simd.load(block));
-        }
-        let (per_input, per_unit) = scales(simd.largest(largest), LARGEST);
+        let (per_input, per_unit) = scales_of(simd, blocks, &last, LARGEST);
         self.scale = per_unit;
         let per_input = simd.splat(per_input);
         let (integers, _) = self.pairs.as_flattened_mut().as_chunks_mut::<LANES>();
@@ -118,6 +113,23 @@ impl Part {
             *to = simd.whole(simd.mul(simd.load(&last), per_input));
         }
     }
+}
+
+/// Returns the factors from numbers, whole blocks and the rest, to integers and back: the largest
+/// magnitude becomes `integer`.
+#[inline(always)]
+pub(crate) fn scales_of<S: Simd>(
+    simd: S,
+    blocks: &[Block],
+    last: &Block,
+    integer: f32,
+) -> (f32, f32) {
+    // A loop, because iterators that take closures are not compiled for the instruction set.
+    let mut largest = simd.larger(simd.zeros(), simd.load(last));
+    for block in blocks {
+        largest = simd.larger(largest, simd.load(block));
+    }
+    scales(simd.largest(largest), integer)
 }
 
 /// Returns the factors from inputs to integers and back, from the bits of the largest magnitude of the

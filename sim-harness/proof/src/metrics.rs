@@ -177,14 +177,10 @@ impl Score {
         let rates = [self.n_rate, self.full_success]
             .into_iter()
             .chain(self.k_rate);
-        let known = rates.flatten().count();
+        let (known, all) = (rates.flatten().count(), 2 + K_RATES);
         // Without commanded sub-tasks there are episodes and no rates.
-        let least = if episodes == 0 { 0 } else { known };
-        if ![0, 2 + K_RATES].contains(&known) || known != least {
-            return Err(format!(
-                "{known} of {} rates of {episodes} episodes",
-                2 + K_RATES
-            ));
+        if known > 0 && (known < all || episodes == 0) {
+            return Err(format!("{known} of {all} rates of {episodes} episodes"));
         }
         let amounts = [
             ("n_rate", self.n_rate),
@@ -209,25 +205,24 @@ impl Score {
                 ));
             }
         }
-        let of_count = share(count, episodes);
-        match (self.full_success, of_count) {
-            (Some(said), Some(is)) if (said - is).abs() > ROUNDING => Err(format!(
-                "full_success is {said} and {count} of {episodes} are {is}"
-            )),
-            _ if !self.k_rate.is_sorted_by(|a, b| a >= b) => Err(format!(
-                "k_rate grows with K: {:?}",
-                self.k_rate.map(Option::unwrap_or_default)
-            )),
-            _ => {
-                let at_least: f64 = self.k_rate.iter().flatten().sum();
-                match self.n_rate {
-                    Some(rate) if rate < at_least - ROUNDING => Err(format!(
-                        "n_rate is {rate}, below the sum of k_rate, {at_least}"
-                    )),
-                    _ => Ok(()),
-                }
-            }
+        let (n_rate, success) = (self.n_rate.unwrap_or(0.0), self.full_success.unwrap_or(0.0));
+        let of_count = share(count, episodes).unwrap_or(0.0);
+        let at_least: f64 = self.k_rate.iter().flatten().sum();
+        if known > 0 && (success - of_count).abs() > ROUNDING {
+            return Err(format!(
+                "full_success is {success} and {count} of {episodes} are {of_count}"
+            ));
         }
+        if !self.k_rate.is_sorted_by(|a, b| a >= b) {
+            let rates = self.k_rate.map(Option::unwrap_or_default);
+            return Err(format!("k_rate grows with K: {rates:?}"));
+        }
+        if n_rate < at_least - ROUNDING {
+            return Err(format!(
+                "n_rate is {n_rate}, below the sum of k_rate, {at_least}"
+            ));
+        }
+        Ok(())
     }
 }
 

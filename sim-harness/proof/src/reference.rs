@@ -7,14 +7,15 @@
 
 use std::path::{Path, PathBuf};
 
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
 use serde::Deserialize;
 use serde_json::Value;
 use thiserror::Error;
 
-use super::frames::{DIGEST_LEN, Digest};
 use super::purpose;
+
+mod trace;
+
+pub use trace::Trace;
 
 /// Value of the JSON's `format`.
 const FORMAT: &str = "lads-reference";
@@ -213,106 +214,6 @@ pub struct Completion {
     pub sub_task: String,
     /// Control step, from 1, after which the sub-task was done.
     pub step: usize,
-}
-
-/// A traced episode, step by step.
-#[derive(Debug, Deserialize)]
-#[serde(try_from = "Written")]
-pub struct Trace {
-    /// Observations of the policy, `[steps, O]`; empty of one that sees by cameras alone.
-    pub observations: Vec<f32>,
-    /// Digest of what the cameras showed at each step; empty of a policy without.
-    pub frames: Vec<Digest>,
-    /// Actions of the policy, `[steps, A]`.
-    pub actions: Vec<f32>,
-    /// Noise-free states before the first steps' actions, `[n, S]`; of a policy with cameras, whose frames are drawn of them, all steps'.
-    pub states: Vec<f64>,
-    /// Logits of each decision, `[decisions, M]`; empty where none were recorded.
-    pub logits: Vec<f32>,
-    /// Plan in force at each step, `[steps, D]`, of a policy whose plans are vectors; empty of others.
-    pub plan_vectors: Vec<f32>,
-    /// Plan that the trajectory encoder sees in each full segment.
-    pub encoded: Option<Vec<u32>>,
-    /// Extra distance of the second nearest code in each segment, relative to the nearest's squared distance.
-    pub encoded_margins: Option<Vec<f64>>,
-}
-
-#[derive(Deserialize)]
-struct Written {
-    observations: String,
-    #[serde(default)]
-    frames: String,
-    actions: String,
-    states: String,
-    #[serde(default)]
-    logits: String,
-    #[serde(default)]
-    plan_vectors: String,
-    encoded: Option<Vec<u32>>,
-    encoded_margins: Option<Vec<f64>>,
-}
-
-impl Trace {
-    /// Returns the logits of one of `decisions` decisions; empty where none were recorded.
-    pub fn logits_of(&self, number: usize, decisions: usize) -> &[f32] {
-        let len = self.logits.len() / decisions.max(1);
-        self.logits
-            .get(number * len..(number + 1) * len)
-            .unwrap_or_default()
-    }
-}
-
-impl Trace {
-    /// Refuses other lengths than those of an episode of `steps` control steps.
-    fn check(&self, steps: usize, subject: &Subject<'_>) -> Result<(), &'static str> {
-        if self.frames.is_empty() == (subject.sees && steps > 0) {
-            return Err(if subject.sees {
-                "its traces hold no frames, and the policy has cameras"
-            } else {
-                "its traces hold frames, and the policy has no camera"
-            });
-        }
-        let frames = if subject.sees { steps } else { 0 };
-        let states = self.states.len() / subject.state_len.max(1);
-        // Saturating: a damaged number of steps could be any.
-        let fits = self.observations.len() == steps.saturating_mul(subject.observation_len)
-            && self.actions.len() == steps.saturating_mul(subject.action_len)
-            && self.frames.len() == frames
-            && self.states.len() == states * subject.state_len
-            && self.plan_vectors.len().is_multiple_of(steps.max(1))
-            && (states >= frames && (states == 0) == (steps == 0));
-        let wrong = "the lengths of a trace are not those of the environment";
-        fits.then_some(()).ok_or(wrong)
-    }
-}
-
-impl TryFrom<Written> for Trace {
-    type Error = String;
-
-    fn try_from(written: Written) -> Result<Self, String> {
-        Ok(Self {
-            observations: numbers(&written.observations, f32::from_le_bytes)?,
-            frames: numbers::<_, DIGEST_LEN>(&written.frames, |digest| digest)?,
-            actions: numbers(&written.actions, f32::from_le_bytes)?,
-            states: numbers(&written.states, f64::from_le_bytes)?,
-            logits: numbers(&written.logits, f32::from_le_bytes)?,
-            plan_vectors: numbers(&written.plan_vectors, f32::from_le_bytes)?,
-            encoded: written.encoded,
-            encoded_margins: written.encoded_margins,
-        })
-    }
-}
-
-/// Decodes little-endian numbers in base64.
-fn numbers<T, const N: usize>(text: &str, read: fn([u8; N]) -> T) -> Result<Vec<T>, String> {
-    let bytes = STANDARD.decode(text).map_err(|error| error.to_string())?;
-    match bytes.as_chunks::<N>() {
-        (whole, []) => Ok(whole.iter().map(|&chunk| read(chunk)).collect()),
-        _ => Err(format!(
-            "a trace of {} bytes is not a whole number of {N}-byte numbers",
-            bytes.len()
-        )),
-    }
 }
 
 /// Description of the policy to verify, as far as its reference must agree with it.

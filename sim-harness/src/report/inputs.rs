@@ -3,34 +3,24 @@
 //! Only the fields that are needed are read, so that a file with more of them is taken too, and only the tables that are asked for. What can
 //! fail: a file that cannot be read, is no JSON, is of another format or version, or has no scores or impossible ones.
 
+mod results;
+mod tables;
+
 use std::collections::BTreeMap;
 use std::io;
 use std::path::Path;
 
-use lads_proof::metrics::{Interval, K_RATES, Score, wilson};
-use serde::Deserialize;
 use serde_json::Value;
 use thiserror::Error;
 
-use super::compare::{Split, System};
-use super::figures::Behaviour;
-use super::words::Counts;
+use super::compare::System;
 use crate::results::{FORMAT, FORMAT_VERSION};
 
 /// Value of the `format` of a file of tables.
 const TABLES: &str = "lads-tables";
 
-/// Versions of a file of tables that are read.
-const TABLES_VERSION: u32 = 1;
-
 /// What to do about one table of a file that cannot be read.
 const REMAKE: &str = "write it again with make table, or name another with --table";
-
-/// Why a table has no figures of what a policy did.
-const A_TABLE: &str = "a table holds success rates only; give a bundle";
-
-/// Why results have no figures of control steps.
-const RESULTS: &str = "results hold no control steps; give the bundle";
 
 /// Why a file is not taken.
 #[derive(Debug, Error)]
@@ -85,7 +75,7 @@ pub enum InputError {
         wrong: String,
     },
     /// No episode was run.
-    #[error("{of} has no split with episodes, so there is nothing to compare; make it again")]
+    #[error("'{of}' has no split with episodes, so there is nothing to compare; make it again")]
     Empty {
         /// Name of the system.
         of: String,
@@ -103,13 +93,18 @@ pub enum InputError {
         listed: usize,
     },
     /// There is no table to compare.
-    #[error("it has no table{asked} with a finished system; it has {tables}")]
+    #[error("it has no table{} with a finished system; it has {tables}", named(asked.as_deref()))]
     NoTable {
-        /// Name that was asked for, in quotes after a space; empty where none was.
-        asked: String,
+        /// Name that was asked for, if one was.
+        asked: Option<String>,
         /// Names of the file's tables.
         tables: String,
     },
+}
+
+/// Returns a name in quotes after a space; nothing where there is none.
+fn named(name: Option<&str>) -> String {
+    name.map_or_else(String::new, |name| format!(" '{name}'"))
 }
 
 /// Systems that a file has numbers of, by their environment's id.
@@ -135,11 +130,11 @@ fn parse(text: &str, name: &str, table: Option<&str>) -> Result<Found, InputErro
     let found = match value["format"].as_str() {
         Some(FORMAT) => {
             versioned(FORMAT, FORMAT_VERSION)?;
-            results(value, name)?
+            results::read(value, name)?
         }
         Some(TABLES) => {
-            versioned(TABLES, TABLES_VERSION)?;
-            tables(value, name, table)?
+            versioned(TABLES, tables::VERSION)?;
+            tables::read(value, name, table)?
         }
         found => {
             return Err(InputError::Format {
@@ -163,105 +158,9 @@ fn check(system: &System) -> Result<(), InputError> {
         })?;
     }
     let ran = system.splits.iter().any(|split| split.score.episodes > 0);
-    let of = || format!("'{}'", system.name);
-    ran.then_some(())
-        .ok_or_else(|| InputError::Empty { of: of() })
-}
-
-#[derive(Deserialize)]
-struct ResultsFile {
-    environment: Id,
-    bundle_sha256: String,
-    seed: u64,
-    noise: String,
-    decision: Decision,
-    episodes_per_instruction: u32,
-    splits: BTreeMap<String, Score>,
-    instructions: Vec<InstructionFound>,
-}
-
-#[derive(Deserialize)]
-struct Id {
-    id: String,
-}
-
-#[derive(Deserialize)]
-struct Decision {
-    rule: String,
-}
-
-#[derive(Deserialize)]
-struct InstructionFound {
-    text: String,
-    split: String,
-    completions: Vec<Value>,
-    runs: Vec<RunFound>,
-}
-
-#[derive(Deserialize)]
-struct RunFound {
-    plans: Vec<u32>,
-}
-
-fn results(value: Value, name: &str) -> Result<Found, InputError> {
-    let format = FORMAT;
-    let file: ResultsFile =
-        serde_json::from_value(value).map_err(|wrong| InputError::Field { format, wrong })?;
-    // JSON's order of splits is the alphabet's; the instructions have the contract's.
-    let mut names: Vec<&str> = Vec::new();
-    for instruction in &file.instructions {
-        if !names.contains(&instruction.split.as_str()) {
-            names.push(&instruction.split);
-        }
-    }
-    for split in names
-        .iter()
-        .copied()
-        .chain(file.splits.keys().map(String::as_str))
-    {
-        let own = file.instructions.iter().filter(|it| it.split == split);
-        let listed = own.map(|it| it.runs.len()).sum();
-        let scored = file.splits.get(split).map_or(0, |score| score.episodes);
-        if scored != listed {
-            let split = split.to_owned();
-            return Err(InputError::Split {
-                split,
-                scored,
-                listed,
-            });
-        }
-    }
-    let split = |&name: &&str| {
-        let own = file.instructions.iter().filter(|it| it.split == name);
-        Some(Split {
-            name: name.to_owned(),
-            score: file.splits.get(name)?.clone(),
-            commanded: own.map(|it| it.completions.len()).max(),
-        })
-    };
-    let decided = file.instructions.iter().map(|instruction| {
-        let plans = instruction.runs.iter().flat_map(|run| &run.plans).copied();
-        (instruction.text.as_str(), plans.collect())
-    });
-    let system = System {
-        name: short(name, ".results.json"),
-        file: name.to_owned(),
-        group: None,
-        facts: facts(
-            &file.bundle_sha256,
-            (&file.noise, file.seed),
-            &file.decision.rule,
-            file.episodes_per_instruction,
-        ),
-        policies: 1,
-        sweep: BTreeMap::new(),
-        splits: names.iter().filter_map(split).collect(),
-        behaviour: Behaviour {
-            compositions: Err(RESULTS.to_owned()),
-            words: Behaviour::words(Counts::of(decided)),
-        },
-    };
-    Ok(Found::from([(file.environment.id, vec![system])]))
+    ran.then_some(()).ok_or_else(|| InputError::Empty {
+        of: system.name.clone(),
+    })
 }
 
 /// Says what ran, in one line.
@@ -284,147 +183,10 @@ pub fn short(path: &str, ending: &str) -> String {
     file.strip_suffix(ending).unwrap_or(&stem).to_owned()
 }
 
-#[derive(Deserialize)]
-struct TablesFile {
-    tables: BTreeMap<String, Value>,
-}
-
-#[derive(Deserialize)]
-struct TableFound {
-    environment: String,
-    measure: String,
-    protocol: Protocol,
-    tracks: Vec<TrackFound>,
-}
-
-#[derive(Deserialize)]
-struct Protocol {
-    episodes_per_instruction: u32,
-    seed: u64,
-    noise: String,
-}
-
-#[derive(Deserialize)]
-struct TrackFound {
-    name: String,
-    rows: Vec<RowFound>,
-}
-
-#[derive(Deserialize)]
-struct RowFound {
-    title: String,
-    seeds: Vec<u64>,
-    #[serde(default)]
-    sweep: BTreeMap<String, f64>,
-    /// Absent until a seed is finished.
-    splits: Option<BTreeMap<String, SplitFound>>,
-}
-
-#[derive(Deserialize)]
-struct SplitFound {
-    episodes: usize,
-    success: f64,
-    success_interval: Interval,
-    n_rate: f64,
-    n_rate_standard_error: f64,
-    k_rate: [f64; K_RATES],
-}
-
-impl SplitFound {
-    /// Scores of all seeds' episodes together. Every seed ran as many, so a mean of rates is the rate of all, and times the number of
-    /// episodes it is the count that an interval needs.
-    fn score(&self) -> Score {
-        let count = |rate: f64| (rate * self.episodes as f64).round() as usize;
-        Score {
-            episodes: self.episodes,
-            n_rate: Some(self.n_rate),
-            n_rate_standard_error: Some(self.n_rate_standard_error),
-            k_rate: self.k_rate.map(Some),
-            k_rate_interval: self.k_rate.map(|rate| wilson(count(rate), self.episodes)),
-            full_success: Some(self.success),
-            full_success_interval: self.success_interval,
-            full_success_count: count(self.success),
-            un_instructed: 0,
-        }
-    }
-}
-
-fn tables(value: Value, name: &str, asked: Option<&str>) -> Result<Found, InputError> {
-    let format = TABLES;
-    let file: TablesFile =
-        serde_json::from_value(value).map_err(|wrong| InputError::Field { format, wrong })?;
-    let mut found = Found::new();
-    let tables: Vec<String> = file.tables.keys().cloned().collect();
-    for (table, content) in file.tables {
-        if asked.is_some_and(|asked| table != asked) {
-            continue;
-        }
-        let content: TableFound =
-            serde_json::from_value(content).map_err(|wrong| InputError::Table {
-                table: table.clone(),
-                wrong,
-            })?;
-        let systems = content.systems(&table, name);
-        if !systems.is_empty() {
-            let same = found.entry(content.environment).or_default();
-            same.extend(systems);
-        }
-    }
-    if found.is_empty() {
-        return Err(InputError::NoTable {
-            asked: asked.map_or_else(String::new, |asked| format!(" '{asked}'")),
-            tables: if tables.is_empty() {
-                "none".to_owned()
-            } else {
-                tables.join(", ")
-            },
-        });
-    }
-    Ok(found)
-}
-
-impl TableFound {
-    fn systems(&self, table: &str, file: &str) -> Vec<System> {
-        let Protocol {
-            episodes_per_instruction: episodes,
-            seed,
-            noise,
-        } = &self.protocol;
-        let system = |track: &TrackFound, row: &RowFound| {
-            let splits = row.splits.as_ref()?.iter();
-            Some(System {
-                name: row.title.clone(),
-                file: file.to_owned(),
-                group: Some(format!("{table}/{}", track.name)),
-                facts: format!(
-                    "table {table}, track {}, noise {noise}, seed {seed}, {episodes} episodes of each instruction by every policy",
-                    track.name
-                ),
-                policies: row.seeds.len(),
-                sweep: row.sweep.clone(),
-                splits: splits
-                    .map(|(name, split)| Split {
-                        name: name.clone(),
-                        score: split.score(),
-                        // The measure says whether K-rates tell more than success; instructions are not listed.
-                        commanded: (self.measure == "n_rate").then_some(K_RATES),
-                    })
-                    .collect(),
-                behaviour: Behaviour {
-                    compositions: Err(A_TABLE.to_owned()),
-                    words: Err(A_TABLE.to_owned()),
-                },
-            })
-        };
-        let tracks = self.tracks.iter();
-        tracks
-            .flat_map(|track| track.rows.iter().filter_map(move |row| system(track, row)))
-            .collect()
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use lads_proof::metrics::{Interval, Score, wilson};
+
     use super::*;
 
     fn split(k_rate: [f64; 4]) -> Value {
