@@ -19,5 +19,5 @@ for cpu in max cortex-a53; do
         CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER="qemu-aarch64 -L /usr/aarch64-linux-gnu -cpu $cpu" \
         CARGO_TARGET_DIR=$root/target/targets \
         "${CARGO:-cargo}" test --quiet --locked --release -p lads-kernels --target $target \
-        --lib --test conv_integers --test images --test integers --test linear --test stored --test twins
+        --lib --test attention --test conv_integers --test images --test integers --test linear --test stored --test twins
 done

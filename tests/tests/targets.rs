@@ -122,7 +122,7 @@ fn kernels_equal_their_twins_on_aarch64() {
     if skipped(&text) {
         return;
     }
-    assert_eq!(text.matches("test result: ok").count(), 14, "{text}");
+    assert_eq!(text.matches("test result: ok").count(), 16, "{text}");
 }
 
 /// Whether a script lacked its tools; where `LADS_REQUIRE_TOOLS` is set, that is a failure.
