@@ -12,7 +12,11 @@ ENV    ?= kitchen
 DATA   ?= data/$(patsubst %-sizes,%,$(ENV)).safetensors
 COLLECT_kitchen := --episodes-per-instruction 50
 COLLECT_lorel   := --episodes 50000
+COLLECT_kitchen-image := --episodes-per-instruction 25
 COLLECT_lorel-image := --episodes 3000
+# What a table's systems with a camera learn from, beside the data.
+SEEN_kitchen-image = $(DATA:.safetensors=.features)
+SEEN_lorel-image = $(DATA:.safetensors=.frames)
 # What lints and tests cover; one selection, because each is a build of its own, of tract too: the oracle and the language encoder's engine.
 FEATURES := lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language
 ALL      := --workspace --features $(FEATURES)
@@ -217,8 +221,8 @@ test-python: setup wheel $(VENV)/stamp
 	$(PIP) 'lads[test,examples]'
 	$(TALLY) $(PY) -m pytest -rs $(WORKERS) runtime/python/tests
 
-## collect: demonstrations into data/ENV.safetensors; ENV=kitchen (scripted, of the 22 seen instructions), lorel (random, labelled), or lorel-image
-##         (as many as are drawn)
+## collect: demonstrations into data/ENV.safetensors; ENV=kitchen (scripted, of the 22 seen instructions), lorel (random, labelled), or kitchen-image and
+##         lorel-image (as many as are drawn)
 collect: setup
 	cargo run --release -p lads-sim --bin lads-collect -- --env $(ENV:-image=) $(COLLECT_$(ENV)) -o data/$(ENV).safetensors
 
@@ -242,14 +246,18 @@ train: $(VENV)/stamp
 export: $(VENV)/stamp
 	$(PY) -m lads_exporter export --run runs/$(ENV) -o models/$(ENV).onnx
 
-## table: every system of the paper's tables, ENV=kitchen, lorel, lorel-image or kitchen-sizes (Figure 6): trained, exported, evaluated, into models/TABLES.md; hours, and the
-##        same command goes on where it was stopped. TABLE_ARGS="--jobs 2" trains two at a time, "--engine ray" on a cluster (docs/cluster.md)
-table: setup $(VENV)/stamp $(DATA) $(if $(filter %-image,$(ENV)),$(DATA:.safetensors=.frames))
+## table: every system of the paper's tables, ENV=kitchen, lorel, kitchen-image, lorel-image or kitchen-sizes (Figure 6): trained, exported, evaluated, into
+##        models/TABLES.md; hours, and the same command goes on where it was stopped. TABLE_ARGS="--jobs 2" trains two at a time, "--device cuda" on a
+##        GPU, "--engine ray" on a cluster (docs/cluster.md)
+table: setup $(VENV)/stamp $(DATA) $(SEEN_$(ENV))
 	cargo build --release -p lads-sim $(if $(filter %-image,$(ENV)),--features camera) --bin lads-run
 	$(PY) -m lads_exporter table exporter/tables/$(ENV).toml --data $(DATA) $(TABLE_ARGS)
 
 %.frames: | %.safetensors
 	$(MAKE) frames DATA=$*.safetensors
+
+%.features: | %.safetensors
+	$(MAKE) features DATA=$*.safetensors
 
 $(DATA):
 	$(MAKE) collect ENV=$(patsubst %-sizes,%,$(ENV))

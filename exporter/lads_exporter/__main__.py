@@ -191,7 +191,8 @@ def _calibrate(arguments):
 def _table(arguments):
     from .tables import run
 
-    chosen = {key: getattr(arguments, key) for key in ("data", "frames", "runs", "lads_run", "models", "engine")}
+    chosen = {key: getattr(arguments, key) for key in ("data", "frames", "features", "runs", "lads_run", "models", "engine", "device")}
+    _device(arguments.device)
     if not run.run(arguments.table, at_once=arguments.jobs, **chosen):
         print("stopped; the same command goes on", file=sys.stderr)
         return 130
@@ -289,13 +290,15 @@ def _parser():
     calibrate.set_defaults(run_command=_calibrate)
 
     table = commands.add_parser("table", help="the paper's tables: trains, exports and evaluates every system; goes on where it was stopped")
-    table.add_argument("table", metavar="TABLE", help="exporter/tables/kitchen.toml or lorel.toml")
+    table.add_argument("table", metavar="TABLE", help="exporter/tables/kitchen.toml or another of that folder")
     table.add_argument("--data", help="the dataset; left out, the one that the table names")
     table.add_argument("--frames", help="the frames of the dataset's states, for systems with a camera; left out, those that the table names")
+    table.add_argument("--features", help="the features of the dataset's frames, for systems with a frozen encoder; left out, those that the table names")
     table.add_argument("--runs", default="runs/tables", help="where jobs are kept (runs/tables)")
     table.add_argument("--lads-run", default="target/release/lads-run", help="the built program (target/release/lads-run)")
     table.add_argument("--models", default="models", help="where TABLES.md and tables.json go (models)")
     table.add_argument("--jobs", type=int, help="trainings at a time, of one thread each; left out, 1, and with ray one for each CPU of the cluster")
+    table.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="what trainings run on (cpu); their sums differ between devices")
     table.add_argument("--engine", choices=("local", "ray"), default="local", help="where jobs run: on this machine, or on the Ray cluster at $RAY_ADDRESS, without it on a Ray of this machine's own (docs/cluster.md)")
     table.set_defaults(run_command=_table)
     return parser

@@ -256,11 +256,17 @@ class Trainer:
             "transitions": int(self.corpus.lengths.sum()),
             "steps": {name: self.system.settings(self.config, name).steps for name in names},
             "seconds": {name: round(self.seconds.get(name, 0.0), 1) for name in names},
+            "device": _named(self.corpus.device),
             **self.system.summary(),
             "validation": last,
             "versions": {"lads-exporter": __version__, "torch": torch.__version__},
         }
         write_atomically(self.out / SUMMARY, (json.dumps(summary, indent=1) + "\n").encode())
+
+
+def _named(device):
+    """Names a device as its maker does where that says something about the time that a training took."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
 
 class SharedEncoder:

@@ -1,5 +1,6 @@
 """Tests a table end to end on the tiny setting, what is refused, and the numbers."""
 
+import dataclasses
 import json
 import os
 import re
@@ -11,11 +12,12 @@ import time
 
 import pytest
 import synthetic
+import test_features
 import test_frames
 import tiny_table
 from tiny_table import TABLE, play
 
-from lads_exporter import config, dataset
+from lads_exporter import __main__ as command, config, dataset, features
 from lads_exporter.config import UserError
 from lads_exporter.tables import definition, jobs, render
 from lads_exporter.tables.commands import Command
@@ -255,7 +257,7 @@ def test_wilson_interval():
 
 def test_the_tables_that_ship_are_sound():
     both, states = ["shipping", "paper"], {"lads", "lang_dt", "lisa", "vae", "cluster"}
-    rows = {"kitchen": (both, states), "lorel": (both, states), "lorel-image": (["shipping"], states - {"cluster"}), "kitchen-sizes": (["shipping"], {"base"})}
+    rows = {"kitchen": (both, states), "lorel": (both, states), "lorel-image": (["shipping"], states - {"cluster"}), "kitchen-image": (["shipping"], {"lads", "wo_sr"}), "kitchen-sizes": (["shipping"], {"base"})}
     for name, (tracks, systems) in rows.items():
         table = definition.load(f"tables/{name}.toml")
         assert [track.name for track in table.tracks] == tracks
@@ -264,14 +266,21 @@ def test_the_tables_that_ship_are_sound():
         assert all(path.is_absolute() and ".." not in path.parts for path in files)
 
 
+def change_base(folder, values, sections):
+    """Gives keys of base.toml other values, and adds sections to it."""
+    base = (folder / "base.toml").read_text()
+    for key, new in values.items():
+        base, count = re.subn(rf"^{key} = .*", f"{key} = {json.dumps(new)}", base, flags=re.MULTILINE)
+        assert count == 1
+    for name, rows in sections.items():
+        base += f"\n[{name}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in rows.items())
+    (folder / "base.toml").write_text(base)
+
+
 def test_systems_with_a_camera_share_the_encoder(folder):
     """Tests that one encoder of frames is trained for a table's systems, and that the frames are those of its dataset."""
-    base = (folder / "base.toml").read_text()
-    for key, old, new in (("observed", r"\d+", "0"), ("renoise", r"\w+", "false"), ("schedule", r'"\w+"', '"staged"')):
-        base, count = re.subn(rf"^{key} = {old}", f"{key} = {new}", base, flags=re.MULTILINE)
-        assert count == 1
-    section = lambda name, rows: f"\n[{name}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in rows.items())
-    (folder / "base.toml").write_text(base + section("images", {key: value for key, value in test_frames.SEEN.items() if key != "frames"}) + section("images.frames", test_frames.APART))
+    seen = {key: value for key, value in test_frames.SEEN.items() if key != "frames"}
+    change_base(folder, {"observed": 0, "renoise": False, "schedule": "staged"}, {"images": seen, "images.frames": test_frames.APART})
     (folder / "table.toml").write_text('frames = "tiny.frames"' + TABLE.replace("seeds = [0, 1]", "seeds = [4]"))
     with pytest.raises(UserError, match=r"no frames at .*tiny\.frames; draw them first \(make frames DATA="):
         play(folder)
@@ -286,3 +295,57 @@ def test_systems_with_a_camera_share_the_encoder(folder):
     assert len(list(folder.glob("runs/tiny/paper/encoder-seed4-*.pt"))) == 1
     found = json.loads((folder / "models/tables.json").read_text())["tables"]["tiny"]["jobs"]
     assert [row["summary"]["steps"]["frames"] for row in found] == [test_frames.APART["steps"]] * 2
+
+
+def test_systems_with_a_frozen_encoder_learn_from_its_features(folder):
+    """Tests that a table's features are those of its dataset, and that a job depends on how they were made."""
+    change_base(folder, {"observed": test_features.JOINTS, "schedule": "staged"}, {"pretrained": test_features.SEEN, "history": test_features.HISTORY})
+    lads = TABLE[: TABLE.index("[[system]]", TABLE.index("[[system]]") + 1)].replace("seeds = [0, 1]", "seeds = [4]")
+    (folder / "table.toml").write_text('features = "tiny.features"' + lads)
+    with pytest.raises(UserError, match=r"no features at .*tiny\.features; make them first \(python -m lads_exporter features\)"):
+        play(folder)
+    with pytest.raises(UserError, match=r"tiny has no systems that learn from frames; leave --frames out"):
+        play(folder, frames=folder / "tiny.safetensors")
+
+    drawer = tiny_table.executable(folder / "drawer", test_features.PROGRAM)
+    features.make(config.load(folder / "base.toml"), folder / "tiny.safetensors", folder / "tiny.features", drawer, quiet=True)
+    assert play(folder)
+    (row,) = json.loads((folder / "models/tables.json").read_text())["tables"]["tiny"]["jobs"]
+    assert row["seed"] == 4 and row["summary"]["device"] == "cpu" and set(row["summary"]["steps"]) == {"plans", "low_level", "high_level"}
+
+    # Features of another encoder are of another job.
+    (before,) = folder.glob("runs/tiny/paper/*")
+    (folder / "tiny.features").unlink()
+    base = (folder / "base.toml").read_text()
+    (folder / "base.toml").write_text(base.replace(f'"{test_features.SEEN["encoder"]}"', '"random-5"').replace(f"features = {test_features.F}", f"features = {test_features.F // 4 * 5}"))
+    with pytest.raises(UserError, match="no features"):
+        play(folder)
+    features.make(config.load(folder / "base.toml"), folder / "tiny.safetensors", folder / "tiny.features", drawer, quiet=True)
+    assert play(folder) and len(list(folder.glob("runs/tiny/paper/*"))) == 2 and before.exists()
+
+    (folder / "table.toml").write_text('frames = "tiny.frames"\nfeatures = "tiny.features"' + lads)
+    with pytest.raises(UserError, match="frames and features exclude each other"):
+        play(folder)
+
+
+def test_a_table_says_on_what_its_systems_were_trained(folder, monkeypatch, capsys):
+    """Tests the device: what is refused, what a job's training is told, and what the page says."""
+    monkeypatch.setattr(command.sys, "argv", ["lads_exporter", "table", str(folder / "table.toml"), "--device", "cuda"])
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert command.main() == 2 and "--device cuda: this machine has no usable CUDA GPU; use --device cpu" in capsys.readouterr().err
+    with pytest.raises(UserError, match=r"--device cuda: the engine ray gives its tasks a CPU each; leave --device out, or use --engine local"):
+        play(folder, engine="ray", device="cuda")
+
+    table = definition.load(folder / "table.toml")
+    told = {device: jobs.all_jobs(table, dataclasses.replace(place_of(folder), device=device))[0] for device in ("cpu", "cuda")}
+    assert "--device" not in told["cpu"]._training().line() and " --device cuda" in " ".join(told["cuda"]._training().line())
+    assert told["cpu"].identity == told["cuda"].identity
+
+    assert play(folder)
+    found = render.read(folder / "models/tables.json")
+    summaries = [summary for row in found["tables"]["tiny"]["tracks"][0]["rows"] for summary in row["summary"]]
+    assert [summary["device"] for summary in summaries] == ["cpu"] * 3
+    assert " min on " not in render.markdown(found)
+    summaries[0]["device"] = "GPU of a maker"
+    del summaries[1]["device"]  # of a file that was written before devices were
+    assert "| 0 min on GPU of a maker |" in render.markdown(found)

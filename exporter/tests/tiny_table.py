@@ -83,10 +83,14 @@ def write(folder):
     (folder / "lang_dt.toml").write_text('[system]\nkind = "lang_dt"\n')
     (folder / "table.toml").write_text(TABLE)
     synthetic.write(folder / "tiny.safetensors", config.load(folder / "base.toml"), discarded='{"dl": 1}', attempts='{"dl": 4, "ld": 6}')
-    program = folder / "lads-run"
-    program.write_text(PROGRAM.format(python=sys.executable, source=source(), instructions=folder / "tiny.instructions.json"))
-    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    executable(folder / "lads-run", PROGRAM.format(python=sys.executable, source=source(), instructions=folder / "tiny.instructions.json"))
     return folder
+
+
+def executable(path, text):
+    path.write_text(text)
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return path
 
 
 def source():

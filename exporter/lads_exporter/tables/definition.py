@@ -62,6 +62,7 @@ class Table:
     systems: list
     folder: Path  # where the file lies; paths in it are relative to it
     frames: str = ""  # of the dataset's states, for systems that observe by a camera
+    features: str = ""  # of those frames instead, for systems with a frozen encoder
 
     def path(self, name):
         """Returns a whole path, which means the same in every folder that a command runs in."""
@@ -121,6 +122,8 @@ def _check(table, path):
     problems = []
     if table.measure not in MEASURES:
         problems.append(f"measure = {table.measure!r}: must be one of {', '.join(MEASURES)}")
+    if table.frames and table.features:
+        problems.append("frames and features exclude each other")
     if len(table.splits) != len(table.headings):
         problems.append("splits and headings must be as many")
     if not re.fullmatch(r"[A-Za-z0-9][\w-]*", table.name):

@@ -19,7 +19,7 @@ from .commands import Command, Rollouts
 from .render import check_scores
 
 CHANGES_NOTHING = ("sampler", "passes", "guidance", "temperature", "clip", "rule")  # of [system]: what only an export depends on
-SUMMARISED = ("perplexity", "codebook_size", "plan_elements_in_use", "validation", "steps")  # of a training's summary, in the table's file
+SUMMARISED = ("perplexity", "codebook_size", "plan_elements_in_use", "validation", "steps", "device")  # of a training's summary, in the table's file
 SCORES = ("episodes", "n_rate", "n_rate_standard_error", "k_rate", "full_success", "full_success_count")  # of a split's results, in the same
 
 
@@ -32,13 +32,15 @@ class Place:
     data_sha256: str
     lads_run: Path
     frames: Path | None = None  # of the dataset's states
-    rendering: dict | None = None  # how they were drawn; their last bits depend on the machine that drew them
+    features: Path | None = None  # of those frames instead, made by a frozen encoder
+    seen: object = None  # of frames how they were drawn, of features that and the encoder's hash; their last bits depend on the machine that drew them
     threads: int = 1  # of a training: sums depend on their number
+    device: str = "cpu"  # that trainings run on
 
     @property
     def large(self):
         """Returns the files that are too large to go along with every command."""
-        return [path for path in (self.data, self.frames) if path]
+        return [path for path in (self.data, self.frames, self.features) if path]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,7 @@ class Job:
         tables[0]["system"] = {key: value for key, value in own.items() if key not in CHANGES_NOTHING}
         encoder = self._encoder
         known = encoder if encoder.startswith("random-") else language.weights_sha256(encoder)
-        seen = [self.place.rendering] if self.place.frames else []
+        seen = [self.place.seen] if self.place.seen else []
         return _hash([tables, self.place.data_sha256, known, self.seed, self.place.threads, *seen])
 
     @property
@@ -92,7 +94,7 @@ class Job:
         table = self._setting.tables[0]
         if not self._setting.config.images.frames.steps:
             return None
-        made_of = _hash([table["images"], table["data"], self.place.data_sha256, self.place.rendering, self.seed, self.place.threads])
+        made_of = _hash([table["images"], table["data"], self.place.data_sha256, self.place.seen, self.seed, self.place.threads])
         return self.place.runs / self.table.name / self.track.name / f"encoder-seed{self.seed}-{made_of[:12]}.pt"
 
     @cached_property
@@ -138,8 +140,9 @@ class Job:
         written = [self.folder / name for name in (CHECKPOINT, CURVES, SUMMARY)]
         resume = ["--resume"] if written[0].is_file() else []
         options = ["--config", base, "--system", over, "--data", place.data, "--out", self.folder, "--seed", self.seed, "--threads", place.threads]
-        if place.frames:
-            options += ["--frames", place.frames]
+        options += ["--device", place.device] if place.device != "cpu" else []
+        for name, path in (("--frames", place.frames), ("--features", place.features)):
+            options += [name, path] if path else []
         if self.shared_encoder:
             options += ["--encoder", self.shared_encoder]
             written.insert(0, self.shared_encoder)

@@ -200,7 +200,8 @@ def _row(table, row):
         cells.append(_ours(row["splits"][split], table["measure"]) if "splits" in row else "not finished")
     first = next(iter(row["splits"].values())) if "splits" in row else None
     cells.append(str(sum(split["episodes"] for split in row["splits"].values())) if first else "-")
-    cells.append(_minutes(row["training_s"]) if first else "-")
+    devices = sorted({found.get("device") or "cpu" for found in row.get("summary", [])} - {"cpu"})
+    cells.append(f"{_minutes(row['training_s'])}{' on ' * bool(devices)}{', '.join(devices)}" if first else "-")
     cells.append(", ".join(f"`{sha256[:12]}`" for sha256 in row["bundle_sha256"]) or "-")
     return _line(cells)
 
@@ -235,7 +236,7 @@ def markdown(found):
     for name, table in found["tables"].items():
         asked = table["protocol"]
         lines += ["", f"## {table['title']}", "", MEASURES[table["measure"]], ""]
-        lines += [f"{asked['episodes_per_instruction']} episodes of each instruction, seed {asked['seed']}, noise {asked['noise']}; data `{table['dataset_sha256'][:12]}`; trained with {table['threads']} thread."]
+        lines += [f"{asked['episodes_per_instruction']} episodes of each instruction, seed {asked['seed']}, noise {asked['noise']}; data `{table['dataset_sha256'][:12]}`; trained with {table['threads']} thread, or on the device named."]
         for track in table["tracks"]:
             heads = ["system", "seeds"]
             heads += [f"{heading}, {whose}" for heading in table["splits"].values() for whose in ("paper", "ours")]

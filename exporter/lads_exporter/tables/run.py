@@ -13,7 +13,7 @@ from pathlib import Path
 
 from safetensors import SafetensorError
 
-from .. import dataset, frames as frame_file
+from .. import config, dataset, features as feature_file, frames as frame_file
 from ..config import UserError
 from . import render
 from .commands import Stopped
@@ -72,17 +72,19 @@ def open_engine(name, place, at_once):
     """Makes the engine that runs the jobs' commands; Ray is imported where it is asked for only."""
     if name == "local":
         return Local(at_once or 1)
+    if place.device != "cpu":
+        raise UserError(f"--device {place.device}: the engine {name} gives its tasks a CPU each; leave --device out, or use --engine local")
     from .on_ray import OnRay
 
     return OnRay(place, at_once)
 
 
-def run(path, data=None, frames=None, runs="runs/tables", lads_run="target/release/lads-run", models="models", at_once=None, engine="local"):
+def run(path, data=None, frames=None, features=None, runs="runs/tables", lads_run="target/release/lads-run", models="models", at_once=None, engine="local", device="cpu"):
     """Runs a table's file to its end, or until it is stopped -> whether it reached the end."""
     if at_once is not None and at_once < 1:
         raise UserError(f"--jobs {at_once}: must be at least 1")
     table = load(path)
-    place = _place(table, data, frames, runs, lads_run, models)
+    place = _place(table, data, {"frames": frames, "features": features}, runs, lads_run, models, device)
     jobs = all_jobs(table, place)
     with open_engine(engine, place, at_once) as opened:
         return _run(table, place, jobs, models, opened)
@@ -139,9 +141,10 @@ def _run(table, place, jobs, models, engine):
     return not engine.stopped
 
 
-def _place(table, data, frames, runs, lads_run, models):
+def _place(table, data, given, runs, lads_run, models, device):
     data = Path(data) if data else table.path(table.data)
-    frames = Path(frames) if frames else table.path(table.frames) if table.frames else None
+    named = {"frames": table.frames, "features": table.features}
+    seen = {what: Path(given[what]) if given[what] else table.path(named[what]) for what in named if given[what] or named[what]}
     lads_run = Path(lads_run)
     problems = []
     if not data.is_file():
@@ -156,12 +159,21 @@ def _place(table, data, frames, runs, lads_run, models):
             problems.append(f"{option} {folder}: it is no folder; name one")
     if not lads_run.is_file():
         problems.append(f"no program at {lads_run}; build it first: cargo build --release -p lads-sim")
-    if frames and not table.frames:
-        problems.append(f"{table.name} has no systems with a camera; leave --frames out")
-    elif frames and not frames.is_file():
-        problems.append(f"no frames at {frames}; draw them first (make frames DATA={data})")
+    advice = {"frames": f"draw them first (make frames DATA={data})", "features": "make them first (python -m lads_exporter features)"}
+    for what, path in seen.items():
+        if not named[what]:
+            problems.append(f"{table.name} has no systems that learn from {what}; leave --{what} out")
+        elif not path.is_file():
+            problems.append(f"no {what} at {path}; {advice[what]}")
     if problems:
         raise UserError("; ".join(problems))
     sha256 = dataset.sha256(data)
-    rendering = frame_file.read(frames, sha256)[1] if frames else None
-    return Place(Path(runs).resolve(), data.resolve(), sha256, lads_run.resolve(), frames and frames.resolve(), rendering)
+    made_of = None
+    if "frames" in seen:
+        made_of = frame_file.read(seen["frames"], sha256)[1]
+    elif "features" in seen:
+        setting = config.load(*table.configuration(table.tracks[0], table.rows(table.tracks[0])[0]))
+        found = feature_file.read(seen["features"], setting, sha256)
+        made_of = [found.rendering, found.encoder]
+    seen = {what: path.resolve() for what, path in seen.items()}
+    return Place(Path(runs).resolve(), data.resolve(), sha256, lads_run.resolve(), **seen, seen=made_of, device=device)
