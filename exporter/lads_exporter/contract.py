@@ -108,10 +108,13 @@ def action(contract):
     return of_role(contract, "action")[0]
 
 
-def camera(contract):
-    """Returns the only observation channel of a policy that sees by one camera; None of a policy that observes something else."""
+def seen(contract):
+    """Returns the channels of a policy that observes one vector, the frames of one camera, or both -> the vector or None, the camera or None."""
     found = of_role(contract, "observation")
-    return found[0] if len(found) == 1 and found[0].get("layout") == "hwc" else None
+    vectors, cameras = [row for row in found if "elements" in row], [row for row in found if row.get("layout") == "hwc"]
+    if len(vectors) > 1 or len(cameras) > 1 or len(vectors) + len(cameras) != len(found):
+        raise UserError(f"the policy observes {', '.join(row['name'] for row in found)}, not one vector, the frames of one camera, or both")
+    return vectors[0] if vectors else None, cameras[0] if cameras else None
 
 
 def observation(contract):

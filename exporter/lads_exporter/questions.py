@@ -33,18 +33,31 @@ def _numbers(text, kind, columns):
     return np.frombuffer(base64.b64decode(text), kind).reshape(-1, columns)
 
 
+def _decoded(text):
+    try:
+        return base64.b64decode(text)
+    except ValueError:  # not base64
+        return b""
+
+
 def _traced(rows):
     """Yields (index of the instruction, episode) of every trace."""
     return [(index, row) for index, instruction in enumerate(rows) for row in instruction["episodes"] if "trace" in row]
 
 
 class Shown:
-    """What the policy was shown in each trace: recorded observations, or frames of the recorded states, drawn once into a temporary file."""
+    """What the policy was shown in each trace: recorded observations, and frames of the recorded states, drawn once into a temporary file."""
 
     def __init__(self, rows, contract, renderer):
         self.frames = {}
+        self.vector, self.camera = contracts.seen(contract)
+        for index, episode in _traced(rows):
+            count = episode["steps"] * self.vector["shape"][0] if self.vector else 0
+            recorded = _decoded(episode["trace"].get("observations", ""))
+            if len(recorded) != 4 * count or not np.isfinite(np.frombuffer(recorded, "<f4")).all():
+                where = f"{rows[index]['id']}, episode {episode['episode']}"
+                raise config.UserError(f"{where}: its observations are not the {count} finite numbers that the policy observes; make the reference again")
         if renderer is None:
-            self.len = contracts.observation(contract)["shape"][0]
             return
         traced = [(index, episode, _states(episode)) for index, episode in _traced(rows)]
         shape = (sum(len(states) for *_, states in traced), *renderer.shape)
@@ -62,10 +75,17 @@ class Shown:
             self.frames[index, episode["episode"]] = drawn[first:at]
 
     def of(self, index, episode):
-        """Returns what was shown at each step [steps, ...]."""
-        if self.frames:
-            return self.frames[index, episode["episode"]]
-        return _numbers(episode["trace"]["observations"], "<f4", self.len)
+        """Returns what was shown at each step: {channel: [steps, ...]}."""
+        found = {}
+        if self.vector:
+            found[self.vector["name"]] = self.observations(episode)
+        if self.camera:
+            found[self.camera["name"]] = self.frames[index, episode["episode"]]
+        return found
+
+    def observations(self, episode):
+        """Returns the observed vectors [steps, O]."""
+        return _numbers(episode["trace"]["observations"], "<f4", self.vector["shape"][0])
 
 
 def _states(episode):
@@ -76,9 +96,9 @@ def _ask(policy, shown, index, episode):
     """Asks a policy what a trace's policy was asked -> logits per decision, actions [steps, A]."""
     trace = episode["trace"]
     policy.start(index, episode.get("noise_seed"))
-    actions = []
-    for seen, done in zip(shown.of(index, episode), _numbers(trace["actions"], "<f4", len(policy.low)), strict=True):
-        actions.append(policy.act(np.array(seen)))
+    actions, seen = [], shown.of(index, episode)
+    for step, done in enumerate(_numbers(trace["actions"], "<f4", len(policy.low))):
+        actions.append(policy.act({name: np.array(rows[step]) for name, rows in seen.items()}))
         policy.actions[-1] = torch.from_numpy(done.copy())
     return policy.logits, np.stack(actions)
 
@@ -174,7 +194,7 @@ def add(head, rows, model, contract, policy, renderer=None):
         segments = len(done) // horizon if encoder else 0
         if segments:
             cut = lambda steps: steps[: segments * horizon].reshape(segments, horizon, -1)
-            trace["encoded"], trace["encoded_margins"] = encoder.plans(cut(shown.of(index, episode)), cut(done))
+            trace["encoded"], trace["encoded_margins"] = encoder.plans(cut(shown.observations(episode)), cut(done))
         elif encoder:
             trace["encoded"], trace["encoded_margins"] = [], []
     head["contract"] = contract

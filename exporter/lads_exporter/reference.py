@@ -9,7 +9,8 @@ the runtime's streams, so that it can run the very same episodes.
 
 The policy sees observations as float32 and acts with float32, as the runtime does. Frames of a policy with a camera are drawn of the
 official environment's states by the harness's renderer, so that both sides see by the same one; a trace holds the states, and of
-every frame a digest, by which a verifier knows whether it draws the same. An interrupted run continues from its progress file, which lies beside the output until that is complete.
+every frame a digest, by which a verifier knows whether it draws the same. What such a policy observes of the state beside its frames is recorded as
+any observation is: the first elements of it. An interrupted run continues from its progress file, which lies beside the output until that is complete.
 """
 
 import base64
@@ -79,14 +80,19 @@ def episode(policy, environment, entropy, instruction, known, traced, renderer=N
     policy.start(instruction, seed)
     commanded, most = known["sub_tasks"], environment.max_steps(known["split"])
     observation = environment.reset(entropy, commanded)
-    states, observations, actions = [], [], []
+    vector, camera = contracts.seen(policy.contract)
+    states, observations, digests, actions = [], [], [], []
     while environment.steps < most and not environment.succeeded(commanded):
         if traced and (renderer or len(states) < TRACED_STATES):
             states.append(environment.state())
-        seen = renderer.draw(environment.state()).copy() if renderer else observation.astype(np.float32)
+        seen = {}
+        if vector:
+            seen[vector["name"]] = observation[: vector["shape"][0]].astype(np.float32)
+            observations.append(seen[vector["name"]])
+        if camera:
+            seen[camera["name"]] = renderer.draw(environment.state()).copy()
+            digests.append(frames.digest(seen[camera["name"]]))
         action = policy.act(seen)
-        if traced:
-            observations.append(frames.digest(seen) if renderer else seen)
         actions.append(action)
         observation = environment.step(action.astype(np.float64))
     order = sorted(environment.completions.items(), key=lambda row: (row[1], environment.SUB_TASKS.index(row[0])))
@@ -104,7 +110,9 @@ def episode(policy, environment, entropy, instruction, known, traced, renderer=N
         text = lambda rows, kind: base64.b64encode(np.stack(rows).astype(kind).tobytes()).decode()
         # What the policy saw and did at every step, so that a verifier can ask another policy the same questions; and the
         # noise-free states that the environment's physics is compared by. Frames are made of the states of all steps.
-        seen = {"observations": "", "frames": text(observations, "u1")} if renderer else {"observations": text(observations, "<f4")}
+        seen = {"observations": text(observations, "<f4") if vector else ""}
+        if camera:
+            seen["frames"] = text(digests, "u1")
         row["trace"] = seen | {"actions": text(actions, "<f4"), "states": text(states, "<f8")}
         if policy.vectors:
             row["trace"]["plan_vectors"] = text(policy.vectors, "<f4")
@@ -174,12 +182,12 @@ def _text(head, instructions):
 
 def renderer_of(contract, lads_run):
     """Makes the renderer of the policy's camera; None for a policy without."""
-    seen = contracts.camera(contract)
-    if seen is None:
+    _, camera = contracts.seen(contract)
+    if camera is None:
         return None
-    if "rendering" not in seen:
-        raise config.UserError(f"channel {seen['name']}: the contract does not say how its frames are drawn; export the policy with the frames of lads-run")
-    return frames.Renderer(lads_run, contract["environment"]["id"], seen["rendering"])
+    if "rendering" not in camera:
+        raise config.UserError(f"channel {camera['name']}: the contract does not say how its frames are drawn; export the policy with the frames of lads-run")
+    return frames.Renderer(lads_run, contract["environment"]["id"], camera["rendering"])
 
 
 def write(bundle, output, run=None, over=(), episodes=20, traced=2, seed=0, noise="v0", lads_run="target/release/lads-run"):

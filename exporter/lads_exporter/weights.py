@@ -49,7 +49,8 @@ def nearness(regressed, codes):
 def from_lads(lads, regressed=False):
     """Takes the acting part of trained networks; `regressed` says that the high level regresses its plans."""
     high_level = Nearest(lads.high_level, lads.codebook.codes) if regressed else lads.high_level
-    return Acting(lads.normalizer, high_level, lads.codebook.codes, lads.low_level, getattr(lads, "frames", None))
+    low_level = lads.acting_low_level() if hasattr(lads, "acting_low_level") else lads.low_level
+    return Acting(lads.normalizer, high_level, lads.codebook.codes, low_level, getattr(lads, "frames", None))
 
 
 def _tensors(model):
@@ -72,7 +73,8 @@ def _lengths(contract):
 
 def _frame_encoder(tensors, contract):
     """Loads the encoder of frames; its layout is that of `FrameEncoder`, its sizes are the tensors'."""
-    channel, size = contracts.camera(contract)["name"], contracts.camera(contract)["shape"][:2]
+    _, camera = contracts.seen(contract)
+    channel, size = camera["name"], camera["shape"][:2]
     numbered = lambda stem, part: [tensors[f"{stem}.{n}.{part}"] for n in range(sum(name.startswith(f"{stem}.") and name.endswith(f".{part}") for name in tensors))]
     convolutions = list(zip(numbered(channel, "weight"), numbered(channel, "bias"), strict=True))
     dense = list(zip(numbered("observation_encoder.dense", "weight"), numbered("observation_encoder.dense", "bias"), strict=True))

@@ -32,6 +32,7 @@ class Whole:
         """Makes the policy; `words` is one tensor [L, E] per instruction."""
         self.networks, self.contract, self.words = networks.eval(), contract, words
         self.low, self.high = (torch.tensor(side, dtype=torch.float32) for side in contracts.limits(contracts.action(contract)))
+        self.channels = [row["name"] for row in contracts.seen(contract) if row]  # in the order in which networks take them
         self.seeded = isinstance(twin.noise_source(contract), Normals)
         self.codes = None  # [M, D] of a policy whose trajectory encoder names one
 
@@ -39,19 +40,25 @@ class Whole:
         """Begins an episode; `seed` is that of its noise."""
         self.instruction, self.normals = instruction, Normals(seed) if self.seeded else None
         self.observations, self.actions = [], []
+        self.before = torch.zeros(len(self.low))  # the action before the context's first step
         self.plans, self.margins, self.logits, self.decided_at = [], [], [], []
         self.vector, self.vectors = None, []
         self.steps = 0
 
     @torch.no_grad()
     def act(self, seen):
-        """Acts on an observation [O] float32, or a frame [r, c, 3] of bytes -> action [A] float32, clipped to the contract's limits."""
+        """Acts on what it sees -> action [A] float32, clipped to the contract's limits.
+
+        seen: {channel: an observation [O] float32, or a frame [r, c, 3] of bytes}, or the array itself where there is one channel.
+        """
         if len(self.observations) == self.contract["context"]["steps"]:
             if self.contract["context"]["beyond"] != "restart":
                 raise UserError("an episode is longer than the policy's context, and its contract says to refuse")
+            self.before = self.actions[-1]
             self.observations, self.actions = [], []
-        self.present = torch.from_numpy(seen)
-        self.observations.append(self.read(self.present))
+        if not isinstance(seen, dict):
+            seen = dict(zip(self.channels, [seen], strict=True))
+        self.observations.append(self.read(*(torch.from_numpy(seen[name]) for name in self.channels)))
         if (len(self.observations) - 1) % contracts.period(self.contract) == 0:
             self.decide()
         action = torch.clamp(self.action(), self.low, self.high)
@@ -61,11 +68,11 @@ class Whole:
         self.steps += 1
         return action.numpy()
 
-    def read(self, seen):
-        """Normalises what the policy sees: an observation, or the features of a frame."""
+    def read(self, *seen):
+        """Normalises what the policy sees: an observation, or what an encoder makes of a frame and of the observation beside it."""
         if hasattr(self.networks, "frames"):
-            seen = self.networks.frames(seen[None])[0]
-        return self.networks.normalizer(seen)
+            return self.networks.normalizer(self.networks.frames(*(part[None] for part in seen))[0])
+        return self.networks.normalizer(*seen)
 
     def decide(self):
         """Decides what is in force from this step on."""
@@ -104,6 +111,21 @@ class Lads(Whole):
 
     def action(self):
         return self.networks.low_level(self.observations[-1][None], self.networks.codes[self.plans[-1]][None])[0]
+
+
+class History(Whole):
+    """LADS with a window: a code every H steps; a transformer on the code, the W steps before it and those since."""
+
+    def decide(self):
+        *words, observations, actions = self.history()
+        known = [actions] if self.contract["family"].get("actions") else []
+        self.select(self.networks.high_level(*words, observations, *known)[0, -1])
+
+    def action(self):
+        low, steps = self.networks.low_level, (len(self.observations) - 1) % contracts.period(self.contract) + 1
+        previous = torch.stack([self.before, *self.actions])
+        window = min(len(self.observations) - steps, low.window)
+        return low(self.plans[-1], torch.stack(self.observations), window, previous, steps)[-1]
 
 
 class Vae(Whole):
@@ -161,6 +183,7 @@ class Denoising(Quantised):
         return self.networks["trained"]
 
     def read(self, seen):
+        self.present = seen  # raw, as its denoiser reads it
         return self.trained.normalizer(seen)
 
 
@@ -186,7 +209,7 @@ class SkillDiffuser(Denoising):
         return self.queue[(len(self.observations) - 1) % contracts.period(self.contract)]
 
 
-KINDS = {"lads": Lads, "vae": Vae, "lang_dt": LangDt, "lisa": Lisa, "lcsd": Lcsd, "skilldiffuser": SkillDiffuser}
+KINDS = {"lads": Lads, "history": History, "vae": Vae, "lang_dt": LangDt, "lisa": Lisa, "lcsd": Lcsd, "skilldiffuser": SkillDiffuser}
 
 
 def of(model, contract, words, run=None, over=()):
@@ -207,7 +230,7 @@ def of(model, contract, words, run=None, over=()):
 def of_networks(networks, setting, encoded, contract, words):
     """Makes the policy of a system's trained networks."""
     kind = contract["family"]["kind"]
-    if kind == "lads":
+    if kind in ("lads", "history"):
         networks = weights.from_lads(networks, getattr(setting.config.system, "regressed", False))
     elif kind in ("lcsd", "skilldiffuser"):
         networks = nn.ModuleDict({"trained": networks, "acting": systems.of(setting.config).acting(networks, setting, encoded)})

@@ -3,6 +3,7 @@
 import base64
 import json
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import onnx
@@ -10,7 +11,7 @@ import pytest
 import torch
 from safetensors.numpy import load
 
-from lads_exporter import bundle as bundles, config, contract as contracts, frames, kinds, questions, reference, training, weights, whole
+from lads_exporter import bundle as bundles, config, contract as contracts, frames, kinds, questions, random_policy, reference, training, twin, weights, whole
 
 
 def contract_of(model):
@@ -255,20 +256,33 @@ def program(tmp_path):
     return path
 
 
-@pytest.fixture
-def sighted(tmp_path, monkeypatch):
-    """A policy with a camera -> its bundle, the networks that it was made of."""
+def on_the_bench(kind, folder, monkeypatch):
+    """A random policy with a camera -> its bundle, the networks that it was made of."""
     monkeypatch.setitem(reference.official.ENVIRONMENTS, "tiny-bench", Bench)
-    networks, model = kinds.export("sighted")
+    networks, model = kinds.export(kind)
     contract = contract_of(model)
-    (camera,) = contracts.of_role(contract, "observation")
-    camera["rendering"] = RENDERING
+    _, camera = contracts.seen(contract)
+    camera["rendering"] = RENDERING | {"size": camera["shape"][:2]}
     contract["environment"]["id"] = "tiny-bench"
     for row in model.metadata_props:
         if row.key == "lads.contract":
             row.value = json.dumps(contract)
-    path = tmp_path / "sighted.onnx"
+    path = folder / f"{kind}.onnx"
     bundles.save(model, path)
+    return path, networks
+
+
+@pytest.fixture
+def sighted(tmp_path, monkeypatch):
+    return on_the_bench("sighted", tmp_path, monkeypatch)
+
+
+@pytest.fixture
+def remembering(tmp_path, monkeypatch):
+    """A policy that sees frames and joints, whose run is its networks -> its bundle, the networks."""
+    path, networks = on_the_bench("sighted_history", tmp_path, monkeypatch)
+    plain = SimpleNamespace(config=SimpleNamespace(system=SimpleNamespace(regressed=False)))
+    monkeypatch.setattr(whole, "_trained", lambda *_: (networks, plain, None))
     return path, networks
 
 
@@ -323,6 +337,75 @@ def test_a_reference_of_a_camera_keeps_states_and_digests(sighted, program, tmp_
     program.write_text(STREAM.replace("2000", "2001"))
     with pytest.raises(config.UserError, match="step 0: its frame is drawn otherwise here"):
         questions.complete(path, file, lads_run=program)
+
+
+@pytest.mark.parametrize("kind", ["history", "sighted_history"])
+def test_a_policy_with_a_window_acts_as_its_twin(kind):
+    networks, model = kinds.export(kind)
+    contract = contracts.of(model)
+    if kind == "sighted_history":
+        networks = weights.from_lads(networks)
+    policy = whole.History(networks, contract, words(kinds.common.WORDS))
+    runner = twin.Twin(model)
+    policy.start(1)
+    runner.set_instruction(1)
+    steps = contract["context"]["steps"] + 3 * contracts.period(contract)  # on into a second context
+    channels = random_policy.channels(contract, steps, seed=5)
+    for step in range(steps):
+        seen = {name: rows[step] for name, rows in channels.items()}
+        action, index = runner.step(seen)
+        assert np.abs(policy.act(seen if len(seen) > 1 else seen["observation"]) - action).max() < 1e-4
+        assert policy.plans[-1] == index
+        executed = action + np.float32(0.01)  # what was executed need not be what was wanted
+        policy.actions[-1] = torch.from_numpy(executed)
+        runner.executed(executed)
+    assert len(set(policy.plans)) > 1
+
+
+def test_a_reference_of_a_camera_and_joints_keeps_both(remembering, program, tmp_path):
+    path, _ = remembering
+    file = tmp_path / "r.json"
+    with pytest.raises(config.UserError, match="whose layers are folded in the bundle; name the training"):
+        reference.write(path, file, episodes=2, traced=1, lads_run=program)
+    reference.write(path, file, run="run", episodes=2, traced=1, lads_run=program)
+    made = json.loads(file.read_text())
+    assert made["renderer"] == {"pencil": "2B"} and made["float_noise"]["logit"] > 0 and made["weights_from"] == "the run's checkpoint"
+    joints, camera = contracts.seen(made["contract"])
+    size, count = camera["shape"][:2], joints["shape"][0]
+    renderer = frames.Renderer(program, "tiny-bench", RENDERING | {"size": size})
+    for index, instruction in enumerate(made["instructions"]):
+        trace, steps = instruction["episodes"][0]["trace"], instruction["episodes"][0]["steps"]
+        read = lambda key, kind, columns: np.frombuffer(base64.b64decode(trace[key]), kind).reshape(steps, columns)
+        # The bench shows its state as it is, so the joints are its first elements as the policy was given them.
+        states, observed = read("states", "<f8", 5), read("observations", "<f4", count)
+        assert np.array_equal(observed, states[:, :count].astype(np.float32))
+        runner = twin.Twin(onnx.load(path))
+        runner.set_instruction(index)
+        for state, digest, own, action in zip(states, read("frames", "u1", frames.DIGEST), observed, read("actions", "<f4", 3), strict=True):
+            drawn = renderer.draw(state)
+            assert np.array_equal(frames.digest(drawn), digest)
+            assert np.abs(runner.step({"camera": drawn, "observation": own})[0] - action).max() < 1e-4
+        assert trace["logits"] and "encoded" not in trace
+    questions.complete(path, file, run="run", lads_run=program)
+    assert json.loads(file.read_text())["instructions"] == made["instructions"]
+
+
+@pytest.mark.parametrize("damage", [
+    lambda trace: trace.update(observations=""),
+    lambda trace: trace.pop("observations"),
+    lambda trace: trace.update(observations=trace["observations"][:-8]),
+    lambda trace: trace.update(observations="not base64"),
+    lambda trace: trace.update(observations=base64.b64encode(np.full(36, np.nan, "<f4").tobytes()).decode()),
+])  # fmt: skip
+def test_damaged_joints_are_refused(remembering, program, tmp_path, damage):
+    path, _ = remembering
+    file = tmp_path / "r.json"
+    reference.write(path, file, run="run", episodes=1, traced=1, lads_run=program)
+    made = json.loads(file.read_text())
+    damage(made["instructions"][1]["episodes"][0]["trace"])
+    file.write_text(json.dumps(made))
+    with pytest.raises(config.UserError, match="close, episode 0: its observations are not the 36 finite numbers"):
+        questions.complete(path, file, run="run", lads_run=program)
 
 
 def test_a_camera_without_a_rendering_is_refused(tmp_path, monkeypatch, program):
