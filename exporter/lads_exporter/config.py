@@ -217,6 +217,7 @@ class SkillDiffuser:
 
 
 SYSTEMS = {"lads": Lads, "vae": Vae, "cluster": Cluster, "lang_dt": LangDt, "lisa": Lisa, "lcsd": Lcsd, "skilldiffuser": SkillDiffuser}
+REMEMBERING = ("lang_dt", "lisa")  # systems that [pretrained] goes with and [history] does not
 SEEING = ("lads", "vae", "lang_dt", "lisa")  # systems that [images] goes with
 LADS = {"kind": "lads", "regressed": False}  # what a configuration without [system] trains
 
@@ -342,7 +343,7 @@ def from_tables(table, environment, instructions, where):
             raise UserError(f"{where}: {name} = {value!r}: must be one of {', '.join(allowed)}")
     plain = config.system.kind == "lads" and not config.system.regressed and config.training.schedule == "staged"
     _seen(config, plain, where)
-    _frozen(config, plain, len(environment.get("observation", [])), where)
+    _frozen(config, len(environment.get("observation", [])), where)
     if config.high_level.hidden % config.high_level.heads:
         raise UserError("high_level.hidden must be a multiple of high_level.heads")
     steps, period = config.high_level.context_steps, config.period
@@ -386,26 +387,30 @@ def _seen(config, plain, where):
         raise UserError(f"{where}: [images]: {'; '.join(problems)}")
 
 
-def _frozen(config, plain, state_len, where):
-    """Checks [pretrained] and [history], which go together: all problems at once."""
-    seen, history = config.pretrained, config.history
+def _frozen(config, state_len, where):
+    """Checks [pretrained] and [history]: all problems at once."""
+    seen, history, kind = config.pretrained, config.history, config.system.kind
     if not seen.encoder and not history.window:
         return
-    problems = []
-    if not seen.encoder or not history.window:
-        problems.append("[pretrained] and [history] go together")
-    if not plain or config.images.channel:
-        problems.append("they go with system lads, not regressed, schedule staged, and without [images]")
-    for name, value in (("pretrained.features", seen.features), ("history.window", history.window), ("history.layers", history.layers), ("history.heads", history.heads)):
-        if value < 1:
-            problems.append(f"{name} = {value} must be positive")
+    problems, sizes = [], {"pretrained.features": seen.features}
+    if kind == "lads":
+        sizes |= {f"history.{name}": getattr(history, name) for name in ("window", "layers", "heads")}
+        if not seen.encoder or not history.window:
+            problems.append("[pretrained] and [history] go together in system lads")
+    elif kind not in REMEMBERING:
+        problems.append(f"they go with the systems lads and {', '.join(REMEMBERING)}, not {kind}")
+    elif history.window:
+        problems.append(f"system {kind} remembers by itself: history.window = 0 is needed")
+    if config.training.schedule != "staged" or config.images.channel:
+        problems.append("they go with schedule staged and without [images]")
+    problems += [f"{name} = {value} must be positive" for name, value in sizes.items() if value < 1]
     if not seen.channel:
         problems.append("pretrained.channel names no camera")
     if not 1 <= seen.joints <= state_len:
         problems.append(f"pretrained.joints = {seen.joints} must be 1 to {state_len}, the elements of the state")
     if seen.std_floor <= 0 or seen.clip <= 0:
         problems.append("pretrained.std_floor and pretrained.clip must be positive")
-    if config.low_level.hidden % max(1, history.heads):
+    if history.window and config.low_level.hidden % max(1, history.heads):
         problems.append("low_level.hidden must be a multiple of history.heads")
     if problems:
         raise UserError(f"{where}: {'; '.join(problems)}")

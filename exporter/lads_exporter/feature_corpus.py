@@ -24,7 +24,8 @@ class FeatureCorpus(Corpus):
         self.encoder_sha256 = dataset.features.encoder
         self.features = torch.from_numpy(dataset.features.rows).to(device)
         mean, std = statistics(dataset.features.rows, training, seen.std_floor)
-        self.mean, self.std = torch.cat([own(self.mean), mean]), torch.cat([own(self.std), std])
+        self.seen_mean, self.seen_std = torch.cat([own(self.mean), mean]), torch.cat([own(self.std), std])
+        self.mean, self.std = torch.zeros_like(self.seen_mean), torch.ones_like(self.seen_std)  # its rows are normalised
         self.feature_mean, self.feature_std = mean.to(device), std.to(device)
         self.observations = Rows(self)
 

@@ -45,7 +45,7 @@ def _limits(low, high):
     return (low + high) / 2, (high - low) / 2
 
 
-def randomize(lads, setting, seed):
+def randomize(lads, setting, seed, placed=True):
     """Sets random weights of a LADS policy."""
     generator = torch.Generator().manual_seed(seed)
     draw = lambda tensor: torch.randn(tensor.shape, generator=generator)
@@ -56,7 +56,8 @@ def randomize(lads, setting, seed):
         for norm in getattr(lads.low_level, "norms", ()):  # only the MLP has batch norms
             norm.running_mean.copy_(0.2 * draw(norm.running_mean))
             norm.running_var.copy_(0.5 + torch.rand(norm.running_var.shape, generator=generator))
-        place(lads, setting.environment["observation"], seed)
+        if placed:
+            place(lads, setting.environment["observation"], seed)
         lads.codebook.codes.copy_(draw(lads.codebook.codes))
         lads.codebook.started.fill_(True)
 

@@ -1,5 +1,5 @@
-"""Frozen features: drawn and encoded in parts by a stand-in for lads-run, then LADS with a history on them, to a bundle that acts as its
-networks do."""
+"""Frozen features: drawn and encoded in parts by a stand-in for lads-run, then LADS with a history on them and other systems, to bundles that act as
+their networks do."""
 
 import copy
 import dataclasses
@@ -17,7 +17,7 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 from test_training import setting_for
 
-from lads_exporter import __main__ as command, bundle, config, contract as contracts, dataset, feature_corpus, features, language, systems, training, twin
+from lads_exporter import __main__ as command, bundle, config, contract as contracts, dataset, feature_corpus, features, language, systems, training, twin, whole
 from lads_exporter.config import UserError
 
 SIZE, F, JOINTS = [16, 20], 48, 2
@@ -163,7 +163,9 @@ def test_features_and_setting_go_together(files):
 
 
 @pytest.mark.parametrize("over, wrong", [
-    ({"history": {"window": 0}}, "go together"),
+    ({"history": {"window": 0}}, "go together in system lads; history.window = 0 must be positive"),
+    ({"system": {"kind": "lang_dt"}}, "system lang_dt remembers by itself: history.window = 0 is needed"),
+    ({"system": {"kind": "vae", "beta": 1e-3, "rule": "mean"}}, "they go with the systems lads and lang_dt, lisa, not vae"),
     ({"pretrained": {"joints": 9, "clip": 0.0}}, "joints = 9 must be 1 to 5, the elements of the state; .*clip must be positive"),
     ({"history": {"heads": 3}}, "multiple of history.heads"),
     ({"training": {"schedule": "joint"}}, "schedule staged"),
@@ -207,9 +209,9 @@ def test_a_std_has_a_floor_and_values_a_bound():
     assert np.isclose(std[0], 0.1 * np.median(wanted.std(0)), rtol=1e-5)
 
 
-def trainer_for(folder, files):
-    made = setting()
-    data = load(files)
+def trainer_for(folder, files, **over):
+    made = setting(**over)
+    data = load(files, made)
     made = dataclasses.replace(made, rendering=data.rendering)
     encoded = language.encode(made.config.language, [row["text"] for row in made.instructions])
     return training.Trainer(made, data, encoded, folder, torch.device("cpu"), 0), made, encoded
@@ -263,7 +265,7 @@ def test_a_run_ends_in_a_bundle_that_acts_as_its_networks(tmp_path, files):
     low, high = (torch.tensor(side) for side in contracts.limits(contracts.action(found)))
     with torch.no_grad():
         for t, (frame, own) in enumerate(zip(seen["camera"], seen["observation"])):
-            observed.append(networks.observed(torch.from_numpy(own)[None], torch.from_numpy(frame)[None])[0])
+            observed.append(networks.frames(torch.from_numpy(own)[None], torch.from_numpy(frame)[None])[0])
             action, index = runner.step({"camera": frame, "observation": own})
             assert np.allclose(runner.states["features"].value[0], observed[-1], atol=1e-5)
             if t % horizon == 0:
@@ -273,6 +275,39 @@ def test_a_run_ends_in_a_bundle_that_acts_as_its_networks(tmp_path, files):
             wanted = acting(index, torch.stack(observed), min(start, acting.window), torch.stack(actions), t + 1 - start)[-1]
             assert np.allclose(action, wanted.clamp(low, high), atol=1e-5)
             actions.append(torch.from_numpy(action))
+
+
+OTHERS = {
+    "wo_cp": {"system": {"kind": "lads", "regressed": True}},
+    "lang_dt": {"system": {"kind": "lang_dt"}, "history": {"window": 0}},
+    "lisa": {"system": {"kind": "lisa", "low_level_layers": 1, "option_gradient": "first"}, "history": {"window": 0}},
+}
+
+
+@pytest.mark.parametrize("name", list(OTHERS))
+def test_other_systems_learn_from_the_same_features(tmp_path, files, name):
+    """Tests that a system's bundle acts as its networks do, which read the whole sequence."""
+    trainer, _, encoded = trainer_for(tmp_path / "run", files, **OTHERS[name])
+    assert trainer.run(quiet=True)
+    saved, made = training.load_run(tmp_path / "run")
+    networks = trainer.networks.eval()
+    if name != "lang_dt":
+        with torch.no_grad():
+            networks.high_level.head.weight.mul_(30)
+    candidates = [(index, {name: rows.numpy() for name, rows in seen.items()}) for index, seen in saved["golden"]]
+    model = bundle.assemble(networks, made, encoded, {"dataset_sha256": "", "seed": 0, "steps": {}}, candidates)
+    found = contracts.of(model)
+    assert found["family"]["features"] == F + JOINTS and [row["name"] for row in contracts.of_role(found, "observation")] == ["camera", "observation"]
+
+    runner, (instruction, seen) = twin.Twin(model), candidates[0]
+    policy = whole.of_networks(networks, made, encoded, found, [torch.from_numpy(row.words) for row in encoded.instructions])
+    policy.start(instruction)
+    runner.set_instruction(instruction)
+    for step in range(len(seen["observation"])):
+        given = {channel: rows[step] for channel, rows in seen.items()}
+        action, index = runner.step(given)
+        assert np.abs(policy.act(given) - action).max() < 1e-4 and (name == "lang_dt" or policy.plans[-1] == index)
+        policy.actions[-1] = torch.from_numpy(action.copy())
 
 
 def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, files):

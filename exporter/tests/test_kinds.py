@@ -29,9 +29,10 @@ class Made:
         self.channels = random_policy.channels(self.contract, STEPS, seed=8)
         observations = self.channels.get("observation")
         self.observations = None if observations is None else torch.from_numpy(observations)
-        if name.startswith("sighted") and observations is None:  # its levels observe what its encoder makes of the camera's frames
+        if hasattr(self.policy, "frames"):  # its levels observe what its encoder makes of the camera's frames
+            seen = [torch.from_numpy(self.channels[name]) for name in ("observation", "camera") if name in self.channels]
             with torch.no_grad():
-                self.observations = self.policy.frames(torch.from_numpy(self.channels["camera"]))
+                self.observations = self.policy.frames(*seen)
         self.words = torch.from_numpy(common.WORDS.instructions[1].words)
         self.rollout = twin.open_loop(twin.Twin(self.model), 1 if self.contract.get("instructions") else None, self.channels)
         self.actions = torch.from_numpy(np.stack(self.rollout.actions))
@@ -65,7 +66,7 @@ def lads(made):
 
 
 def sighted_history(made):
-    seen = made.policy.observed(made.observations, torch.from_numpy(made.channels["camera"]))
+    seen = made.observations
     plans = made.plans(made.policy.high_level([made.words], seen[None], made.actions[None])[0])
     low = made.policy.acting_low_level()
     chunk = lambda start, end: low(plans[start], seen[:end], min(start, low.window), made.previous[:end], end - start)
@@ -117,7 +118,7 @@ def plain(made):
     return None, made.policy(*(torch.from_numpy(rows) for rows in made.channels.values()))
 
 
-WHOLE = {"lads": lads, "sighted": lads, "sighted_lang_dt": lang_dt, "sighted_lisa": lisa, "sighted_vae": vae, "sighted_history": sighted_history, "lang_dt": lang_dt, "lisa": lisa, "history": history, "vae": vae, "lcsd": lcsd, "skilldiffuser": skilldiffuser}
+WHOLE = {"lads": lads, "sighted": lads, "sighted_lang_dt": lang_dt, "sighted_lisa": lisa, "sighted_vae": vae, "frozen_lang_dt": lang_dt, "frozen_lisa": lisa, "sighted_history": sighted_history, "lang_dt": lang_dt, "lisa": lisa, "history": history, "vae": vae, "lcsd": lcsd, "skilldiffuser": skilldiffuser}
 
 
 @torch.no_grad()

@@ -13,7 +13,7 @@ use safetensors::{SafeTensors, tensor::TensorView};
 pub const FOLDER: &str = "LADS_FAMILIES";
 
 /// Kinds of random policies.
-pub const KINDS: [&str; 17] = [
+pub const KINDS: [&str; 19] = [
     "lads",
     "lang_dt",
     "lisa",
@@ -26,6 +26,8 @@ pub const KINDS: [&str; 17] = [
     "stacked",
     "camera",
     "images",
+    "frozen_lang_dt",
+    "frozen_lisa",
     "sighted",
     "sighted_history",
     "sighted_lang_dt",

@@ -10,7 +10,7 @@ import torch
 
 from .. import bundle, random_policy
 from ..config import UserError
-from . import common, history, images, lads, lang_dt, lcsd, lisa, plain, sighted, sighted_history, skilldiffuser, vae
+from . import common, frozen, history, images, lads, lang_dt, lcsd, lisa, plain, sighted, sighted_history, skilldiffuser, vae
 from .common import Sizes
 
 
@@ -37,6 +37,12 @@ def _sighted(network, build, family, noise=None):
     return Kind(lambda sizes, seed: sighted.of_kind(network(sizes), seed), build, contract, sizes)
 
 
+def _frozen(network, build, family):
+    sizes = Sizes(observation=frozen.SEEN.joints + frozen.SEEN.features)
+    contract = lambda sizes, seed: frozen.contract_of(family(sizes), sizes, seed)
+    return Kind(lambda sizes, seed: frozen.of_kind(network(sizes), seed), build, contract, sizes)
+
+
 KINDS = {
     "lads": Kind(lads.policy, lads.build, lads.contract),
     "lang_dt": _of(lang_dt.LangDt, lang_dt.build, lang_dt.contract),
@@ -54,6 +60,8 @@ KINDS = {
     "sighted_lang_dt": _sighted(lang_dt.LangDt, lang_dt.build, lambda sizes: {"kind": "lang_dt"}),
     "sighted_lisa": _sighted(lisa.Lisa, lisa.build, lambda sizes: lisa.family(sizes, common.argmax())),
     "sighted_vae": _sighted(vae.Vae, vae.build, lambda sizes: vae.family(sizes, "sample", 0), [Sizes().plan]),
+    "frozen_lang_dt": _frozen(lang_dt.LangDt, lang_dt.build, lambda sizes: {"kind": "lang_dt"}),
+    "frozen_lisa": _frozen(lisa.Lisa, lisa.build, lambda sizes: lisa.family(sizes, common.argmax())),
     "sighted_history": Kind(sighted_history.policy, sighted_history.build, sighted_history.contract),
 }
 # Of the sizes that encoders have in the field.

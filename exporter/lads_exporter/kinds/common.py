@@ -84,11 +84,13 @@ def high_level(sizes, outputs, actions=True):
     return HighLevelPolicy(sizes.transformer, sizes.words.dim, sizes.observation, sizes.action if actions else None, outputs)
 
 
-def randomize(policy, seed):
-    """Sets random weights in all parts of a policy: plans differ from step to step, and few actions are at their limits."""
+def randomize(policy, seed, placed=True):
+    """Sets random weights in all parts of a policy: plans differ from step to step, and few actions are at their limits. What is observed is normalised
+    already if not `placed`."""
     generator = torch.Generator().manual_seed(seed)
     random_policy.draw_weights(policy, generator)
-    random_policy.place(policy, ENVIRONMENT["observation"], seed)
+    if placed:
+        random_policy.place(policy, ENVIRONMENT["observation"], seed)
     with torch.no_grad():
         for module in policy.modules():
             if isinstance(module, nn.Embedding):

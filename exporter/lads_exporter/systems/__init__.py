@@ -26,4 +26,5 @@ MODULES = {
 def of(config):
     """Returns the module of the system that a configuration names."""
     module = import_module(f".{MODULES[config.system.kind]}{'_history' if config.history.window else ''}", __name__)
-    return import_module(".sighted", __name__).of(module) if config.images.channel else module
+    eyes = "sighted" if config.images.channel else "frozen" if config.pretrained.encoder else None
+    return import_module(f".{eyes}", __name__).of(module) if eyes else module

@@ -23,8 +23,13 @@ from .base import Exported
 from .folding import fold
 
 
+def head(setting):
+    """Returns the number of the high level's outputs, None for logits over the codes."""
+    return setting.config.encoder.codebook_dim if setting.config.system.regressed else None
+
+
 def Networks(setting, encoded):
-    return Lads(setting, encoded, setting.config.encoder.codebook_dim if setting.config.system.regressed else None)
+    return Lads(setting, encoded, head(setting))
 
 
 class Training(base.Training):
@@ -200,9 +205,14 @@ def family(setting):
     }
 
 
-def export(networks, setting, encoded):
-    horizon = setting.config.encoder.horizon
+def acting(networks, setting):
+    """Returns networks whose high level gives logits over the codes."""
     if setting.config.system.regressed:
         networks = copy.deepcopy(networks)
         networks.high_level.head = fold(networks.high_level.head, None, networks.codebook.codes)
-    return Exported(graphs.build(networks, encoded, horizon), family(setting), segment=horizon)
+    return networks
+
+
+def export(networks, setting, encoded):
+    horizon = setting.config.encoder.horizon
+    return Exported(graphs.build(acting(networks, setting), encoded, horizon), family(setting), segment=horizon)

@@ -1,4 +1,4 @@
-"""LADS on a frozen encoder's features, with a low level that remembers a window of steps: the paper's Kitchen setting with images.
+"""LADS with a low level that remembers a window of steps, on a frozen encoder's features: the paper's Kitchen setting with images.
 
 The stages are those of LADS on states; the low level is a causal transformer over the plan, the W steps before it and the H steps under it, and
 learns whole plans: those of the segments in `plans`, and of windows that start anywhere in `low_level`. Its batch is of plans, not of steps.
@@ -7,25 +7,17 @@ learns whole plans: those of the segments in `plans`, and of windows that start 
 import torch
 import torch.nn.functional as F
 
-from .. import encoders
-from ..config import UserError
 from ..kinds import sighted_history
 from . import base, lads
 from .base import Exported
 
-Networks = sighted_history.Remembering
+
+def Networks(setting, encoded):
+    return sighted_history.Remembering(setting, encoded, lads.head(setting))
 
 
 class Training(lads.Training):
     STAGES = {"staged": lads.Training.STAGES["staged"]}
-
-    def __init__(self, networks, corpus, setting, seed_of):
-        super().__init__(networks, corpus, setting, seed_of)
-        seen = setting.config.pretrained
-        encoder, sha256 = encoders.load(seen.encoder, seen.channel, setting.rendering["size"])
-        if sha256 != corpus.encoder_sha256:
-            raise UserError(f"the features were made by other weights of {seen.encoder}; make them anew with python -m lads_exporter features")
-        networks.frames.load_state_dict(encoder.state_dict())
 
     def cloning(self, segments, plans, episodes):
         return self.chunks(episodes[segments.rows.cpu()], segments.starts, plans)
@@ -57,5 +49,5 @@ class Training(lads.Training):
 
 
 def export(networks, setting, encoded):
-    made = sighted_history.graph(networks, setting, encoded)
+    made = sighted_history.graph(lads.acting(networks, setting), setting, encoded)
     return Exported(made, sighted_history.family(setting, encoded, base.decision(setting)))
