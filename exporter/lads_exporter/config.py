@@ -217,6 +217,7 @@ class SkillDiffuser:
 
 
 SYSTEMS = {"lads": Lads, "vae": Vae, "cluster": Cluster, "lang_dt": LangDt, "lisa": Lisa, "lcsd": Lcsd, "skilldiffuser": SkillDiffuser}
+ACTING = ("sampler", "passes", "guidance", "temperature", "clip", "rule")  # of [system]: what trained weights do not depend on
 REMEMBERING = ("lang_dt", "lisa")  # systems that [pretrained] goes with and [history] does not
 SEEING = ("lads", "vae", "lang_dt", "lisa")  # systems that [images] goes with
 LADS = {"kind": "lads", "regressed": False}  # what a configuration without [system] trains
@@ -414,6 +415,25 @@ def _frozen(config, state_len, where):
         problems.append("low_level.hidden must be a multiple of history.heads")
     if problems:
         raise UserError(f"{where}: {'; '.join(problems)}")
+
+
+def changed(before, after, within=""):
+    """Lists the dotted keys whose values differ between two tables."""
+    if not (isinstance(before, dict) and isinstance(after, dict)):
+        return [within] if before != after else []
+    names = dict.fromkeys([*before, *after])
+    return [row for name in names for row in changed(before.get(name), after.get(name), f"{within}.{name}" if within else name)]
+
+
+def exported_with(table, path):
+    """Layers a file over the table of a trained run, for an export; refuses one that changes what its weights depend on."""
+    after = layered(table, read_toml(path))
+    wrong = [key for key in changed(table.get("system", LADS), after.get("system", LADS), "system") if key.removeprefix("system.") not in ACTING]
+    without = lambda whole: {key: value for key, value in whole.items() if key not in ("system", "decision", "beyond_context")}
+    wrong += changed(without(table), without(after))
+    if wrong:
+        raise UserError(f"{path}: changes {', '.join(wrong)}, on which the trained weights depend; name the file that the run was trained with, or one that changes how it acts only")
+    return after
 
 
 def layered(table, over):

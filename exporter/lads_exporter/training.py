@@ -360,7 +360,7 @@ def load_run(folder, *over):
     saved = _read(path)
     table, *beside = saved["identity"]["tables"]
     for one in over:
-        table = configuration.layered(table, configuration.read_toml(one))
+        table = configuration.exported_with(table, one)
     setting = configuration.from_tables(table, *beside, path)
     setting = dataclasses.replace(setting, rendering=saved["identity"].get("rendering"))
     names = systems.of(setting.config).Training.stages(setting.config)

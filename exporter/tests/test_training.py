@@ -142,6 +142,20 @@ def test_resumed_run_equals_an_uninterrupted_one(tmp_path, schedule, stop_at):
     assert_same_weights(whole, resumed)
 
 
+def test_an_export_may_change_how_a_run_acts_and_not_what_it_was_trained_with(tmp_path):
+    setting = setting_for("joint")
+    setting.tables[0]["training"]["joint"]["steps"] = 2
+    trainer = trainer_for(tmp_path / "run", config.from_tables(*setting.tables, "test"))
+    assert trainer.run(quiet=True)
+    over = tmp_path / "over.toml"
+    over.write_text('decision = "sample"\n[system]\nkind = "lads"\nregressed = false\n')
+    assert load_run(tmp_path / "run", over)[1].config.decision == "sample"
+    over.write_text('[system]\nkind = "lisa"\nlow_level_layers = 1\noption_gradient = "all"\n[training.joint]\nsteps = 7\n')
+    wrong = r"over.toml: changes system.kind, system.regressed, system.low_level_layers, system.option_gradient, training.joint.steps, on which the trained weights depend"
+    with pytest.raises(UserError, match=wrong):
+        load_run(tmp_path / "run", over)
+
+
 def test_a_signal_ends_in_a_checkpoint(tmp_path):
     trainer = trainer_for(tmp_path / "run", setting_for("joint"))
     original = Stage.advance

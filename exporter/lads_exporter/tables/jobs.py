@@ -18,7 +18,6 @@ from ..training import CHECKPOINT, CURVES, SUMMARY
 from .commands import Command, Rollouts
 from .render import check_scores
 
-CHANGES_NOTHING = ("sampler", "passes", "guidance", "temperature", "clip", "rule")  # of [system]: what only an export depends on
 SUMMARISED = ("perplexity", "codebook_size", "plan_elements_in_use", "validation", "steps", "device")  # of a training's summary, in the table's file
 SCORES = ("episodes", "n_rate", "n_rate_standard_error", "k_rate", "full_success", "full_success_count")  # of a split's results, in the same
 
@@ -82,7 +81,7 @@ class Job:
         """Hashes all that the trained weights depend on."""
         tables = json.loads(json.dumps(self._setting.tables))
         own = tables[0].get("system", {})
-        tables[0]["system"] = {key: value for key, value in own.items() if key not in CHANGES_NOTHING}
+        tables[0]["system"] = {key: value for key, value in own.items() if key not in config.ACTING}
         encoder = self._encoder
         known = encoder if encoder.startswith("random-") else language.weights_sha256(encoder)
         seen = [self.place.seen] if self.place.seen else []
