@@ -218,7 +218,7 @@ class SkillDiffuser:
 
 SYSTEMS = {"lads": Lads, "vae": Vae, "cluster": Cluster, "lang_dt": LangDt, "lisa": Lisa, "lcsd": Lcsd, "skilldiffuser": SkillDiffuser}
 ACTING = ("sampler", "passes", "guidance", "temperature", "clip", "rule")  # of [system]: what trained weights do not depend on
-REMEMBERING = ("lang_dt", "lisa")  # systems that [pretrained] goes with and [history] does not
+GAZING = ("lads", "lang_dt", "lisa")  # systems that [pretrained] goes with
 SEEING = ("lads", "vae", "lang_dt", "lisa")  # systems that [images] goes with
 LADS = {"kind": "lads", "regressed": False}  # what a configuration without [system] trains
 
@@ -394,14 +394,14 @@ def _frozen(config, state_len, where):
     if not seen.encoder and not history.window:
         return
     problems, sizes = [], {"pretrained.features": seen.features}
-    if kind == "lads":
+    if kind not in GAZING:
+        problems.append(f"they go with the systems {', '.join(GAZING)}, not {kind}")
+    elif kind == "lads" or history.window:
         sizes |= {f"history.{name}": getattr(history, name) for name in ("window", "layers", "heads")}
         if not seen.encoder or not history.window:
-            problems.append("[pretrained] and [history] go together in system lads")
-    elif kind not in REMEMBERING:
-        problems.append(f"they go with the systems lads and {', '.join(REMEMBERING)}, not {kind}")
-    elif history.window:
-        problems.append(f"system {kind} remembers by itself: history.window = 0 is needed")
+            problems.append(f"[pretrained] and [history] go together in system {kind}")
+        if kind == "lang_dt":
+            problems.append("system lang_dt has no low level: history.window = 0 is needed")
     if config.training.schedule != "staged" or config.images.channel:
         problems.append("they go with schedule staged and without [images]")
     problems += [f"{name} = {value} must be positive" for name, value in sizes.items() if value < 1]

@@ -31,13 +31,13 @@ class Acting(nn.Module):
 class Nearest(nn.Module):
     """High level that regresses a plan, with logits over the codes: the nearest is the largest."""
 
-    def __init__(self, high_level, codes):
+    def __init__(self, high_level, codes, project_in=None):
         super().__init__()
-        self.high_level = high_level
+        self.high_level, self.project_in = high_level, project_in or nn.Identity()
         self.register_buffer("codes", codes)
 
     def forward(self, *history):
-        return nearness(self.high_level(*history), self.codes)
+        return nearness(self.project_in(self.high_level(*history)), self.codes)
 
 
 def nearness(regressed, codes):
@@ -47,8 +47,9 @@ def nearness(regressed, codes):
 
 
 def from_lads(lads, regressed=False):
-    """Takes the acting part of trained networks; `regressed` says that the high level regresses its plans."""
-    high_level = Nearest(lads.high_level, lads.codebook.codes) if regressed else lads.high_level
+    """Takes the acting part of trained networks; `regressed` says that the high level regresses its plans, as those do that it projects."""
+    project_in = getattr(lads, "project_in", None)
+    high_level = Nearest(lads.high_level, lads.codebook.codes, project_in) if regressed or project_in else lads.high_level
     low_level = lads.acting_low_level() if hasattr(lads, "acting_low_level") else lads.low_level
     return Acting(lads.normalizer, high_level, lads.codebook.codes, low_level, getattr(lads, "frames", None))
 

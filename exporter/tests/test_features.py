@@ -164,8 +164,8 @@ def test_features_and_setting_go_together(files):
 
 @pytest.mark.parametrize("over, wrong", [
     ({"history": {"window": 0}}, "go together in system lads; history.window = 0 must be positive"),
-    ({"system": {"kind": "lang_dt"}}, "system lang_dt remembers by itself: history.window = 0 is needed"),
-    ({"system": {"kind": "vae", "beta": 1e-3, "rule": "mean"}}, "they go with the systems lads and lang_dt, lisa, not vae"),
+    ({"system": {"kind": "lang_dt"}}, "system lang_dt has no low level: history.window = 0 is needed"),
+    ({"system": {"kind": "vae", "beta": 1e-3, "rule": "mean"}}, "they go with the systems lads, lang_dt, lisa, not vae"),
     ({"pretrained": {"joints": 9, "clip": 0.0}}, "joints = 9 must be 1 to 5, the elements of the state; .*clip must be positive"),
     ({"history": {"heads": 3}}, "multiple of history.heads"),
     ({"training": {"schedule": "joint"}}, "schedule staged"),
@@ -228,7 +228,7 @@ def test_the_low_level_in_batches_is_the_one_of_single_plans(tmp_path, files):
     original, low.chunks = low.chunks, keep
     with torch.no_grad():
         trainer.system.autocast = False
-        trainer.system.chunks(episodes, starts, networks.codebook.codes[codes])
+        trainer.system.in_windows(episodes, starts, networks.codebook.codes[codes])
         batch = original(*found[0])
         for row, (e, start, code) in enumerate(zip(episodes.tolist(), starts.tolist(), codes.tolist())):
             seen = corpus.observations[e, : start + corpus.horizon]
@@ -281,6 +281,7 @@ OTHERS = {
     "wo_cp": {"system": {"kind": "lads", "regressed": True}},
     "lang_dt": {"system": {"kind": "lang_dt"}, "history": {"window": 0}},
     "lisa": {"system": {"kind": "lisa", "low_level_layers": 1, "option_gradient": "first"}, "history": {"window": 0}},
+    "lisa_history": {"system": {"kind": "lisa", "low_level_layers": 0, "option_gradient": "all"}},
 }
 
 

@@ -4,6 +4,8 @@ The window is a ring of tokens before their positions are added: row = [action e
 the plan, then the window's rows at positions 0, 1, ...; a step of the plan stands at position `window` plus its phase.
 """
 
+import copy
+
 import torch
 from onnx import TensorProto
 from torch import nn
@@ -43,6 +45,15 @@ class HistoryPolicy(nn.Module):
         pairs = pairs[-(before + steps) :] + self.embed_position.weight[places][:, None]
         tokens = torch.cat([self.embed_option.weight[index][None], pairs.flatten(0, 1)])
         return self.head(run_blocks(self, tokens[None])[0][2 + 2 * before :: 2])
+
+    @torch.no_grad()
+    def with_table(self, options):
+        """Returns the policy that acts: with a table of embedded options [M, ...] in place of the layer that embeds them."""
+        acting = copy.deepcopy(self)
+        rows = self.embed_option(options)
+        acting.embed_option = nn.Embedding(*rows.shape).requires_grad_(False)
+        acting.embed_option.weight.copy_(rows)
+        return acting.eval()
 
     def chunks(self, options, observations, previous, before):
         """Computes the actions of N plans of H steps: options [N, d] embedded, observations [N, W + H, O] and previous [N, W + H, A], of which
@@ -121,10 +132,11 @@ def add_low_level(graph, policy, normalizer, sizes):
     _append(graph, policy, normalizer, sizes)
 
 
-def build(policy, sizes):
+def build(policy, sizes, low_level_sizes=None):
+    """Builds all entries; the low level has sizes of its own where they are given."""
     graph = common.graph_of(policy, sizes)
     common.select_at_every_token(graph, policy)
-    add_low_level(graph, policy.low_level, policy.normalizer, sizes)
+    add_low_level(graph, policy.low_level, policy.normalizer, low_level_sizes or sizes)
     return graph.model("history")
 
 

@@ -1,6 +1,5 @@
 """`sighted_history`: LADS on a frozen encoder's features; its low level is the transformer of `history`, over a window of earlier steps."""
 
-import copy
 import dataclasses
 
 import torch
@@ -44,11 +43,7 @@ class Remembering(Lads):
     @torch.no_grad()
     def acting_low_level(self):
         """Returns the low level with a table of the embedded plans in place of the layer that embeds them."""
-        acting = copy.deepcopy(self.low_level)
-        rows = self.low_level.embed_option(self.codebook.codes)
-        acting.embed_option = nn.Embedding(*rows.shape).requires_grad_(False)
-        acting.embed_option.weight.copy_(rows)
-        return acting.eval()
+        return self.low_level.with_table(self.codebook.codes)
 
 
 def graph(networks, setting, encoded):
