@@ -229,7 +229,7 @@ pub struct Subject<'s> {
     pub environment_version: &'s str,
     /// Number of elements of the environment's noise-free state.
     pub state_len: usize,
-    /// Number of elements of the observed vector; 0 of a policy that sees by cameras alone.
+    /// Number of elements of the observed vector, beside cameras of the first ones of the state; 0 of a policy that sees by cameras alone.
     pub observation_len: usize,
     /// Whether the policy has cameras.
     pub sees: bool,

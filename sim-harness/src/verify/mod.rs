@@ -139,14 +139,16 @@ pub fn run(
 pub fn subject<'s>(bundle: &'s Bundle, environment: &'s dyn Environment) -> Subject<'s> {
     let contract = bundle.contract();
     let known = &contract.instructions;
+    // A policy with a camera may observe the first elements of the state alone.
     let mut vectors = contract.observations().filter(|it| !sight::is_image(it));
+    let observation = vectors.next();
     Subject {
         contract: bundle.metadata("lads.contract").unwrap_or_default(),
         instructions: known.iter().map(|row| row.text.as_str()).collect(),
         environment_id: environment.id(),
         environment_version: environment.version(),
         state_len: environment.state().len(),
-        observation_len: vectors.next().map_or(0, |_| environment.observation_len()),
+        observation_len: observation.map_or(0, |it| it.shape.iter().product()),
         sees: contract.observations().any(sight::is_image),
         draws: matches!(contract.noise(), Noise::Seeded { .. }),
         action_len: environment.action_len(),

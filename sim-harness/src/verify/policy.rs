@@ -1,8 +1,9 @@
 //! Asks the compiled policy what the reference policy was asked; [`lads_proof::answers`] and [`lads_proof::rounding`] judge.
 //!
 //! Open loop: at each control step of a traced episode the controller gets the observation that the reference saw, and its history holds
-//! the actions that the reference executed. A policy with cameras is asked up to the first frame that is not the reference's. What can fail: a workspace that is too small for the policy, a bundle that does not compile with
-//! 32 bits; it can be told to stop.
+//! the actions that the reference executed. A policy with cameras gets frames drawn of the reference's states, with the recorded observation where
+//! it observes a vector too, and is asked up to the first frame that is not the reference's. What can fail: a workspace that is too small for the
+//! policy, a bundle that does not compile with 32 bits; it can be told to stop.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 

@@ -11,7 +11,7 @@ use crate::frames::{DIGEST_LEN, Digest};
 #[derive(Debug, Deserialize)]
 #[serde(try_from = "Written")]
 pub struct Trace {
-    /// Observations of the policy, `[steps, O]`; empty of one that sees by cameras alone.
+    /// Observed vectors, `[steps, O]`, of a policy with cameras those beside their frames; empty of one that sees by cameras alone.
     pub observations: Vec<f32>,
     /// Digest of what the cameras showed at each step; empty of a policy without.
     pub frames: Vec<Digest>,
@@ -62,11 +62,17 @@ impl Trace {
                 "its traces hold frames, and the policy has no camera"
             });
         }
+        // Saturating: a damaged number of steps could be any.
+        if self.observations.len() != steps.saturating_mul(subject.observation_len) {
+            return Err(match (subject.observation_len, self.observations.len()) {
+                (0, _) => "its traces hold observations, and the policy sees by cameras alone",
+                (_, 0) => "its traces hold no observations, and the policy observes a vector",
+                _ => "the observations of its traces are not one of the policy's for each step",
+            });
+        }
         let frames = if subject.sees { steps } else { 0 };
         let states = self.states.len() / subject.state_len.max(1);
-        // Saturating: a damaged number of steps could be any.
-        let fits = self.observations.len() == steps.saturating_mul(subject.observation_len)
-            && self.actions.len() == steps.saturating_mul(subject.action_len)
+        let fits = self.actions.len() == steps.saturating_mul(subject.action_len)
             && self.frames.len() == frames
             && self.states.len() == states * subject.state_len
             && self.plan_vectors.len().is_multiple_of(steps.max(1))
@@ -102,5 +108,55 @@ fn numbers<T, const N: usize>(text: &str, read: fn([u8; N]) -> T) -> Result<Vec<
             "a trace of {} bytes is not a whole number of {N}-byte numbers",
             bytes.len()
         )),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A policy of a camera, whose frame has a digest, of `joints` and of one action; its environment's state is of two numbers.
+    fn subject(joints: usize) -> Subject<'static> {
+        Subject {
+            contract: "",
+            instructions: vec![],
+            environment_id: "",
+            environment_version: "",
+            state_len: 2,
+            observation_len: joints,
+            sees: true,
+            draws: false,
+            action_len: 1,
+        }
+    }
+
+    fn trace(observations: usize) -> Trace {
+        Trace {
+            observations: vec![0.0; observations],
+            frames: vec![[0; DIGEST_LEN]; 3],
+            actions: vec![0.0; 3],
+            states: vec![0.0; 6],
+            logits: vec![],
+            plan_vectors: vec![],
+            encoded: None,
+            encoded_margins: None,
+        }
+    }
+
+    #[test]
+    fn a_camera_s_trace_has_an_observation_for_each_step_where_the_policy_observes_one() {
+        for (joints, observations) in [(0, 0), (4, 12)] {
+            assert_eq!(trace(observations).check(3, &subject(joints)), Ok(()));
+        }
+        for (joints, observations, wrong) in [
+            (0, 12, "by cameras alone"),
+            (4, 0, "hold no observations"),
+            (4, 11, "not one of the policy's for each step"),
+            (4, 16, "not one of the policy's for each step"),
+        ] {
+            let refused = trace(observations).check(3, &subject(joints));
+            assert!(refused.unwrap_err().contains(wrong), "{observations}");
+        }
+        assert!(trace(12).check(usize::MAX, &subject(4)).is_err());
     }
 }
