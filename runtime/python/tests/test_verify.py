@@ -167,6 +167,37 @@ def test_a_policy_with_plans_is_compared_by_its_logits(tmp_path):
     assert any("indices and their scores" in row for row in found.data["not_covered"])
 
 
+class Seen(environments.Servo):
+    """The servo as a camera shows it, with its first elements beside the frame."""
+
+    def reset(self, **more):
+        _, info = super().reset(**more)
+        return self.seen(), info
+
+    def step(self, action):
+        _, *rest = super().step(action)
+        return self.seen(), *rest
+
+    def seen(self):
+        grid = np.sin(np.outer(np.arange(16 * 20 * 3), self.state[:3] + 1)).sum(1)
+        return {"observation": self.state[:4].astype(np.float32), "camera": np.uint8(128 + 40 * grid).reshape(16, 20, 3)}
+
+
+def test_a_policy_that_sees_and_observes_gets_both(tmp_path):
+    def damage(policy):
+        policy.low_level.embed_observation.weight[:, :4] *= 1.05
+
+    _, opened, model = exported("sighted_history", tmp_path)
+    known = [opened.contract.instructions[0].id]
+    verify = lambda policy: lads.verify(InOnnxRuntime(model), policy.controller(), Seen, instructions=known, episodes=3, traced=2)
+    found = verify(opened)
+    assert found.verdict == "INCONCLUSIVE", str(found)  # few episodes
+    policy = found.data["policy"]
+    assert policy["compared_steps"] == 2 * 40 and policy["compared_decisions"] == 2 * 10 and policy["differing_episodes"] == 0
+    found = verify(exported("sighted_history", tmp_path, spoil=damage)[1])
+    assert found.verdict == "DIFFERENT" and found.data["policy"]["differing_episodes"] == 2
+
+
 def test_fewer_bits_are_judged_beside_32(tmp_path):
     """Tests that decisions with fewer bits are judged by their margins, and that an image whose bundle is not at hand is not judged."""
     _, opened, model = exported("lads", tmp_path)
