@@ -15,8 +15,8 @@ COLLECT_lorel   := --episodes 50000
 COLLECT_kitchen-image := --episodes-per-instruction 25
 COLLECT_lorel-image := --episodes 3000
 # What a table's systems with a camera learn from, beside the data.
-SEEN_kitchen-image = $(DATA:.safetensors=.features)
-SEEN_lorel-image = $(DATA:.safetensors=.frames)
+SEEN_kitchen-image = $(patsubst %.safetensors,%.features,$(DATA))
+SEEN_lorel-image = $(patsubst %.safetensors,%.frames,$(DATA))
 # What lints and tests cover; one selection, because each is a build of its own, of tract too: the oracle and the language encoder's engine.
 FEATURES := lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language
 ALL      := --workspace --features $(FEATURES)
