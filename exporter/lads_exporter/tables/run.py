@@ -72,8 +72,6 @@ def open_engine(name, place, at_once):
     """Makes the engine that runs the jobs' commands; Ray is imported where it is asked for only."""
     if name == "local":
         return Local(at_once or 1)
-    if place.device != "cpu":
-        raise UserError(f"--device {place.device}: the engine {name} gives its tasks a CPU each; leave --device out, or use --engine local")
     from .on_ray import OnRay
 
     return OnRay(place, at_once)
@@ -83,6 +81,8 @@ def run(path, data=None, frames=None, features=None, runs="runs/tables", lads_ru
     """Runs a table's file to its end, or until it is stopped -> whether it reached the end."""
     if at_once is not None and at_once < 1:
         raise UserError(f"--jobs {at_once}: must be at least 1")
+    if device != "cpu" and engine != "local":
+        raise UserError(f"--device {device}: the engine {engine} gives its tasks a CPU each; leave --device out, or use --engine local")
     table = load(path)
     place = _place(table, data, {"frames": frames, "features": features}, runs, lads_run, models, device)
     jobs = all_jobs(table, place)
