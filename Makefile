@@ -18,8 +18,8 @@ COLLECT_lorel-image := --episodes 3000
 SEEN_kitchen-image = $(patsubst %.safetensors,%.features,$(DATA))
 SEEN_lorel-image = $(patsubst %.safetensors,%.frames,$(DATA))
 # What lints and tests cover; one selection, because each is a build of its own, of tract too: the oracle and the language encoder's engine.
-FEATURES := lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language
-ALL      := --workspace --features $(FEATURES)
+CARGO_FEATURES := lads-sim/report,lads-sim/record,lads-sim/viewer,lads-sim/language
+ALL      := --workspace --features $(CARGO_FEATURES)
 RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-host -p lads-import -p lads-pace -p lads-record -p lads-ffi -p lads-cli -p lads-proof
 # What is published, in the order of its dependencies; without lads-language, whose engine (tract) needs a newer Rust and builds for minutes.
 PUBLISHED := -p lads-kernels -p lads-image -p lads-core -p lads-compiler -p lads-host -p lads-import -p lads-pace -p lads-proof -p lads-record -p lads-ffi -p lads-cli

@@ -11,7 +11,7 @@ import pytest
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
 # Packages and features of the whole suite: cargo builds nothing twice for another selection.
-FEATURES = re.search(r"^FEATURES := (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[1]
+FEATURES = re.search(r"^CARGO_FEATURES := (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[1]
 SELECTION = ("--workspace", "--features", FEATURES)
 # With an example, cargo counts in the dependencies of tests, whose features are those of their build.
 AS_TESTS = ("--example", "controller")

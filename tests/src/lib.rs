@@ -27,7 +27,7 @@ pub fn built(programs: &[&str]) -> PathBuf {
     let makefile = std::fs::read_to_string(project_path("Makefile")).expect("it can be read");
     let features = makefile
         .lines()
-        .find_map(|line| line.strip_prefix("FEATURES := "))
+        .find_map(|line| line.strip_prefix("CARGO_FEATURES := "))
         .expect("the Makefile says what tests are built with");
     let test = std::env::current_exe().expect("a test is a file");
     let folder = test.ancestors().nth(2).expect("it lies in deps/");
