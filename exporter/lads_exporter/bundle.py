@@ -54,7 +54,7 @@ def contract(setting, encoded, provenance, exported):
     config, environment = setting.config, setting.environment
     high = config.high_level
     camera = config.images.channel or config.pretrained.channel
-    image = contracts.frames(camera, setting.rendering) if camera else None
+    image = contracts.camera(camera, setting.rendering["size"], rendering=setting.rendering) if camera else None
     return describe(
         exported.family,
         environment,

@@ -45,9 +45,9 @@ def array(name, role, shape, dtype="f32", **more):
     return {"name": name, "role": role, "dtype": dtype, "shape": list(shape), **more}
 
 
-def frames(name, rendering):
-    """Makes the channel of a camera whose frames are drawn as `rendering` states."""
-    return array(name, "observation", [*rendering["size"], 3], "u8", layout="hwc", min=0, max=255, rendering=rendering)
+def camera(name, size, **more):
+    """Makes the channel of a camera with frames of `size`, rows and columns; `rendering` states how they are drawn where that is known."""
+    return array(name, "observation", [*size, 3], "u8", layout="hwc", min=0, max=255, **more)
 
 
 def element(row):

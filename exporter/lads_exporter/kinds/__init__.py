@@ -31,16 +31,11 @@ def _images(name, cameras, hidden, sizes=Sizes(steps=12)):
     return Kind(lambda sizes, seed: images.randomize(images.Images(cameras, hidden), seed), images.build, contract, sizes)
 
 
-def _sighted(network, build, family, noise=None):
-    sizes = Sizes(observation=sighted.SEEN.features)
-    contract = lambda sizes, seed: sighted.contract_of(family(sizes), sizes, seed, noise)
-    return Kind(lambda sizes, seed: sighted.of_kind(network(sizes), seed), build, contract, sizes)
-
-
-def _frozen(network, build, family):
-    sizes = Sizes(observation=frozen.SEEN.joints + frozen.SEEN.features)
-    contract = lambda sizes, seed: frozen.contract_of(family(sizes), sizes, seed)
-    return Kind(lambda sizes, seed: frozen.of_kind(network(sizes), seed), build, contract, sizes)
+def _seeing(eyes, network, build, family, noise=None):
+    """Makes the kind of a family on what an encoder hands on; `eyes` is the module `sighted` or `frozen`."""
+    sizes = Sizes(observation=eyes.HANDED)
+    contract = lambda sizes, seed: eyes.contract_of(family(sizes), sizes, seed, noise)
+    return Kind(lambda sizes, seed: eyes.of_kind(network(sizes), seed), build, contract, sizes)
 
 
 KINDS = {
@@ -57,11 +52,11 @@ KINDS = {
     "camera": _of(plain.Camera, plain.build_camera, plain.contract_camera),
     "images": _images("images", images.SMALL, (32,)),
     "sighted": Kind(sighted.policy, lads.build, sighted.contract),
-    "sighted_lang_dt": _sighted(lang_dt.LangDt, lang_dt.build, lambda sizes: {"kind": "lang_dt"}),
-    "sighted_lisa": _sighted(lisa.Lisa, lisa.build, lambda sizes: lisa.family(sizes, common.argmax())),
-    "sighted_vae": _sighted(vae.Vae, vae.build, lambda sizes: vae.family(sizes, "sample", 0), [Sizes().plan]),
-    "frozen_lang_dt": _frozen(lang_dt.LangDt, lang_dt.build, lambda sizes: {"kind": "lang_dt"}),
-    "frozen_lisa": _frozen(lisa.Lisa, lisa.build, lambda sizes: lisa.family(sizes, common.argmax())),
+    "sighted_lang_dt": _seeing(sighted, lang_dt.LangDt, lang_dt.build, lambda sizes: {"kind": "lang_dt"}),
+    "sighted_lisa": _seeing(sighted, lisa.Lisa, lisa.build, lambda sizes: lisa.family(sizes, common.argmax())),
+    "sighted_vae": _seeing(sighted, vae.Vae, vae.build, lambda sizes: vae.family(sizes, "sample", 0), [Sizes().plan]),
+    "frozen_lang_dt": _seeing(frozen, lang_dt.LangDt, lang_dt.build, lambda sizes: {"kind": "lang_dt"}),
+    "frozen_lisa": _seeing(frozen, lisa.Lisa, lisa.build, lambda sizes: lisa.family(sizes, common.argmax())),
     "sighted_history": Kind(sighted_history.policy, sighted_history.build, sighted_history.contract),
 }
 # Of the sizes that encoders have in the field.

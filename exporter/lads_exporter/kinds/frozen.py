@@ -12,6 +12,7 @@ from .sighted import ENTRY, FEATURES
 
 SIZE = (16, 20)  # rows and columns of the random policy's camera
 SEEN = config.Pretrained("camera", "random-4", 48, 4, 0.1, 2.0)  # a clip that is felt
+HANDED = SEEN.joints + SEEN.features  # elements that its encoder hands on
 
 
 class FrozenEncoder(nn.Module):
@@ -61,7 +62,6 @@ def of_kind(network, seed):
     return give_random_eyes(common.randomize(network, seed, placed=False), seed).eval()
 
 
-def contract_of(family, sizes, seed):
+def contract_of(family, sizes, seed, noise=None):
     """Makes the contract of a random policy on what such an encoder hands on."""
-    image = contracts.array(SEEN.channel, "observation", [*SIZE, 3], "u8", layout="hwc", min=0, max=255)
-    return common.contract(family | {"features": SEEN.joints + SEEN.features}, sizes, seed, image=image, joints=SEEN.joints)
+    return common.contract(family | {"features": HANDED}, sizes, seed, noise=noise, image=contracts.camera(SEEN.channel, SIZE), joints=SEEN.joints)

@@ -196,7 +196,7 @@ def build(policy, sizes):
 
 
 def contract(cameras, seed, kind):
-    frames = [contracts.array(camera.name, "observation", [*camera.shape, 3], "u8", layout="hwc", min=0, max=255) for camera in cameras]
+    frames = [contracts.camera(camera.name, camera.shape) for camera in cameras]
     return plain.contract(None, seed, kind, more=frames)
 
 

@@ -193,6 +193,6 @@ def contract_stacked(sizes, seed):
 
 
 def contract_camera(sizes, seed):
-    image = contracts.array("camera", "observation", Camera.IMAGE, "u8", layout="hwc", min=0, max=255)
+    image = contracts.camera("camera", Camera.IMAGE[:2])
     modes = contracts.array("mode", "observation", [Camera.MODES], "i32", min=-1, max=2)
     return contract(sizes, seed, "camera", more=[image, modes])

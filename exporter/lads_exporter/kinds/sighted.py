@@ -13,6 +13,7 @@ from . import common, images, lads
 ENTRY, FEATURES = "observation_encoder/encode", "features"
 SIZE = (12, 16)  # rows and columns of the random policy's camera
 SEEN = config.Images("camera", [4, 8], [24], 16, 0.0, 0.0, 0.0, 0.0, 0.0, config.Stage(**config.NO_STAGE))
+HANDED = SEEN.features  # elements that its encoder hands on
 
 
 class FrameEncoder(nn.Module):
@@ -79,5 +80,4 @@ def of_kind(network, seed):
 
 def contract_of(family, sizes, seed, noise=None):
     """Makes the contract of a random policy on features."""
-    image = contracts.array(SEEN.channel, "observation", [*SIZE, 3], "u8", layout="hwc", min=0, max=255)
-    return common.contract(family | {"features": SEEN.features}, sizes, seed, noise=noise, image=image)
+    return common.contract(family | {"features": HANDED}, sizes, seed, noise=noise, image=contracts.camera(SEEN.channel, SIZE))
