@@ -263,9 +263,10 @@ $(DATA):
 	$(MAKE) collect ENV=$(patsubst %-sizes,%,$(ENV))
 
 ## reference: the policy of $(MODEL) in PyTorch and the official environment, 20 episodes of each instruction, for `lads-run verify`;
+##         RUN=runs/$(ENV) takes the weights from the training's checkpoint, as the shipped references do, so that a fault of the export would show;
 ##         ARGS="--noise none" on the LOReL table; a policy with a camera needs the built program, which draws for it (--lads-run)
 reference: $(VENV)/stamp
-	$(PY) -m lads_exporter reference --model $(MODEL) -o $(MODEL:.onnx=.reference.json) $(ARGS)
+	$(PY) -m lads_exporter reference --model $(MODEL) -o $(MODEL:.onnx=.reference.json) $(if $(RUN),--run $(RUN)) $(ARGS)
 
 ## verify: is the compiled policy the reference's? Fails unless EQUIVALENT; `lads-run verify` itself exits with 0, 1 DIFFERENT or 3 INCONCLUSIVE
 verify: setup

@@ -4,7 +4,7 @@
 # LADS_OPS says which groups of operations a policy needs; without it all are in, and every image runs. It is a list of features of
 # the crate lads-ffi, separated by commas (Cargo.toml names them); an image that needs what was left out is refused when it is opened:
 #     LADS_OPS=lads runtime/ffi/archive.sh build/liblads.a                   the family of the shipped policies
-#     LADS_OPS=lads,half-weights,half-cache runtime/ffi/archive.sh ...       the same with 16-bit weights and cache
+#     LADS_OPS=lads,integer-weights,half-cache runtime/ffi/archive.sh ...    the same with weights of 16 and 8 bits and a cache of 16
 # Needs cargo and binutils; for another target set LD, OBJCOPY, AR and NM to its tools, and CARGO_FLAGS to what cargo needs for it.
 set -eu
 output=$1

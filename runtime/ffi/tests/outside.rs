@@ -21,8 +21,8 @@ const STRICT: [&str; 4] = ["-Wall", "-Wextra", "-Werror", "-pedantic"];
 /// of one family of policies.
 const MOST_TEXT: usize = 200 * 1024;
 
-/// Largest size of the same program with the number formats of the shipped policies as tuned.
-const MOST_TEXT_TUNED: usize = 244 * 1024;
+/// Largest size of the same program with the number formats of the shipped kitchen policy: integer caches are 18 KB of it, and save 526 KB of RAM.
+const MOST_TEXT_TUNED: usize = 262 * 1024;
 
 /// Largest size, in bytes, of machine code and constants of a stripped program with all operations.
 /// The operations on images are 240 KB of it, for three instruction sets: 160 of that are convolutions
@@ -245,7 +245,7 @@ fn with_operations(operations: &str, name: &str) -> PathBuf {
 fn an_archive_holds_what_its_policies_need_and_says_what_it_does_not() {
     let exact = exact_kitchen();
     let plain = with_operations("lads", "user_lads");
-    let tuned = with_operations("lads,integer-weights,half-cache", "user_tuned");
+    let tuned = with_operations("lads,integer-weights,integer-cache", "user_tuned");
     for (program, image, most) in [
         (&plain, exact.as_path(), MOST_TEXT),
         (&tuned, kitchen(), MOST_TEXT_TUNED),
