@@ -331,6 +331,11 @@ fn references_of_something_else_are_refused_by_name() {
         &["not one per decision"],
     );
     check(
+        r#""plans": [19"#,
+        r#""plans": [18"#,
+        &["a plan is not that of the largest logit"],
+    );
+    check(
         r#""final_state": ["#,
         r#""final_state": [0.5, "#,
         &["final state"],

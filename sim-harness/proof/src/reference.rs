@@ -12,6 +12,7 @@ use serde_json::Value;
 use thiserror::Error;
 
 use super::purpose;
+use crate::answers::CLOSE_CALL;
 
 mod trace;
 
@@ -196,6 +197,19 @@ impl Episode {
         }
         if !trace.logits.len().is_multiple_of(decisions.max(1)) {
             return Err("the logits of a trace are not the same number for each decision");
+        }
+        let of_each = trace
+            .logits
+            .chunks((trace.logits.len() / decisions.max(1)).max(1));
+        let selects = |(logits, &plan): (&[f32], &u32)| {
+            let largest = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+            let lead = logits
+                .get(plan as usize)
+                .map(|&own| f64::from(largest - own));
+            lead.is_none_or(|lead| lead <= CLOSE_CALL)
+        };
+        if !of_each.zip(&self.plans).all(selects) {
+            return Err("a plan is not that of the largest logit");
         }
         let segments = period.map_or(0, |period| self.steps / period);
         let margins = trace.encoded_margins.as_ref().map(Vec::len);
