@@ -18,49 +18,17 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import torch
-from torch import nn
 
 PROJECT = Path(__file__).parents[1]
-sys.path.insert(0, str(PROJECT / "exporter"))
+sys.path[:0] = [str(PROJECT / "exporter"), str(PROJECT / "benches/python")]
 
 import lads  # noqa: E402
+import plain as bundles  # noqa: E402
 from lads.vector import Controllers  # noqa: E402
-from lads_exporter import bundle, contract as contracts, graphs, random_policy  # noqa: E402
 from lads_exporter.twin import Entry  # noqa: E402
 
 # Seconds of a share: shorter than what a busy system gives a process at a time, so that the fastest one was not interrupted.
 SHARE = 0.002
-WIDTHS = (51, 512, 256, 128, 14)
-ENTRY = "policy/act"
-
-
-def legged():
-    """Makes a policy of a legged robot's size, 51-512-256-128-14, Elu between, with random weights, as a bundle."""
-    names = lambda kind, count: [{"name": f"{kind}{i}", "unit": "1", "min": -10.0, "max": 10.0} for i in range(count)]
-    environment = {
-        "id": "legged-bench",
-        "version": "1",
-        "control_period_s": 0.02,
-        "quaternion_order": "none",
-        "reference": "default position",
-        "observation": names("observation", WIDTHS[0]),
-        "action": [{**row, "joint": row["name"], "interface": "position"} for row in names("action", WIDTHS[-1])],
-    }
-    torch.manual_seed(0)
-    graph = graphs.Graph()
-    entry = graphs.Entry(graph, ENTRY)
-    x = entry.input("observation", [1, WIDTHS[0]])
-    for place, (inputs, outputs) in enumerate(zip(WIDTHS, WIDTHS[1:])):
-        layer, last = nn.Linear(inputs, outputs), place == len(WIDTHS) - 2
-        name = "action" if last else f"layer{place}"
-        x = entry.gemm(x, entry.weight(f"{name}.weight", layer.weight), entry.weight(f"{name}.bias", layer.bias), name)
-        x = x if last else entry.op("Elu", [x], f"{name}.elu")
-    entry.output("action", [1, WIDTHS[-1]])
-    channels = contracts.channels(environment)
-    contract = bundle.describe({"kind": "plain"}, environment, [], None, {"setting": "bench", "seed": 0}, channels=channels)
-    candidates = ((None, random_policy.channels(contract, 20, n)) for n in range(1, 50))
-    return bundle.seal(graph.model("plain"), contract, candidates)
 
 
 def hot(contenders, seconds):
@@ -160,26 +128,26 @@ def main():
     parser.add_argument("--rust", type=Path, help="the example step_cost of lads-host, built in release")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        path, model = Path(folder) / "legged.onnx", legged()
+        path, model = Path(folder) / "legged.onnx", bundles.mlp(*bundles.LEGGED)
         onnx.save(model, path)
-        plain = lads.open(path)
-        session = Entry(model, ENTRY).session
-        (seen,) = (values[0].copy() for values in plain.golden.observations.values())
-        given = {f"{ENTRY}/observation": seen[None]}
-        print(f"policy {'-'.join(map(str, WIDTHS))}, Elu")
-        contenders = {"lads": stepper(plain), "onnxruntime": lambda: session.run(None, given)}
+        legged = lads.open(path)
+        session = Entry(model, bundles.ENTRY).session
+        (seen,) = (values[0].copy() for values in legged.golden.observations.values())
+        given = {f"{bundles.ENTRY}/observation": seen[None]}
+        print(f"policy {'-'.join(map(str, bundles.LEGGED))}, Elu")
+        contenders = {"lads": stepper(legged), "onnxruntime": lambda: session.run(None, given)}
         for name, found in (("hot", hot(contenders, arguments.seconds)), ("at 50 Hz", paced(contenders, arguments.seconds))):
             ratio = found["lads"] / found["onnxruntime"]
             print(f"  {name}: lads {found['lads']:.2f} us, onnxruntime {found['onnxruntime']:.2f} us, ratio {ratio:.2f}")
         kitchen = lads.open(PROJECT / "models/kitchen.onnx")
         if arguments.rust:
-            for name, policy in ((str(path), plain), (str(PROJECT / "models/kitchen.onnx"), kitchen)):
+            for name, policy in ((str(path), legged), (str(PROJECT / "models/kitchen.onnx"), kitchen)):
                 python, native = beside_rust(arguments.rust, name, policy, arguments.seconds)
                 print(f"  step of {Path(name).stem}: from Python {python:.2f} us, from Rust {native:.2f} us, {python - native:+.2f} us")
         one, two = scaling(kitchen, arguments.seconds)
         print(f"8 controllers of kitchen: one thread {one:.0f} us, two {two:.0f} us, {one / two:.2f} times faster")
         print(f"import: {importing():.1f} ms")
-        grown, each = leak(plain, arguments.controllers)
+        grown, each = leak(legged, arguments.controllers)
         print(f"{arguments.controllers} controllers: {grown} kB more memory, {each:.0f} us each")
         for wheel in sorted((PROJECT / "target/wheels").glob("lads-*.whl")):
             print(f"wheel: {wheel.name}, {wheel.stat().st_size / 1e6:.2f} MB")

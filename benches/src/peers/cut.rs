@@ -59,6 +59,43 @@ struct ValueName {
     name: String,
 }
 
+/// A `ValueInfoProto` with the lengths of its axes.
+#[derive(Clone, PartialEq, Message)]
+struct Value {
+    #[prost(string, tag = "1")]
+    name: String,
+    #[prost(message, optional, tag = "2")]
+    kind: Option<Kind>,
+}
+
+/// A `TypeProto` of a tensor.
+#[derive(Clone, PartialEq, Message)]
+struct Kind {
+    #[prost(message, optional, tag = "1")]
+    tensor: Option<TensorKind>,
+}
+
+/// The type of a tensor.
+#[derive(Clone, PartialEq, Message)]
+struct TensorKind {
+    #[prost(message, optional, tag = "2")]
+    shape: Option<Shape>,
+}
+
+/// A `TensorShapeProto`.
+#[derive(Clone, PartialEq, Message)]
+struct Shape {
+    #[prost(message, repeated, tag = "1")]
+    axes: Vec<Axis>,
+}
+
+/// An axis; 0 where its length is a name.
+#[derive(Clone, PartialEq, Message)]
+struct Axis {
+    #[prost(int64, tag = "1")]
+    len: i64,
+}
+
 /// A bundle, as an ONNX model.
 #[derive(Debug)]
 pub struct Source {
@@ -94,6 +131,18 @@ impl Source {
     pub fn new(bytes: &[u8]) -> Result<Self, BenchError> {
         let model = Model::decode(bytes).map_err(broken)?;
         Ok(Self { model })
+    }
+
+    /// Returns the name of the only entry; `None` of a bundle that has several.
+    pub fn only_entry(&self) -> Result<Option<String>, BenchError> {
+        let graph = self.model.graph.clone().unwrap_or_default();
+        let outputs = keep(&graph.output, |value: ValueName| value.name, |_| true)?;
+        let mut entries = outputs
+            .iter()
+            .map(|(name, _)| name.rsplit_once('/').map_or("", |(entry, _)| entry));
+        let first = entries.next();
+        let only = first.filter(|&first| entries.all(|entry| entry == first));
+        Ok(only.map(str::to_owned))
     }
 
     /// Cuts out the entry whose values start with `entry/`, as a model of its own: its inputs and outputs, and what lies between.
@@ -171,6 +220,22 @@ pub fn signature(model: &[u8]) -> Result<(Vec<String>, Vec<String>), BenchError>
     Ok((names(&graph.input)?, names(&graph.output)?))
 }
 
+/// Returns the names of a model's inputs with the lengths of their axes, in order.
+pub fn shapes(model: &[u8]) -> Result<Vec<(String, Vec<usize>)>, BenchError> {
+    let graph = Model::decode(model)
+        .map_err(broken)?
+        .graph
+        .unwrap_or_default();
+    let read = |part: &Vec<u8>| {
+        let value = Value::decode(part.as_slice()).map_err(broken)?;
+        let shape = value.kind.and_then(|kind| kind.tensor?.shape);
+        let axes = shape.unwrap_or_default().axes;
+        let lens = axes.iter().map(|axis| axis.len.max(0) as usize);
+        Ok((value.name, lens.collect()))
+    };
+    graph.input.iter().map(read).collect()
+}
+
 /// A tensor for a general runtime.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tensor {
@@ -190,6 +255,14 @@ pub enum Data {
 }
 
 impl Tensor {
+    /// Makes a tensor of floating-point numbers.
+    pub fn of(shape: Vec<usize>, values: Vec<f32>) -> Self {
+        Self {
+            shape,
+            data: Data::F32(values),
+        }
+    }
+
     /// Makes a row `[1, n]`.
     pub fn row(values: &[f32]) -> Self {
         Self {
@@ -253,6 +326,12 @@ mod tests {
             (300_000..600_000).contains(&act.len()),
             "{} bytes",
             act.len()
+        );
+        assert_eq!(source.only_entry().expect("it is a model"), None);
+        let read = shapes(&act).expect("a model");
+        assert!(
+            read.iter()
+                .all(|(_, shape)| shape.len() == 2 && shape[0] == 1)
         );
         let step = source.cut("high_level/step").expect("it has a high level");
         let recording = source.cut_for("high_level/step", |name| name != "logits");

@@ -1,12 +1,13 @@
 //! Peers of lads: the runtimes that users would pick instead, on the very same graphs.
 //!
 //! ONNX Runtime, tract and rten run in this process; PyTorch and OpenVINO in Python, in a worker that keeps to the same
-//! protocol. They run policies of the family `lads`. Only with the cargo feature `peers`.
+//! protocol. They run policies of the family `lads` and, but for the worker, of one entry. Only with the cargo feature `peers`.
 
 pub mod cut;
 pub mod engine;
 pub mod general;
 pub mod onnxruntime;
+pub mod plain;
 pub mod recompute;
 pub mod rten;
 pub mod tract;
@@ -14,12 +15,14 @@ pub mod worker;
 
 use std::path::PathBuf;
 
+use lads_pace::BenchError;
 use lads_pace::contender::{Contender, Episode};
 use lads_pace::suite::Others;
 
 use cut::Source;
 use engine::Engine;
 use general::General;
+use plain::Plain;
 use worker::{NAMES, Worker};
 
 /// Choice of the peers to run, and where they are.
@@ -61,8 +64,8 @@ impl Others for Peers {
             engines.push(Box::new(rten::Rten));
         }
         for engine in engines {
-            match General::new(engine.as_ref(), &source, episode) {
-                Ok(contender) => open.push(Box::new(contender)),
+            match on(engine.as_ref(), &source, episode) {
+                Ok(contender) => open.push(contender),
                 Err(error) => absent.push(error.to_string()),
             }
         }
@@ -76,4 +79,16 @@ impl Others for Peers {
         }
         open
     }
+}
+
+/// Opens a bundle on a general runtime.
+fn on<'e>(
+    engine: &dyn Engine,
+    source: &Source,
+    episode: &'e Episode,
+) -> Result<Box<dyn Contender + 'e>, BenchError> {
+    Ok(match source.only_entry()? {
+        Some(entry) => Box::new(Plain::new(engine, source, &entry, episode)?),
+        None => Box::new(General::new(engine, source, episode)?),
+    })
 }

@@ -131,10 +131,16 @@ def _cell(entry, kind, x, module, order, states, **attributes):
     return f"{ENTRY}/next_{states[0]}"
 
 
+def gru(entry, x, module):
+    """Adds one step of a GRU, its state `gru_h` among the inputs and outputs: x [1, k] -> [1, h]."""
+    # ONNX orders the gates z, r, h; PyTorch r, z, n.
+    return _cell(entry, "GRU", x, module, (1, 0, 2), ["gru_h"], linear_before_reset=1)
+
+
 def build_recurrent(policy, sizes):
     graph, entry, x = _start(policy)
-    # ONNX orders the gates z, r, h and i, o, f, c; PyTorch r, z, n and i, f, g, o.
-    x = _cell(entry, "GRU", x, policy.gru, (1, 0, 2), ["gru_h"], linear_before_reset=1)
+    x = gru(entry, x, policy.gru)
+    # ONNX orders the gates i, o, f, c; PyTorch i, f, g, o.
     x = _cell(entry, "LSTM", x, policy.lstm, (0, 3, 1, 2), ["lstm_h", "lstm_c"])
     return _finish(graph, entry, x, policy)
 
@@ -178,12 +184,13 @@ def contract(sizes, seed, kind="plain", states=None, more=()):
     return bundle.describe({"kind": "plain"}, common.ENVIRONMENT, [], None, provenance, channels=channels, states=states)
 
 
-def _plain_state(name, width):
+def state(name, width):
+    """Describes a state of so many numbers, cleared by an episode's start."""
     return {"name": name, "shape": [1, width], "kind": "plain", "cleared_by": "episode"}
 
 
 def contract_recurrent(sizes, seed):
-    states = [_plain_state("gru_h", 24), _plain_state("lstm_h", 16), _plain_state("lstm_c", 16)]
+    states = [state("gru_h", 24), state("lstm_h", 16), state("lstm_c", 16)]
     return contract(sizes, seed, "recurrent", states)
 
 

@@ -10,6 +10,7 @@ use crate::charts::{Line, lines, tail};
 use crate::growth::{Point, Series};
 use crate::measure::{CONTEXT, RATE, Run};
 use crate::page::page;
+use crate::plain;
 use crate::regression::Changes;
 use crate::rows::Row;
 
@@ -26,6 +27,7 @@ pub struct Measured {
     pub contexts: Vec<Line>,
     pub growth: Vec<Series>,
     pub not_grown: Option<String>,
+    pub plain: Vec<plain::Measured>,
     pub criterion: Vec<Value>,
     pub quick: bool,
     pub seconds: f64,
@@ -79,6 +81,9 @@ fn as_json(measured: &Measured, rows: &[Row]) -> Value {
             "paced": measured.paced.rows(),
             "paced_loaded": measured.loaded.rows(),
         },
+        "plain_us": measured.plain.iter().map(|it| json!({
+            "policy": it.title, "hot": it.hot.rows(), "paced": it.paced.rows(),
+        })).collect::<Vec<_>>(),
         "context_growth_us": measured.contexts,
         "network_growth": measured.growth,
         "criterion": measured.criterion,

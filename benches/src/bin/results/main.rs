@@ -12,6 +12,7 @@ mod machine;
 mod markdown;
 mod measure;
 mod page;
+mod plain;
 mod regression;
 mod rows;
 
@@ -47,6 +48,7 @@ pub struct Effort {
     load_rounds: usize,
     context_rounds: usize,
     growth_rounds: usize,
+    plain_rounds: usize,
     processes: usize,
 }
 
@@ -59,6 +61,7 @@ impl Effort {
         load_rounds: 16,
         context_rounds: 6,
         growth_rounds: 8,
+        plain_rounds: 50,
         processes: 15,
     };
     const QUICK: Self = Self {
@@ -69,6 +72,7 @@ impl Effort {
         load_rounds: 2,
         context_rounds: 2,
         growth_rounds: 2,
+        plain_rounds: 2,
         processes: 3,
     };
 }
@@ -143,8 +147,8 @@ fn images(bundle: &Bundle) -> Result<Vec<(&'static str, Aligned)>, BenchError> {
     Ok(images)
 }
 
-/// Number of images that the paced run for the tails measures: weights of 32 and of 16 bits.
-const FOR_TAILS: usize = 3;
+/// Formats that the paced run for the tails measures.
+const FOR_TAILS: [&str; 4] = ["f32", "int16", "f16", AUTO];
 
 #[expect(clippy::too_many_lines, reason = "the order of the run, step by step")]
 fn run(arguments: &Arguments) -> Result<(), BenchError> {
@@ -214,9 +218,13 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
             });
             Ok((entrants, hot, paced, contexts))
         })?;
-    let tails = candidates.get(..FOR_TAILS).unwrap_or(&candidates);
+    let tails: Vec<_> = candidates
+        .iter()
+        .filter(|candidate| FOR_TAILS.contains(&candidate.weights))
+        .copied()
+        .collect();
     say("beside ONNX Runtime: at 50 Hz, for the tails");
-    let (paced, loaded) = with_contenders(tails, &main_peers, bare(), |field, contenders| {
+    let (paced, loaded) = with_contenders(&tails, &main_peers, bare(), |field, contenders| {
         let rounds = effort.paced_rounds;
         let paced = measure::paced(field, contenders, rounds, 0, &mut |_| ())?;
         say("the same beside a thread that thrashes the caches");
@@ -233,6 +241,13 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
         Err(error) => (vec![], Some(error.to_string())),
     };
 
+    say("policies of one entry");
+    let folder = arguments.scratch.join("plain");
+    made(arguments, &folder.join("mlp.onnx"), |python| {
+        python.arg(script("plain.py")).arg(&folder);
+    })?;
+    let plain = plain::measure(&folder, &arguments.onnxruntime, effort, &mut say)?;
+
     let measured = files::Measured {
         machine: machine::describe(),
         field,
@@ -245,13 +260,14 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
         contexts,
         growth: grown,
         not_grown,
+        plain,
         criterion: criterion::collect(&arguments.criterion),
         quick: arguments.quick,
         seconds: started.elapsed().as_secs_f64(),
     };
     let rows = rows::rows(&measured);
     let before = regression::committed(&arguments.output);
-    let changes = regression::compare(&rows, before.as_ref());
+    let changes = regression::compare(&rows, &measured.machine["cpu"], before.as_ref());
     for warning in &changes.warnings {
         say(&format!("warning: {warning}"));
     }
@@ -337,9 +353,8 @@ fn export_recompute(
     lads_host::output::write(&file, content.to_string().as_bytes())
         .map_err(|error| about(file.display(), error))?;
     let model = arguments.scratch.join("recompute.onnx");
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/recompute.py");
     let done = Command::new(&arguments.python)
-        .arg(script)
+        .arg(script("recompute.py"))
         .arg(bundle())
         .arg(&file)
         .arg(&model)
@@ -376,20 +391,36 @@ fn recomputes(arguments: &Arguments, model: &Result<PathBuf, String>) -> Vec<Box
     open
 }
 
-/// Makes the random bundles with the exporter, unless they exist.
+/// Path of a script of this crate.
+fn script(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("python")
+        .join(name)
+}
+
+/// Makes the random bundles that grow with the exporter, unless they exist.
 fn export_growth(arguments: &Arguments, folder: &Path) -> Result<(), BenchError> {
-    if folder.join("index.json").is_file() {
+    let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("../exporter/configs/kitchen.toml");
+    made(arguments, &folder.join("index.json"), |python| {
+        python.args(["-m", "lads_exporter", "growth", "--config"]);
+        python.arg(config).arg("-o").arg(folder);
+    })
+}
+
+/// Runs Python, unless the file that it makes is there.
+fn made(
+    arguments: &Arguments,
+    file: &Path,
+    call: impl FnOnce(&mut Command),
+) -> Result<(), BenchError> {
+    if file.is_file() {
         return Ok(());
     }
-    let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("../exporter/configs/kitchen.toml");
-    let python = &arguments.python;
-    let done = Command::new(python)
-        .args(["-m", "lads_exporter", "growth", "--config"])
-        .arg(config)
-        .arg("-o")
-        .arg(folder)
-        .output();
-    let output = done.map_err(|error| about(python.display(), error))?;
+    let mut python = Command::new(&arguments.python);
+    call(&mut python);
+    let output = python
+        .output()
+        .map_err(|error| about(arguments.python.display(), error))?;
     if output.status.success() {
         return Ok(());
     }

@@ -58,10 +58,11 @@ impl Run {
     }
 }
 
-/// A contender that reads as many bytes as the low level's weights have, and does nothing else.
+/// A contender that reads as many bytes as weights have, the low level's or those of a policy of one entry, and does nothing else.
 pub struct Bare {
     name: String,
     sweep: Sweep,
+    kind: Kind,
 }
 
 impl Bare {
@@ -69,6 +70,15 @@ impl Bare {
         Self {
             name: format!("bare sweep {label}"),
             sweep: Sweep::new(bytes),
+            kind: Kind::Act,
+        }
+    }
+
+    /// Makes a contender that reads as many bytes as a whole policy's weights have, in each control step.
+    pub fn steps(label: &str, bytes: usize) -> Self {
+        Self {
+            kind: Kind::Ordinary,
+            ..Self::new(label, bytes)
         }
     }
 }
@@ -87,13 +97,17 @@ impl Contender for Bare {
     }
 
     fn offers(&self, work: Work) -> bool {
-        work == Work::Act
+        match work {
+            Work::Act => self.kind == Kind::Act,
+            Work::Steps { .. } => self.kind == Kind::Ordinary,
+            Work::Instruct | Work::Recompute { .. } => false,
+        }
     }
 
     fn block(&mut self, block: &Block, samples: &mut Vec<Sample>) -> Result<(), BenchError> {
         measure(block, samples, |_| {
             std::hint::black_box(self.sweep.read());
-            Ok((Kind::Act, 0))
+            Ok((self.kind, 0))
         })
     }
 }

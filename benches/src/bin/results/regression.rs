@@ -1,5 +1,6 @@
-//! Compares ratios, never times, with those of the results that were committed last.
+//! Compares ratios, never times, with those of the results that were committed last, if the same kind of CPU made them.
 
+use std::fmt::Write as _;
 use std::path::Path;
 use std::process::Command;
 
@@ -15,10 +16,51 @@ const WORTH: f64 = 0.15;
 pub struct Changes {
     /// Commit or file that was compared with.
     pub with: Option<String>,
+    /// CPU of those results, where it is another: nothing is compared then.
+    pub other_cpu: Option<String>,
     /// Ratios that are in both, as `(row, before, now)`.
     pub all: Vec<(String, f64, f64)>,
     /// Lines about the ratios that became worse by more than 15 %.
     pub warnings: Vec<String>,
+}
+
+impl Changes {
+    /// Renders what changed, as a section of the page.
+    pub fn section(&self) -> String {
+        let Some(with) = &self.with else {
+            return String::new();
+        };
+        let mut text = format!("## Since {with}\n\n");
+        if let Some(cpu) = &self.other_cpu {
+            let _ = writeln!(
+                text,
+                "Not compared: those ratios are of another CPU, {cpu}."
+            );
+            return text;
+        }
+        let (count, moved) = (
+            self.all.len(),
+            changes
+                .all
+                .iter()
+                .filter(|(_, was, now)| (now / was - 1.0).abs() > 0.1)
+                .count(),
+        );
+        let _ = writeln!(
+            text,
+            "{count} ratios are in both; {moved} of them moved by more than 10 %."
+        );
+        match self.warnings.as_slice() {
+            [] => text.push_str("None became worse by more than 15 %.\n"),
+            warnings => {
+                text.push_str("Worse by more than 15 %:\n\n");
+                for warning in warnings {
+                    let _ = writeln!(text, "- {warning}");
+                }
+            }
+        }
+        text
+    }
 }
 
 /// Reads the results of the last commit, or, outside a repository, of the folder.
@@ -42,8 +84,8 @@ pub fn committed(folder: &Path) -> Option<(String, Value)> {
     ))
 }
 
-/// Compares the ratios row by row.
-pub fn compare(rows: &[Row], before: Option<&(String, Value)>) -> Changes {
+/// Compares the ratios of this CPU row by row.
+pub fn compare(rows: &[Row], cpu: &Value, before: Option<&(String, Value)>) -> Changes {
     let Some((with, before)) = before else {
         return Changes::default();
     };
@@ -51,6 +93,11 @@ pub fn compare(rows: &[Row], before: Option<&(String, Value)>) -> Changes {
         with: Some(with.clone()),
         ..Changes::default()
     };
+    let known = &before["machine"]["cpu"];
+    if known != cpu {
+        changes.other_cpu = Some(known.as_str().unwrap_or("unknown").to_owned());
+        return changes;
+    }
     for row in rows.iter().filter(|row| row.unit.is_empty()) {
         let known = before["rows"]
             .as_array()
@@ -96,7 +143,7 @@ mod tests {
 
     #[test]
     fn only_ratios_that_became_worse_are_warned_of() {
-        let before = json!({ "rows": [
+        let before = json!({ "machine": { "cpu": "this" }, "rows": [
             { "id": "a", "ratio": { "median": 0.5 } },
             { "id": "b", "ratio": { "median": 0.5 } },
             { "id": "time", "ratio": { "median": 1.0 } },
@@ -108,10 +155,15 @@ mod tests {
             row("time", 9.0, "ms"),
             row("new", 1.0, ""),
         ];
-        let changes = compare(&rows, Some(&("x".into(), before)));
+        let before = ("x".to_owned(), before);
+        let changes = compare(&rows, &json!("this"), Some(&before));
         assert_eq!(changes.all.len(), 2);
         assert_eq!(changes.warnings.len(), 1);
         assert!(changes.warnings[0].starts_with("b: 0.580, was 0.500"));
-        assert!(compare(&rows, None).all.is_empty());
+        assert!(compare(&rows, &json!("this"), None).all.is_empty());
+        // Ratios of another CPU say nothing.
+        let changes = compare(&rows, &json!("that"), Some(&before));
+        assert!(changes.all.is_empty() && changes.warnings.is_empty());
+        assert_eq!(changes.other_cpu.as_deref(), Some("this"));
     }
 }

@@ -8,6 +8,7 @@ use serde_json::Value;
 
 use crate::files::Measured;
 use crate::measure::{Run, ratio};
+use crate::plain;
 use Mode::{Hot, Loaded, Paced, PacedAll};
 use Statistic::{P50, P999};
 
@@ -49,8 +50,8 @@ enum Mode {
 }
 
 /// Latencies that are divided.
-#[derive(Clone, Copy)]
-enum Statistic {
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Statistic {
     /// Median, with [`paired`].
     P50,
     /// 99.9th percentile, with [`pooled`].
@@ -58,7 +59,7 @@ enum Statistic {
 }
 
 /// One side of a ratio, a contender and a kind of its calls.
-type Side = (&'static str, Kind);
+pub type Side = (&'static str, Kind);
 
 /// Ratio of the latencies of two contenders in one run.
 struct Comparison {
@@ -74,6 +75,7 @@ struct Comparison {
 const F32: &str = "lads f32";
 const INT16: &str = "lads int16";
 const F16: &str = "lads f16";
+const AUTO: &str = "lads auto";
 const ORT: &str = "ONNX Runtime";
 const SWEEP: &str = "bare sweep f32";
 const THIRD: Option<f64> = Some(1.0 / 3.0);
@@ -90,6 +92,11 @@ const COMPARISONS: &[Comparison] = &[
     Comparison { id: "act_hot_f16", label: "`low_level/act`, hot: f16 / ONNX Runtime f32", run: Hot, statistic: P50, above: (F16, Act), below: (ORT, Act), target: Some(0.25) },
     Comparison { id: "step_hot_int16", label: "ordinary step, hot: int16 / ONNX Runtime f32", run: Hot, statistic: P50, above: (INT16, Ordinary), below: (ORT, Ordinary), target: None },
     Comparison { id: "step_hot_f16", label: "ordinary step, hot: f16 / ONNX Runtime f32", run: Hot, statistic: P50, above: (F16, Ordinary), below: (ORT, Ordinary), target: None },
+    Comparison { id: "step_hot_auto", label: "ordinary step, hot: auto / ONNX Runtime f32", run: Hot, statistic: P50, above: (AUTO, Ordinary), below: (ORT, Ordinary), target: Some(0.2) },
+    Comparison { id: "decision_hot_auto", label: "decision step / ordinary step, hot, auto", run: Hot, statistic: P50, above: (AUTO, Decision), below: (AUTO, Ordinary), target: None },
+    Comparison { id: "decision_paced_auto", label: "decision step / ordinary step, 50 Hz, auto", run: Paced, statistic: P50, above: (AUTO, Decision), below: (AUTO, Ordinary), target: Some(1.2) },
+    Comparison { id: "step_paced_auto_p50", label: "ordinary step, 50 Hz: auto / ONNX Runtime f32, p50", run: Paced, statistic: P50, above: (AUTO, Ordinary), below: (ORT, Ordinary), target: Some(0.14) },
+    Comparison { id: "step_paced_auto_p999", label: "ordinary step, 50 Hz: auto / ONNX Runtime f32, p99.9", run: Paced, statistic: P999, above: (AUTO, Ordinary), below: (ORT, Ordinary), target: Some(0.25) },
     Comparison { id: "act_paced_f32_p50", label: "`low_level/act`, 50 Hz: f32 / ONNX Runtime f32, p50", run: Paced, statistic: P50, above: (F32, Act), below: (ORT, Act), target: Some(0.2) },
     Comparison { id: "act_paced_f32_p999", label: "`low_level/act`, 50 Hz: f32 / ONNX Runtime f32, p99.9", run: Paced, statistic: P999, above: (F32, Act), below: (ORT, Act), target: THIRD },
     Comparison { id: "act_paced_int16_p50", label: "`low_level/act`, 50 Hz: int16 / ONNX Runtime f32, p50", run: Paced, statistic: P50, above: (INT16, Act), below: (ORT, Act), target: Some(0.125) },
@@ -130,6 +137,9 @@ const COMPARISONS: &[Comparison] = &[
     Comparison { id: "step_paced_openvino", label: "ordinary step, 50 Hz: f32 / OpenVINO", run: PacedAll, statistic: P50, above: (F32, Ordinary), below: ("OpenVINO", Ordinary), target: None },
 ];
 
+/// Targets that are lower where the CPU has AVX-512.
+const WITH_AVX512: [(&str, f64); 2] = [("step_hot_auto", 0.1), ("step_paced_auto_p50", 0.11)];
+
 impl Comparison {
     /// Computes the row, whose ratio is missing if a contender was not measured.
     fn row(&self, measured: &Measured) -> Row {
@@ -139,18 +149,36 @@ impl Comparison {
             PacedAll => &measured.paced_all,
             Loaded => &measured.loaded,
         };
-        let (ratio, halves) = match self.statistic {
-            P50 => paired(run, self.above, self.below),
-            P999 => (pooled(run, self.above, self.below, 0.999), None),
-        };
-        Row {
-            id: self.id.into(),
-            label: self.label.into(),
-            ratio,
-            halves,
-            target: self.target,
-            unit: "",
-        }
+        let named = (self.id.to_owned(), self.label.to_owned());
+        between(
+            run,
+            self.statistic,
+            (self.above, self.below),
+            named,
+            self.target,
+        )
+    }
+}
+
+/// Computes a row of two contenders' latencies in one run, which is named by its id and label.
+pub fn between(
+    run: &Run,
+    statistic: Statistic,
+    (above, below): (Side, Side),
+    (id, label): (String, String),
+    target: Option<f64>,
+) -> Row {
+    let (ratio, halves) = match statistic {
+        P50 => paired(run, above, below),
+        P999 => (pooled(run, above, below, 0.999), None),
+    };
+    Row {
+        id,
+        label,
+        ratio,
+        halves,
+        target,
+        unit: "",
     }
 }
 
@@ -216,6 +244,15 @@ pub fn rows(measured: &Measured) -> Vec<Row> {
         cold, preparation, ..
     } = measured;
     let mut rows: Vec<Row> = COMPARISONS.iter().map(|row| row.row(measured)).collect();
+    let mut vectors = measured.machine["vectors"].as_array().into_iter().flatten();
+    if vectors.any(|one| one == "avx512f") {
+        for (id, most) in WITH_AVX512 {
+            if let Some(row) = rows.iter_mut().find(|row| row.id == id) {
+                row.target = Some(most);
+            }
+        }
+    }
+    rows.extend(measured.plain.iter().flat_map(plain::Measured::rows));
     rows.extend([
         number(
             "first_step",
