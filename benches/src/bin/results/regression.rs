@@ -40,8 +40,7 @@ impl Changes {
         }
         let (count, moved) = (
             self.all.len(),
-            changes
-                .all
+            self.all
                 .iter()
                 .filter(|(_, was, now)| (now / was - 1.0).abs() > 0.1)
                 .count(),
