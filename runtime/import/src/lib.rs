@@ -217,7 +217,19 @@ fn known(request: &Request) -> Result<Known, ImportError> {
         });
     }
     let mut lost: Vec<(String, Gain)> = vec![];
+    // What a person wrote stands; files beside each other have to agree on the rest.
+    let own = robot.clone();
+    let mut earlier: Vec<(String, Robot)> = vec![];
     let mut take = |said: Said, source: &str, problems: &mut Problems| {
+        for (other, before) in &earlier {
+            for field in before.contradictions(&said.robot, &own) {
+                problems.add(
+                    source,
+                    format!("`{field}` is said otherwise by {other}; say in the description which is right"),
+                );
+            }
+        }
+        earlier.push((source.to_owned(), said.robot.clone()));
         if !said.used.is_empty() {
             notes.push(format!("{source}: read {}", said.used.join(", ")));
         }

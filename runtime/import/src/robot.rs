@@ -320,6 +320,86 @@ impl Robot {
     }
 }
 
+/// Adds the names of fields that are said both here and there, not alike.
+macro_rules! differing {
+    ($found:ident, $within:expr, $mine:expr, $other:expr, $settled:expr, $($field:ident)+) => {
+        $(if let (Some(mine), Some(other), None) = (&$mine.$field, &$other.$field, &$settled.$field)
+            && !mine.is_near(other)
+        {
+            $found.push(format!("{}{}", $within, stringify!($field)));
+        })+
+    };
+}
+
+impl Robot {
+    /// Lists the fields of which another source says something else, where `settled`, a person's description, says nothing.
+    pub fn contradictions(&self, other: &Robot, settled: &Robot) -> Vec<String> {
+        let mut found = vec![];
+        differing!(found, "", self, other, settled, control_period_s joints default_position);
+        differing!(found, "action.", self.action, other.action, settled.action, scale offset min max stiffness damping);
+        let none = Term::default();
+        for (place, (mine, other)) in self.terms.iter().zip(&other.terms).enumerate() {
+            let settled = settled.terms.get(place).unwrap_or(&none);
+            let within = format!("{}: ", mine.name);
+            differing!(found, within, mine, other, settled, scale clip history);
+        }
+        found
+    }
+}
+
+/// Whether two sources say the same, one of which may have printed three decimals.
+trait Near {
+    fn is_near(&self, other: &Self) -> bool;
+}
+
+impl Near for f64 {
+    fn is_near(&self, other: &Self) -> bool {
+        (self - other).abs() <= 5.1e-4
+    }
+}
+
+impl Near for usize {
+    fn is_near(&self, other: &Self) -> bool {
+        self == other
+    }
+}
+
+impl Near for String {
+    fn is_near(&self, other: &Self) -> bool {
+        self == other
+    }
+}
+
+impl<T: Near> Near for Vec<T> {
+    fn is_near(&self, other: &Self) -> bool {
+        let mut pairs = self.iter().zip(other);
+        self.len() == other.len() && pairs.all(|(mine, other)| mine.is_near(other))
+    }
+}
+
+impl Near for Each {
+    fn is_near(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Each::One(mine), Each::One(other)) => mine.is_near(other),
+            (Each::Many(mine), Each::Many(other)) => mine.is_near(other),
+            (Each::One(one), Each::Many(many)) | (Each::Many(many), Each::One(one)) => {
+                many.iter().all(|each| each.is_near(one))
+            }
+        }
+    }
+}
+
+impl Near for Clip {
+    fn is_near(&self, other: &Self) -> bool {
+        let sides = |clip: &Clip| match clip {
+            Clip::Around(most) => [Each::One(-most), Each::One(*most)],
+            Clip::Between(sides) => sides.clone(),
+        };
+        let ([low, high], [low_there, high_there]) = (sides(self), sides(other));
+        low.is_near(&low_there) && high.is_near(&high_there)
+    }
+}
+
 impl Term {
     /// Fills the fields that this term lacks from another source's description of it.
     pub fn fill(&mut self, other: Term) {
@@ -362,6 +442,36 @@ mod tests {
             let error = Robot::parse(wrong).expect_err(wrong);
             assert!(error.contains(said), "{error}");
         }
+    }
+
+    #[test]
+    fn sources_that_contradict_each_other_are_told() {
+        let parse = |text: &str| Robot::parse(text).expect("it reads");
+        let mine = parse(
+            "control_period_s = 0.02\n[[term]]\nname = \"a\"\nscale = 2\nclip = 5\n[action]\nscale = 0.25\noffset = [0.1, 0.2]",
+        );
+        let same = parse(
+            "[[term]]\nname = \"a\"\nscale = [2, 2]\nclip = [-5, 5]\n[action]\nscale = [0.25, 0.25]\noffset = [0.1004, 0.2]",
+        );
+        let other = parse(
+            "control_period_s = 0.01\n[[term]]\nname = \"a\"\nscale = 3\n[action]\nscale = 0.5\noffset = [0.1, 0.3]",
+        );
+        let none = Robot::default();
+        assert!(mine.contradictions(&same, &none).is_empty());
+        assert_eq!(
+            mine.contradictions(&other, &none),
+            [
+                "control_period_s",
+                "action.scale",
+                "action.offset",
+                "a: scale"
+            ]
+        );
+        // A person's word settles it.
+        let settled = parse(
+            "control_period_s = 0.02\n[[term]]\nname = \"a\"\nscale = 2\n[action]\nscale = 0.25",
+        );
+        assert_eq!(mine.contradictions(&other, &settled), ["action.offset"]);
     }
 
     #[test]

@@ -8,6 +8,7 @@
 //! which is a problem.
 
 mod deploy;
+mod terms;
 
 use crate::problem::Problems;
 use crate::robot::{Each, Robot, Term};
@@ -154,6 +155,7 @@ fn flat(values: &Value, source: &str, problems: &mut Problems) -> Said {
             None => problems.add(format!("{source}, `{name}`"), "is not a list of names"),
         }
     }
+    terms::read(&mut said, values, source, problems);
     said
 }
 
