@@ -218,7 +218,7 @@ class SkillDiffuser:
 
 SYSTEMS = {"lads": Lads, "vae": Vae, "cluster": Cluster, "lang_dt": LangDt, "lisa": Lisa, "lcsd": Lcsd, "skilldiffuser": SkillDiffuser}
 ACTING = ("sampler", "passes", "guidance", "temperature", "clip", "rule")  # of [system]: what trained weights do not depend on
-ON_FEATURES = ("lads", "lang_dt", "lisa")  # systems that [pretrained] goes with
+ON_FEATURES = ("lads", "vae", "lang_dt", "lisa")  # systems that [pretrained] goes with
 SEEING = ("lads", "vae", "lang_dt", "lisa")  # systems that [images] goes with
 LADS = {"kind": "lads", "regressed": False}  # what a configuration without [system] trains
 
@@ -396,7 +396,7 @@ def _frozen(config, state_len, where):
     problems, sizes = [], {"pretrained.features": seen.features}
     if kind not in ON_FEATURES:
         problems.append(f"they go with the systems {', '.join(ON_FEATURES)}, not {kind}")
-    elif kind == "lads" or history.window:
+    elif kind in ("lads", "vae") or history.window:
         sizes |= {f"history.{name}": getattr(history, name) for name in ("window", "layers", "heads")}
         if not seen.encoder or not history.window:
             problems.append(f"[pretrained] and [history] go together in system {kind}")

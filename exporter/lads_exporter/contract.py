@@ -219,8 +219,10 @@ def _family(found, where):
         "window": ["window"],
         "memory": ["memory.dim"],
         "low_level": ["low_level.layers", "low_level.heads", "low_level.head_dim"],
+        "history": [f"history.{name}" for name in ("window", "memory.dim", "low_level.layers", "low_level.heads", "low_level.head_dim")],
     }
-    _positive(family, [name for key in FAMILIES[kind] for name in sizes.get(key, [])], where)
+    given = [*FAMILIES[kind], *(["history"] if kind == "vae" and "history" in family else [])]
+    _positive(family, [name for key in given for name in sizes.get(key, [])], where)
     rules = {"decision": ("mean", "sample") if kind == "vae" else ("argmax", "sample"), "noise": ("seeded", "zero")}
     for key in ("decision", "noise"):
         if key in FAMILIES[kind]:

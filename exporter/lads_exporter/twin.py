@@ -142,7 +142,7 @@ class Twin:
             if name not in ("instruction/lookup", "trajectory_encoder/encode", "high_level/instruct"):
                 for port, shape in entry.inputs.items():
                     if port not in taken and port not in found and not port.startswith(PAST):
-                        ring = self.family.get("window", 0) if port == "row" else 0
+                        ring = self.family.get("history", self.family).get("window", 0) if port == "row" else 0
                         found[port] = _State(shape, "episode", ring)
         return found
 
@@ -302,7 +302,10 @@ def _vae(twin):
     _first_or_later(twin)
     if twin.decides:
         twin.run("plan/sample")
-    twin.run("low_level/act")
+    if "history" in twin.family:
+        _recall(twin)
+    else:
+        twin.run("low_level/act")
 
 
 def _lcsd(twin):
@@ -330,6 +333,11 @@ def _history(twin):
         twin.run("high_level/step")
     if twin.decides:
         twin.select()
+    _recall(twin)
+
+
+def _recall(twin):
+    if twin.decides:
         twin.clear("low_level")
         twin.run("low_level/plan")
         twin.repeat("low_level/recall", len(twin.states["row"].rows), ring="row")

@@ -81,6 +81,13 @@ class Whole:
         """Computes the action of the present step [A]."""
         raise NotImplementedError
 
+    def remembering(self, plan):
+        """Computes the action of a low level on a plan, a window of steps before it and those since."""
+        low, steps = self.networks.low_level, (len(self.observations) - 1) % contracts.period(self.contract) + 1
+        previous = torch.stack([self.before, *self.actions])
+        window = min(len(self.observations) - steps, low.window)
+        return low(plan, torch.stack(self.observations), window, previous, steps)[-1]
+
     def select(self, logits):
         """Records the decision for the largest of logits [M]."""
         best = logits.topk(2).values
@@ -122,10 +129,7 @@ class History(Whole):
         self.select(self.networks.high_level(*words, observations, *known)[0, -1])
 
     def action(self):
-        low, steps = self.networks.low_level, (len(self.observations) - 1) % contracts.period(self.contract) + 1
-        previous = torch.stack([self.before, *self.actions])
-        window = min(len(self.observations) - steps, low.window)
-        return low(self.plans[-1], torch.stack(self.observations), window, previous, steps)[-1]
+        return self.remembering(self.plans[-1])
 
 
 class Vae(Whole):
@@ -136,6 +140,8 @@ class Vae(Whole):
         self.vector = mean + log_std.clamp(*LOG_STD).exp() * self.draw(len(mean))
 
     def action(self):
+        if "history" in self.contract["family"]:
+            return self.remembering(self.vector)
         return self.networks.low_level(self.observations[-1][None], self.vector[None])[0]
 
 

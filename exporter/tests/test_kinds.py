@@ -102,6 +102,14 @@ def vae(made):
     return None, torch.cat(parts)
 
 
+def vae_history(made):
+    mean, log_std = made.policy.plans(made.words, made.observations, made.actions)
+    normed, low = made.policy.normalizer(made.observations), made.policy.low_level
+    plan = lambda start: mean[start] + log_std[start].exp() * made.noise[start]
+    chunk = lambda start, end: low(plan(start), normed[:end], min(start, low.window), made.previous[:end], end - start)
+    return None, torch.cat([chunk(*ends) for ends in made.chunks()])
+
+
 def lcsd(made):
     plans = made.plans(made.policy.logits(made.words, made.observations))
     act = lambda t: made.policy.denoise(made.observations[t : t + 1], plans[t], made.noise[t].view(-1, made.sizes.action))
@@ -118,7 +126,7 @@ def plain(made):
     return None, made.policy(*(torch.from_numpy(rows) for rows in made.channels.values()))
 
 
-WHOLE = {"lads": lads, "sighted": lads, "sighted_lang_dt": lang_dt, "sighted_lisa": lisa, "sighted_vae": vae, "frozen_lang_dt": lang_dt, "frozen_lisa": lisa, "sighted_history": sighted_history, "lang_dt": lang_dt, "lisa": lisa, "history": history, "vae": vae, "lcsd": lcsd, "skilldiffuser": skilldiffuser}
+WHOLE = {"lads": lads, "sighted": lads, "sighted_lang_dt": lang_dt, "sighted_lisa": lisa, "sighted_vae": vae, "frozen_lang_dt": lang_dt, "frozen_lisa": lisa, "frozen_vae_history": vae_history, "vae_history": vae_history, "sighted_history": sighted_history, "lang_dt": lang_dt, "lisa": lisa, "history": history, "vae": vae, "lcsd": lcsd, "skilldiffuser": skilldiffuser}
 
 
 @torch.no_grad()

@@ -17,7 +17,7 @@ pytest.importorskip("lads_exporter.episode")
 from lads_exporter import bundle, episode, kinds  # noqa: E402
 
 # The Makefile's: with another one cargo would build its dependencies once more.
-KINDS = ("lads", "lang_dt", "lisa", "vae", "lcsd", "skilldiffuser", "history", "plain", "recurrent", "stacked", "camera", "images", "frozen_lang_dt", "frozen_lisa", "sighted", "sighted_history", "sighted_lang_dt", "sighted_lisa", "sighted_vae")
+KINDS = ("lads", "lang_dt", "lisa", "vae", "lcsd", "skilldiffuser", "history", "vae_history", "plain", "recurrent", "stacked", "camera", "images", "frozen_lang_dt", "frozen_lisa", "frozen_vae_history", "sighted", "sighted_history", "sighted_lang_dt", "sighted_lisa", "sighted_vae")
 STEPS = 200
 
 

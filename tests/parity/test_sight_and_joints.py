@@ -27,6 +27,7 @@ SEEN = {"channel": "camera", "encoder": "random-4", "joints": JOINTS, "std_floor
 SYSTEMS = {
     "lads": {"kind": "lads", "regressed": False},
     "wo_cp": {"kind": "lads", "regressed": True},
+    "vae": {"kind": "vae", "beta": 5e-4, "rule": "sample"},
     "lang_dt": {"kind": "lang_dt"},
     "lisa_history": {"kind": "lisa", "low_level_layers": 2, "option_gradient": "first"},
     "lisa": {"kind": "lisa", "low_level_layers": 2, "option_gradient": "first"},

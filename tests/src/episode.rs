@@ -13,7 +13,7 @@ use safetensors::{SafeTensors, tensor::TensorView};
 pub const FOLDER: &str = "LADS_FAMILIES";
 
 /// Kinds of random policies.
-pub const KINDS: [&str; 19] = [
+pub const KINDS: [&str; 21] = [
     "lads",
     "lang_dt",
     "lisa",
@@ -21,6 +21,7 @@ pub const KINDS: [&str; 19] = [
     "lcsd",
     "skilldiffuser",
     "history",
+    "vae_history",
     "plain",
     "recurrent",
     "stacked",
@@ -28,6 +29,7 @@ pub const KINDS: [&str; 19] = [
     "images",
     "frozen_lang_dt",
     "frozen_lisa",
+    "frozen_vae_history",
     "sighted",
     "sighted_history",
     "sighted_lang_dt",

@@ -235,4 +235,4 @@ macro_rules! kinds {
     };
 }
 
-kinds! { lads lang_dt lisa vae lcsd skilldiffuser history plain recurrent stacked camera images frozen_lang_dt frozen_lisa sighted sighted_history sighted_lang_dt sighted_lisa sighted_vae }
+kinds! { lads lang_dt lisa vae lcsd skilldiffuser history vae_history plain recurrent stacked camera images frozen_lang_dt frozen_lisa frozen_vae_history sighted sighted_history sighted_lang_dt sighted_lisa sighted_vae }

@@ -46,6 +46,7 @@ KINDS = {
     "lcsd": _of(lcsd.Lcsd, lcsd.build, lcsd.contract),
     "skilldiffuser": _of(skilldiffuser.SkillDiffuser, skilldiffuser.build, skilldiffuser.contract, Sizes(horizon=7, steps=42)),
     "history": _of(history.History, history.build, history.contract),
+    "vae_history": _of(vae.VaeHistory, vae.build_history, vae.contract_history),
     "plain": _of(plain.Plain, plain.build_plain, plain.contract),
     "recurrent": _of(plain.Recurrent, plain.build_recurrent, plain.contract_recurrent),
     "stacked": _of(plain.Stacked, plain.build_stacked, plain.contract_stacked),
@@ -57,6 +58,7 @@ KINDS = {
     "sighted_vae": _seeing(sighted, vae.Vae, vae.build, lambda sizes: vae.family(sizes, "sample", 0), [Sizes().plan]),
     "frozen_lang_dt": _seeing(frozen, lang_dt.LangDt, lang_dt.build, lambda sizes: {"kind": "lang_dt"}),
     "frozen_lisa": _seeing(frozen, lisa.Lisa, lisa.build, lambda sizes: lisa.family(sizes, common.argmax())),
+    "frozen_vae_history": _seeing(frozen, vae.VaeHistory, vae.build_history, lambda sizes: vae.family_history(sizes, "sample", 0), [Sizes().plan]),
     "sighted_history": Kind(sighted_history.policy, sighted_history.build, sighted_history.contract),
 }
 # Of the sizes that encoders have in the field.

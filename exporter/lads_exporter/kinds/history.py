@@ -21,7 +21,8 @@ LEVEL = "low_level"
 class HistoryPolicy(nn.Module):
     """Low level: a causal transformer over the plan, then pairs of (previous action, observation); the action is read at the observation.
 
-    A plan is a row of a table; while it is trained `embed_option` is a layer on the code instead (`systems.lads_history`).
+    A plan is a row of a table; while it is trained `embed_option` is a layer on the code instead (`systems.lads_history`), and where plans are
+    vectors it stays one (`vae_history`).
     """
 
     def __init__(self, sizes, embed_option=None):
@@ -37,14 +38,22 @@ class HistoryPolicy(nn.Module):
         self.norm = nn.LayerNorm(sizes.hidden)
         self.head = nn.Linear(sizes.hidden, sizes.action)
 
-    def forward(self, index, observations, before, previous, steps):
-        """Computes actions [steps, A]: the last so many `steps` of normalised observations [T, O] are the plan's own, `before` rows are its
+    def forward(self, plan, observations, before, previous, steps):
+        """Computes actions [steps, A] under a plan, its index or the vector [D]: the last so many `steps` of normalised observations [T, O] are the plan's own, `before` rows are its
         window; previous [T, A] are the actions executed before each observation."""
         pairs = torch.stack([self.embed_action(previous), self.embed_observation(observations)], 1)
         places = torch.cat([torch.arange(before), self.window + torch.arange(steps)])
         pairs = pairs[-(before + steps) :] + self.embed_position.weight[places][:, None]
-        tokens = torch.cat([self.embed_option.weight[index][None], pairs.flatten(0, 1)])
+        tokens = torch.cat([self.embedded(plan)[None], pairs.flatten(0, 1)])
         return self.head(run_blocks(self, tokens[None])[0][2 + 2 * before :: 2])
+
+    def embedded(self, plan):
+        return self.embed_option(plan) if self.embeds else self.embed_option.weight[plan]
+
+    @property
+    def embeds(self):
+        """Whether a plan is a vector, which a layer embeds."""
+        return isinstance(self.embed_option, nn.Linear)
 
     @torch.no_grad()
     def with_table(self, options):
@@ -84,8 +93,13 @@ def _transformer(entry, policy, x, new, record_only=False):
 
 def _plan(graph, policy):
     entry = graphs.Entry(graph, f"{LEVEL}/plan")
-    index = entry.input("index", [1], TensorProto.INT64)
-    x = option_token(entry, entry.weight(f"{LEVEL}.embed_option", policy.embed_option.weight), index)
+    if policy.embeds:
+        plan, weights = entry.input("plan", [1, policy.embed_option.in_features]), f"{LEVEL}.embed_option"
+        row = entry.gemm(plan, entry.weight(f"{weights}.weight", policy.embed_option.weight), entry.weight(f"{weights}.bias", policy.embed_option.bias), "option_row")
+        x = entry.op("Unsqueeze", [row, entry.integers("axis_one", [1])], "option_token")
+    else:
+        index = entry.input("index", [1], TensorProto.INT64)
+        x = option_token(entry, entry.weight(f"{LEVEL}.embed_option", policy.embed_option.weight), index)
     _transformer(entry, policy, x, 1, record_only=True)
 
 
@@ -140,16 +154,13 @@ def build(policy, sizes, low_level_sizes=None):
     return graph.model("history")
 
 
+def recall(sizes):
+    """Makes what the contract says of the low level."""
+    return {"window": sizes.window, "memory": {"dim": 2 * sizes.hidden}, "low_level": sizes.low_level_network}
+
+
 def family(sizes, decision):
-    return {
-        "kind": "history",
-        "horizon": sizes.horizon,
-        "codebook": sizes.codebook,
-        "decision": decision,
-        "window": sizes.window,
-        "memory": {"dim": 2 * sizes.hidden},
-        "low_level": sizes.low_level_network,
-    }
+    return {"kind": "history", "horizon": sizes.horizon, "codebook": sizes.codebook, "decision": decision, **recall(sizes)}
 
 
 def contract(sizes, seed):

@@ -1,11 +1,13 @@
-"""Kind `vae`: the high level gives the mean and the deviation of a continuous plan, the low level is an MLP on observation and plan."""
+"""Kind `vae`: the high level gives the mean and the deviation of a continuous plan, the low level is an MLP on observation and plan.
+
+`vae_history` has the low level of `history` instead."""
 
 import torch
 from torch import nn
 
 from .. import config, graphs
 from ..model import LowLevelPolicy, Normalizer, TrajectoryEncoder
-from . import common
+from . import common, history
 
 LOG_STD = (-10.0, 2.0)
 
@@ -50,7 +52,9 @@ def _sample(graph, dim):
     entry.output("plan", [1, dim])
 
 
-def build(policy, sizes):
+def build(policy, sizes, low_level_sizes=None):
+    """Builds all entries; with sizes of its own the low level is one that remembers, and the trajectory encoder, which reads features that
+    nobody outside has, is left out."""
     graph = common.graph_of(policy, sizes)
     mean, log_std = (_half(policy.high_level.head, part) for part in (0, 1))
     for first in (True, False):
@@ -61,13 +65,36 @@ def build(policy, sizes):
         entry.op("Clip", [wide, low, high], "plan_log_std")
         entry.output("plan_log_std", [1, sizes.plan])
     _sample(graph, sizes.plan)
-    graphs.low_level_act(graph, policy.low_level, policy.normalizer)
-    graphs.trajectory_encode(graph, policy.encoder, None, policy.normalizer, sizes.horizon)
+    if low_level_sizes:
+        history.add_low_level(graph, policy.low_level, policy.normalizer, low_level_sizes)
+    else:
+        graphs.low_level_act(graph, policy.low_level, policy.normalizer)
+        graphs.trajectory_encode(graph, policy.encoder, None, policy.normalizer, sizes.horizon)
     return graph.model("vae")
+
+
+class VaeHistory(Vae):
+    """The same with a low level that attends to a window of earlier steps."""
+
+    def __init__(self, sizes):
+        super().__init__(sizes)
+        self.low_level = history.HistoryPolicy(sizes, nn.Linear(sizes.plan, sizes.hidden))
+
+
+def build_history(policy, sizes):
+    return build(policy, sizes, sizes)
 
 
 def family(sizes, rule, seed):
     return {"kind": "vae", "horizon": sizes.horizon, "plan": {"dim": sizes.plan}, "decision": {"rule": rule, "seed": seed}}
+
+
+def family_history(sizes, rule, seed):
+    return family(sizes, rule, seed) | {"history": history.recall(sizes)}
+
+
+def contract_history(sizes, seed):
+    return common.contract(family_history(sizes, "sample", seed), sizes, seed, noise=[sizes.plan])
 
 
 def contract(sizes, seed):

@@ -104,10 +104,7 @@ class Training(lads.Training):
     def loss(self, stage, step):
         generator = self.generator(stage, step)
         if stage == "low_level":
-            episodes, steps, starts = self.corpus.draw_transitions(self.settings(self.config, stage).batch, generator)
-            plans = sample(self.known[episodes, starts])
-            bc = F.mse_loss(self.networks.low_level(self.corpus.shown(episodes, steps), plans), self.corpus.actions[episodes, steps])
-            return self.config.training.bc_weight * bc, {"bc": bc}
+            return self._low_level_loss(generator)
         if stage == "high_level":
             episodes = self.draw_alike(stage, step)
             ce = self.high_level(episodes, self.known, self._decisions(self.contexts.places(episodes)))
@@ -123,9 +120,15 @@ class Training(lads.Training):
             total = total + parts["ce"]
         return total, parts
 
+    def _low_level_loss(self, generator):
+        episodes, steps, starts = self.corpus.draw_transitions(self.settings(self.config, "low_level").batch, generator)
+        plans = sample(self.known[episodes, starts])
+        bc = F.mse_loss(self.networks.low_level(self.corpus.shown(episodes, steps), plans), self.corpus.actions[episodes, steps])
+        return self.config.training.bc_weight * bc, {"bc": bc}
+
     def finish(self, stage):
         if stage in ("joint", "low_level"):
-            base.gain(self.networks.low_level.last, self.config.low_level.gain)
+            base.gain(self.actions_layer(), self.config.low_level.gain)
 
     @torch.no_grad()
     def validate(self, stage):

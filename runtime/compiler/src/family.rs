@@ -13,6 +13,7 @@ pub mod lang_dt;
 pub mod lcsd;
 pub mod lisa;
 pub mod plain;
+pub mod recall;
 pub mod skilldiffuser;
 pub mod vae;
 

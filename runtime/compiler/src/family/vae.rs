@@ -1,11 +1,13 @@
 //! VAE, and LADS with a VAE: the plan is a vector, the mean of the high level's distribution or a
 //! draw from it.
 //!
-//! Where the contract says `features`, an encoder runs first in every step, and both levels read what it gives instead.
+//! Where the contract says `features`, an encoder runs first in every step, and both levels read what it gives instead. Where it says
+//! `history`, the low level attends to a window of earlier steps, as that of family `history` does.
 
 use lads_image::records::{Event, NoiseRule};
 use serde::Deserialize;
 
+use super::recall::Recall;
 use super::{Blueprint, Call, Entry, Kind, Noise, instructed, lengths, one_noise};
 use crate::contract::Contract;
 
@@ -49,6 +51,9 @@ pub struct Vae {
     /// they read the observations themselves.
     #[serde(default)]
     pub features: Option<usize>,
+    /// Sizes of a low level that remembers; without it that is a function of observation and plan.
+    #[serde(default)]
+    pub history: Option<Recall>,
 }
 
 impl Kind for Vae {
@@ -72,6 +77,7 @@ impl Kind for Vae {
             ("plan.dim", self.plan.dim),
             ("features", self.features.unwrap_or(1)),
         ])?;
+        self.history.map_or(Ok(()), Recall::check)?;
         one_noise(contract)?;
         instructed(contract)
     }
@@ -79,8 +85,12 @@ impl Kind for Vae {
     fn blueprint(&self, contract: &Contract) -> Blueprint {
         let (start, step, record) = ("high_level/start", "high_level/step", "high_level/record");
         let plan = ["plan_mean", "plan_log_std"];
-        Blueprint::observed(self.features, &[Event::Step])
-            .kv("context", contract.network)
+        let mut blueprint =
+            Blueprint::observed(self.features, &[Event::Step]).kv("context", contract.network);
+        if let Some(recall) = self.history {
+            blueprint = recall.states(blueprint);
+        }
+        blueprint = blueprint
             .plain("plan")
             .wide(self.plan.dim, "family.plan.dim")
             .handed("plan_mean")
@@ -88,8 +98,12 @@ impl Kind for Vae {
             .entry(Entry::new(start, &plan).cache("context").acts())
             .entry(Entry::new(step, &plan).cache("context").acts())
             .entry(Entry::variant(record, step, &[]).cache("context").acts())
-            .entry(Entry::new("plan/sample", &["plan"]).acts())
-            .entry(Entry::new("low_level/act", &["action"]).acts())
+            .entry(Entry::new("plan/sample", &["plan"]).acts());
+        blueprint = match self.history {
+            Some(_) => Recall::entries(blueprint),
+            None => blueprint.entry(Entry::new("low_level/act", &["action"]).acts()),
+        };
+        blueprint = blueprint
             .entry(
                 Entry::new("high_level/instruct", &[])
                     .cache("context")
@@ -99,7 +113,12 @@ impl Kind for Vae {
             .call(Call::step(start).first())
             .call(Call::step(step).every(self.horizon).otherwise())
             .call(Call::step(record).otherwise())
-            .call(Call::step("plan/sample").every(self.horizon))
-            .call(Call::step("low_level/act"))
+            .call(Call::step("plan/sample").every(self.horizon));
+        if self.history.is_none() {
+            return blueprint.call(Call::step("low_level/act"));
+        }
+        blueprint = Recall::calls(blueprint, self.horizon);
+        blueprint.period = self.horizon;
+        blueprint
     }
 }
