@@ -3,8 +3,8 @@
 # usage: runtime/ffi/archive.sh <output file> [<target>]
 # LADS_OPS says which groups of operations a policy needs; without it all are in, and every image runs. It is a list of features of
 # the crate lads-ffi, separated by commas (Cargo.toml names them); an image that needs what was left out is refused when it is opened:
-#     LADS_OPS=lads runtime/ffi/archive.sh build/liblads.a                   the family of the shipped policies
-#     LADS_OPS=lads,integer-weights,half-cache runtime/ffi/archive.sh ...    the same with weights of 16 and 8 bits and a cache of 16
+#     LADS_OPS=lads runtime/ffi/archive.sh build/liblads.a                   the family of the shipped policies, as images with 32 bits
+#     LADS_OPS=lads,integer-weights,integer-cache runtime/ffi/archive.sh ... the same with weights of 16 and 8 bits and a cache of 8, as the kitchen is tuned
 # Needs cargo and binutils; for another target set LD, OBJCOPY, AR and NM to its tools, and CARGO_FLAGS to what cargo needs for it.
 set -eu
 output=$1

@@ -152,6 +152,11 @@ fn a_cache_goes_on_where_it_stopped_and_is_the_same() {
     assert_eq!(make("longer", 1, &go).unwrap().done, states.len());
     assert_eq!(std::fs::read(path("longer")).unwrap(), whole);
 
+    // A finished file would take a link's place.
+    std::os::unix::fs::symlink(path("nowhere"), path("link")).unwrap();
+    assert!(matches!(make("link", 1, &go), Err(CacheError::Io { .. })));
+    assert!(path("link").is_symlink());
+
     let other = Rendering {
         samples: 0,
         ..rendering.clone()

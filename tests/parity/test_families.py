@@ -4,13 +4,14 @@ twin of the schedule, and the ignored tests of `lads-tests` on them (`families`,
 Skipped where the exporter's environment or cargo is missing.
 """
 
+import dataclasses
 import os
 import re
 import shutil
 import subprocess
 
 import pytest
-from programs import ROOT, SELECTION
+from programs import ROOT, SELECTION, newest
 
 pytest.importorskip("onnxruntime")
 pytest.importorskip("lads_exporter.episode")
@@ -58,6 +59,17 @@ def test_edited_images_and_bundles(families):
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     scripts = dict(re.findall(r"(image|bundle): \d+ kept scripts, (\d+) generated ones", done.stdout))
     assert min(map(int, scripts.values())) > 100 and len(scripts) == 2
+
+
+@pytest.mark.parametrize("kind", ["lads", "lisa", "vae", "history", "vae_history", "frozen_lisa"])
+def test_plans_of_one_step(kind, tmp_path, monkeypatch):
+    """Tests that a policy that decides at every step replays: entries for later steps under a plan never run."""
+    known = kinds.KINDS[kind]
+    monkeypatch.setitem(kinds.KINDS, kind, dataclasses.replace(known, sizes=dataclasses.replace(known.sizes, horizon=1)))
+    _, model = kinds.export(kind, seed=0)
+    bundle.save(model, tmp_path / "one.onnx")
+    done = subprocess.run([newest("lads"), "self-test", tmp_path / "one.onnx"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_instruction_counts(families):

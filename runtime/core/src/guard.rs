@@ -51,8 +51,10 @@ pub struct GuardConfig<'c> {
     /// Number of periods in a row without a usable observation in which the last action is repeated
     /// and the policy's state is kept before the fallback takes over; 0 for none.
     pub coast: u32,
-    /// Largest step from the last timestamp to the next, in its unit; 0 for any. A timestamp
-    /// further ahead is refused, and does not become the last one.
+    /// Largest step from the last timestamp to the next, in its unit; 0 for any, so that one
+    /// damaged timestamp makes all later ones stale until a reset. A timestamp further ahead is
+    /// refused, and does not become the last one. Of the first two of an episode either may be the
+    /// damaged one: the next timestamp is measured from the second.
     pub max_jump: u64,
     /// Number of interventions in a row after which the guard stops; 0 for never.
     pub stop_after: u32,

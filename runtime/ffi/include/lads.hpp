@@ -160,23 +160,28 @@ public:
     Controller &operator=(const Controller &) = delete;
     ~Controller() { release(); }
 
-    /** Allocates a workspace and sets the controller up in it. */
+    /** Allocates a workspace and sets the controller up in it; if that is refused, what ran before runs on. */
     Status allocate(const Policy &policy, const lads_options &options = made<lads_options>(),
                     lads_report *report = nullptr) noexcept {
         const std::size_t bytes = policy.workspace_bytes();
         if (bytes == 0) {
             return LADS_STATUS_NOT_SET_UP;
         }
-        release();
-        owned_ = ::operator new(bytes, alignment, std::nothrow);
-        return owned_ == nullptr ? Status(LADS_STATUS_WORKSPACE_TOO_SMALL) : init(policy, owned_, bytes, options, report);
+        void *const owned = ::operator new(bytes, alignment, std::nothrow);
+        if (owned == nullptr) {
+            return LADS_STATUS_WORKSPACE_TOO_SMALL;
+        }
+        const Status status = init(policy, owned, owned, bytes, options, report);
+        if (!status) {
+            ::operator delete(owned, alignment, std::nothrow);
+        }
+        return status;
     }
 
-    /** Sets the controller up in lent memory, aligned to LADS_WORKSPACE_ALIGN, which has to outlive it. */
+    /** Sets the controller up in lent memory, aligned to LADS_WORKSPACE_ALIGN, which has to outlive it; if that is refused, what ran before runs on. */
     Status use(const Policy &policy, void *workspace, std::size_t bytes, const lads_options &options = made<lads_options>(),
                lads_report *report = nullptr) noexcept {
-        release();
-        return init(policy, workspace, bytes, options, report);
+        return init(policy, nullptr, workspace, bytes, options, report);
     }
 
     /** Replays the recorded episode, and arms if it passes. */
@@ -247,10 +252,17 @@ public:
 private:
     static constexpr std::align_val_t alignment{LADS_WORKSPACE_ALIGN};
 
-    Status init(const Policy &policy, void *workspace, std::size_t bytes, const lads_options &options,
+    /** What runs is given up only for what has been set up; `owned` is the workspace, or null where it is lent. */
+    Status init(const Policy &policy, void *owned, void *workspace, std::size_t bytes, const lads_options &options,
                 lads_report *report) noexcept {
-        const Status status = lads_controller_init(policy.get(), workspace, bytes, &options, &controller_, report);
-        policy_ = status ? &policy : nullptr;
+        decltype(controller_) made = nullptr;
+        const Status status = lads_controller_init(policy.get(), workspace, bytes, &options, &made, report);
+        if (status) {
+            release();
+            controller_ = made;
+            owned_ = owned;
+            policy_ = &policy;
+        }
         return status;
     }
 

@@ -326,10 +326,16 @@ fn check(graph: &GraphProto, problems: &mut Problems) {
             );
         }
     }
-    for tensor in &graph.initializer {
+    let weights = graph.initializer.iter().map(|it| (it.name.as_str(), it));
+    let constants = graph.node.iter().flat_map(|node| {
+        let name = node.output.first().map_or("", String::as_str);
+        let values = node.attribute.iter().filter_map(|it| it.t.as_ref());
+        values.map(move |it| (name, it))
+    });
+    for (name, tensor) in weights.chain(constants) {
         if !finite(tensor) {
             problems.add(
-                format!("weight `{}`", tensor.name),
+                format!("weight `{name}`"),
                 "holds a value that is not a finite number; the training has diverged, export an earlier checkpoint",
             );
         }
@@ -386,12 +392,23 @@ fn finite(tensor: &TensorProto) -> bool {
                 .chain(tensor.float_data.iter().copied())
                 .all(f32::is_finite)
         }
-        // All ones in the exponent.
-        data_type::FLOAT16 => {
-            let words = raw.as_chunks::<2>().0.iter();
+        data_type::DOUBLE => {
+            let words = raw.as_chunks::<8>().0.iter();
             words
-                .map(|&word| u16::from_le_bytes(word))
-                .all(|half| half & 0x7c00 != 0x7c00)
+                .map(|&word| f64::from_le_bytes(word))
+                .chain(tensor.double_data.iter().copied())
+                .all(f64::is_finite)
+        }
+        data_type::FLOAT16 | data_type::BFLOAT16 => {
+            // All ones there: infinite, or not a number.
+            let exponent = match tensor.data_type {
+                data_type::FLOAT16 => 0x7c00,
+                _ => 0x7f80,
+            };
+            let words = raw.as_chunks::<2>().0.iter();
+            let words = words.map(|&word| u16::from_le_bytes(word));
+            let mut halves = words.chain(tensor.int32_data.iter().map(|&word| word as u16));
+            halves.all(|half| half & exponent != exponent)
         }
         _ => true,
     }

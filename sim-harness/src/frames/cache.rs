@@ -147,6 +147,11 @@ pub fn make(
     let head = head(states, rendering);
     let all = states.len();
     let part = PathBuf::from(format!("{}.part", path.display()));
+    // It is replaced by the finished file: a link would be lost, and a device or FIFO has no beginning to read.
+    if std::fs::symlink_metadata(path).is_ok_and(|found| !found.is_file()) {
+        let kind = io::Error::new(io::ErrorKind::InvalidInput, "it is no regular file");
+        return Err(io_error(path)(kind));
+    }
     if path.exists() {
         let begun = begins_with(path, &head).map_err(io_error(path))?;
         let found = std::fs::metadata(path).map_err(io_error(path))?.len();

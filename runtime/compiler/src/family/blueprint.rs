@@ -352,6 +352,12 @@ impl Blueprint {
                 }
             }
         });
+        // An entry that never runs, such as a later step under plans of one, is compiled all the same.
+        for entry in &self.entries {
+            if let Some(cache) = entry.cache.as_deref().and_then(index) {
+                most[cache] = most[cache].max(tokens(entry));
+            }
+        }
         most
     }
 

@@ -43,6 +43,8 @@ pub struct GuardedController<'a, 'm> {
     /// Number of periods in a row in which the last action was repeated.
     coasted: u32,
     timestamp: Option<u64>,
+    /// Whether a second timestamp has followed on that one: before, either of two that do not fit may be the damaged one.
+    confirmed: bool,
     counters: Counters,
 }
 
@@ -76,6 +78,7 @@ impl<'a, 'm> GuardedController<'a, 'm> {
             in_a_row: 0,
             coasted: 0,
             timestamp: None,
+            confirmed: false,
             counters: Counters::default(),
         })
     }
@@ -142,7 +145,7 @@ impl<'a, 'm> GuardedController<'a, 'm> {
     /// stop.
     pub fn reset(&mut self) {
         self.controller.reset();
-        self.timestamp = None;
+        (self.timestamp, self.confirmed) = (None, false);
         self.coasted = 0;
     }
 
@@ -184,7 +187,7 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         self.stopped = running.stopped;
         self.in_a_row = running.in_a_row;
         self.coasted = running.coasted;
-        self.timestamp = running.timestamp;
+        (self.timestamp, self.confirmed) = (running.timestamp, running.confirmed);
         self.counters = running.counters;
         Ok(())
     }
@@ -266,14 +269,19 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         let missed = tick.map_or(0, |tick| tick.missed);
         self.counters.missed = self.counters.missed.saturating_add(u64::from(missed));
         let last = self.timestamp;
-        let jumps = tick.zip(last).is_some_and(|(tick, last)| {
-            self.max_jump > 0 && tick.timestamp.saturating_sub(last) > self.max_jump
+        let between = tick.zip(last).map(|(tick, last)| match self.confirmed {
+            true => tick.timestamp.saturating_sub(last),
+            false => tick.timestamp.abs_diff(last),
         });
+        let jumps = self.max_jump > 0 && between.is_some_and(|between| between > self.max_jump);
         let stale = tick
             .zip(last)
             .is_some_and(|(tick, last)| tick.timestamp <= last);
         if !jumps {
             self.timestamp = last.max(tick.map(|tick| tick.timestamp));
+            self.confirmed |= between.is_some_and(|between| between > 0) && !stale;
+        } else if !self.confirmed {
+            self.timestamp = tick.map(|tick| tick.timestamp);
         }
         if !self.armed {
             Err(Intervention::NotArmed)

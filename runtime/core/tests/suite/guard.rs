@@ -316,6 +316,21 @@ fn one_damaged_timestamp_is_refused_itself() {
         [None, None, Some(Intervention::Jump), None, None, None, None]
     );
     assert_eq!((counters.policy, counters.stale), (6, 1));
+    // The first timestamp of an episode may be the damaged one, whichever way.
+    for first in [u64::MAX, 0] {
+        let config = GuardConfig {
+            fallback: Fallback::Hold,
+            max_jump: 200,
+            ..GuardConfig::default()
+        };
+        let seen = ready(&config, |guarded| {
+            [first, 100_000, 100_080, 100_080, 100_160].map(|timestamp| {
+                let report = guarded.step(&[0.0; 3], tick(timestamp), &mut [0.0; 2]);
+                report.expect("the action has two elements").intervention
+            })
+        });
+        assert_eq!(seen, [None, Some(Intervention::Jump), None, stale, None]);
+    }
     // The bound itself is not a jump.
     let (seen, _) = run(80);
     assert_eq!(
@@ -356,7 +371,7 @@ fn a_few_missing_observations_are_coasted_over() {
             assert!(!report.coasting && report.intervention.is_none());
             assert_eq!(action, last);
         }
-        let [first, damaged, old] = [10, 1000, 5].map(|timestamp| {
+        let [_, first, damaged, old] = [9, 10, 1000, 5].map(|timestamp| {
             let tick = Some(Tick {
                 timestamp,
                 missed: 0,

@@ -73,6 +73,7 @@ int main(int count, char **arguments) {
     options.fallback = LADS_FALLBACK_DECAY;
     options.decay_s = 0.2F;
     options.coast = 2;
+    options.max_jump = 10; /* periods: further ahead, and a timestamp is damaged */
     options.max_rate = rates;
     if ((status = load(arguments[1], &options, &stand)) != LADS_STATUS_OK) {
         return refuse(arguments[1], status);

@@ -159,7 +159,8 @@ int main(int count, char **arguments) {
                                   .decay_s = 2 * contract.control_period_s,
                                   .late_after = 1,
                                   .coast = 1,
-                                  .stop_after = 25};
+                                  .stop_after = 25,
+                                  .max_jump = 10}; /* periods: further ahead, and a timestamp is damaged */
     const size_t workspace_bytes = lads_workspace_bytes(&policy);
     void *workspace = lines(workspace_bytes);
     if (data == NULL || workspace == NULL) {

@@ -65,6 +65,7 @@ public:
         options.decay_s = parameters.decay_s;
         options.late_after = 2;
         options.stop_after = 50;
+        options.max_jump = static_cast<std::uint64_t>(1e10 * contract.control_period_s); // ten periods in ns
         options.max_rate = parameters.max_rate > 0.0F ? rates.data() : nullptr;
         if (auto status = controller_.allocate(policy_, options, &report_); !status) {
             return failed("controller", status);

@@ -51,6 +51,8 @@ fn run() -> Result<(), Box<dyn Error>> {
             time_constant_s: 2.0 * contract.control_period_s(),
         },
         late_after: 2,
+        // Ten periods, in nanoseconds: further ahead, and a timestamp is damaged.
+        max_jump: (1e10 * contract.control_period_s()) as u64,
         ..GuardConfig::default()
     };
     let mut controller = GuardedController::new(controller, &config, &mut guard)?;

@@ -299,6 +299,7 @@ fn coasting_and_jumps_are_options() {
         let status = unsafe { lads_step(c, o, 3, &raw const tick, a, 2, &raw mut report) };
         (status, report.coasting, action)
     };
+    assert_eq!(at(5).0, Status::Ok);
     let (status, coasting, last) = at(10);
     assert_eq!((status, coasting), (Status::Ok, 0));
     assert_eq!(at(u64::MAX), (Status::Jump, 1, last));

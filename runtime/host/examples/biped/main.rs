@@ -56,6 +56,8 @@ fn run() -> Result<(), Box<dyn Error>> {
             time_constant_s: 0.2,
         },
         coast: 2,
+        // Periods: further ahead, and a timestamp is damaged.
+        max_jump: 10,
         limits: Limits {
             max_rate: Some(&rates),
             ..Limits::default()

@@ -41,6 +41,12 @@ int main(int count, char **arguments) {
         std::fprintf(stderr, "self-test: %s\n", status.text());
         return 1;
     }
+    // A set-up that is refused leaves what runs alone.
+    auto wrong_options = options;
+    wrong_options.flags |= 1U << 20;
+    if (controller.allocate(policy, wrong_options) || controller.use(policy, nullptr, 0) || controller.get() == nullptr) {
+        return 10;
+    }
     auto known = lads::made<lads_instruction>();
     if (!policy.instruction(0, known) || !controller.set_instruction(lads::view(known.id)) ||
         controller.set_instruction("make tea") != LADS_STATUS_UNKNOWN_INSTRUCTION) {
