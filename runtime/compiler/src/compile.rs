@@ -84,7 +84,11 @@ pub fn compile_with(bundle: &Bundle, options: &Options) -> Result<Image, Compile
     let (mut made, mut programs) = (vec![], vec![]);
     // In the order of the blueprint: whole matrices come before the parts of them that other programs need, and what runs in every
     // control step comes first.
+    let idle = blueprint.idle(contract);
     for (index, entry) in blueprint.entries.iter().enumerate() {
+        if idle.contains(&entry.name) {
+            continue;
+        }
         let Some(fused) = fused(&model, &signatures, &blueprint, entry)? else {
             continue;
         };

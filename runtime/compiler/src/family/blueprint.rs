@@ -352,13 +352,17 @@ impl Blueprint {
                 }
             }
         });
-        // An entry that never runs, such as a later step under plans of one, is compiled all the same.
-        for entry in &self.entries {
-            if let Some(cache) = entry.cache.as_deref().and_then(index) {
-                most[cache] = most[cache].max(tokens(entry));
-            }
-        }
         most
+    }
+
+    /// Returns the entries with a cache that never run, such as later steps under plans of one: they have no rows there.
+    pub fn idle(&self, contract: &Contract) -> Vec<String> {
+        let cached = self.entries.iter().filter(|entry| entry.cache.is_some());
+        let mut idle: Vec<String> = cached.map(|entry| entry.name.clone()).collect();
+        self.walk(contract, |_, entry, _| {
+            idle.retain(|name| *name != entry.name)
+        });
+        idle
     }
 
     /// Walks an instruction and all control steps of a context, or one period without a context,
