@@ -326,14 +326,16 @@ fn check(graph: &GraphProto, problems: &mut Problems) {
             );
         }
     }
-    let weights = graph.initializer.iter().map(|it| (it.name.as_str(), it));
+    // Constants of nodes may be infinite, as in masks.
+    let weights = graph.initializer.iter();
+    let weights = weights.map(|it| (it.name.as_str(), it, false));
     let constants = graph.node.iter().flat_map(|node| {
         let name = node.output.first().map_or("", String::as_str);
         let values = node.attribute.iter().filter_map(|it| it.t.as_ref());
-        values.map(move |it| (name, it))
+        values.map(move |it| (name, it, true))
     });
-    for (name, tensor) in weights.chain(constants) {
-        if !finite(tensor) {
+    for (name, tensor, may_be_infinite) in weights.chain(constants) {
+        if !numbers(tensor, may_be_infinite) {
             problems.add(
                 format!("weight `{name}`"),
                 "holds a value that is not a finite number; the training has diverged, export an earlier checkpoint",
@@ -382,34 +384,72 @@ fn check(graph: &GraphProto, problems: &mut Problems) {
     }
 }
 
-fn finite(tensor: &TensorProto) -> bool {
+/// Whether a tensor holds numbers, which are finite unless they may not be.
+fn numbers(tensor: &TensorProto, may_be_infinite: bool) -> bool {
     let raw = &tensor.raw_data;
+    let sound = |x: f64| x.is_finite() || may_be_infinite && !x.is_nan();
     match tensor.data_type {
         data_type::FLOAT => {
             let words = raw.as_chunks::<4>().0.iter();
-            words
-                .map(|&word| f32::from_le_bytes(word))
-                .chain(tensor.float_data.iter().copied())
-                .all(f32::is_finite)
+            let words = words.map(|&word| f32::from_le_bytes(word));
+            let mut all = words.chain(tensor.float_data.iter().copied());
+            all.all(|x| sound(f64::from(x)))
         }
         data_type::DOUBLE => {
             let words = raw.as_chunks::<8>().0.iter();
-            words
-                .map(|&word| f64::from_le_bytes(word))
-                .chain(tensor.double_data.iter().copied())
-                .all(f64::is_finite)
+            let words = words.map(|&word| f64::from_le_bytes(word));
+            words.chain(tensor.double_data.iter().copied()).all(sound)
         }
         data_type::FLOAT16 | data_type::BFLOAT16 => {
-            // All ones there: infinite, or not a number.
-            let exponent = match tensor.data_type {
-                data_type::FLOAT16 => 0x7c00,
-                _ => 0x7f80,
+            // All ones in the exponent: infinite, or with other bits not a number.
+            let (exponent, fraction) = match tensor.data_type {
+                data_type::FLOAT16 => (0x7c00, 0x03ff),
+                _ => (0x7f80, 0x007f),
             };
             let words = raw.as_chunks::<2>().0.iter();
             let words = words.map(|&word| u16::from_le_bytes(word));
             let mut halves = words.chain(tensor.int32_data.iter().map(|&word| word as u16));
-            halves.all(|half| half & exponent != exponent)
+            halves
+                .all(|half| half & exponent != exponent || may_be_infinite && half & fraction == 0)
         }
         _ => true,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_no_number_is_seen_in_every_type() {
+        let raw = |data_type, bytes: &[u8]| TensorProto {
+            data_type,
+            raw_data: bytes.to_vec().into(),
+            ..TensorProto::default()
+        };
+        let halves = |data_type, word: u16| TensorProto {
+            data_type,
+            int32_data: vec![0, i32::from(word)],
+            ..TensorProto::default()
+        };
+        let float = |x: f32| raw(data_type::FLOAT, &x.to_le_bytes());
+        assert!(numbers(&float(1.0), false) && numbers(&float(f32::INFINITY), true));
+        assert!(!numbers(&float(f32::INFINITY), false) && !numbers(&float(f32::NAN), true));
+        let double = |x: f64| raw(data_type::DOUBLE, &x.to_le_bytes());
+        assert!(numbers(&double(1.0), false) && numbers(&double(f64::INFINITY), true));
+        assert!(!numbers(&double(f64::INFINITY), false) && !numbers(&double(f64::NAN), true));
+        for (kind, infinite, nan) in [
+            (data_type::FLOAT16, 0x7c00_u16, 0x7e00),
+            (data_type::BFLOAT16, 0x7f80, 0x7fc0),
+        ] {
+            for of in [halves, |kind, word: u16| TensorProto {
+                data_type: kind,
+                raw_data: word.to_le_bytes().to_vec().into(),
+                ..TensorProto::default()
+            }] {
+                assert!(numbers(&of(kind, 0x3c00), false) && numbers(&of(kind, infinite), true));
+                assert!(!numbers(&of(kind, infinite), false) && !numbers(&of(kind, nan), true));
+            }
+        }
     }
 }

@@ -113,9 +113,11 @@ def test_what_does_not_fit_is_named(plain, arguments, text):
         ("MountainCar-v0", environments.first_high),
         ("MountainCarContinuous-v0", lambda action: action[:1]),
         ("Pendulum-v1", lambda action: 2 * action[:1]),
+        ("InvertedPendulum-v5", lambda action: action[:1]),
+        ("Reacher-v5", lambda action: action[:2]),
     ],
 )
-def test_classic_environments(plain, name, action):
+def test_environments_of_gymnasium(plain, name, action):
     found = gym.evaluate(plain.controller(), lambda: gymnasium.make(name), episodes=3, observation=environments.fill, action=action)
     assert len(found.episodes) == 3 and found.success is None
     again = gym.evaluate(plain.controller(), lambda: gymnasium.make(name), episodes=3, observation=environments.fill, action=action, processes=2)

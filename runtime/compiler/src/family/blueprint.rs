@@ -360,7 +360,7 @@ impl Blueprint {
         let cached = self.entries.iter().filter(|entry| entry.cache.is_some());
         let mut idle: Vec<String> = cached.map(|entry| entry.name.clone()).collect();
         self.walk(contract, |_, entry, _| {
-            idle.retain(|name| *name != entry.name)
+            idle.retain(|name| *name != entry.name);
         });
         idle
     }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use lads_image::op::{BinaryKind, ReduceKind};
 
 use super::{Dim, Graph, Id, Kind, MAX_FOLDING, Op, Type, Unary, cost, fold, show};
-use crate::tensor::{MAX_RANK, Tensor, elements};
+use crate::tensor::{MAX_ELEMENTS, MAX_RANK, Tensor, elements};
 
 /// A node, or the reason why its operands do not fit.
 type Built = Result<Id, String>;
@@ -67,10 +67,17 @@ impl Graph {
             .map(|&id| self.constant(id).cloned())
             .collect();
         let known: Option<Vec<usize>> = shape.iter().map(|dim| dim.known()).collect();
+        // Before anything of that size is computed.
+        if known
+            .as_ref()
+            .is_some_and(|known| elements(known).is_none())
+        {
+            return Err(format!(
+                "gives {}, more than {MAX_ELEMENTS} elements",
+                show(&shape)
+            ));
+        }
         if let (Some(operands), Some(known)) = (operands, known) {
-            if elements(&known).is_none() {
-                return Err(format!("the constant {} is too large", show(&shape)));
-            }
             self.folded = self.folded.saturating_add(cost(&op, &operands, &known));
             if self.folded > MAX_FOLDING {
                 return Err(format!(

@@ -269,9 +269,12 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         let missed = tick.map_or(0, |tick| tick.missed);
         self.counters.missed = self.counters.missed.saturating_add(u64::from(missed));
         let last = self.timestamp;
-        let between = tick.zip(last).map(|(tick, last)| match self.confirmed {
-            true => tick.timestamp.saturating_sub(last),
-            false => tick.timestamp.abs_diff(last),
+        let between = tick.zip(last).map(|(tick, last)| {
+            if self.confirmed {
+                tick.timestamp.saturating_sub(last)
+            } else {
+                tick.timestamp.abs_diff(last)
+            }
         });
         let jumps = self.max_jump > 0 && between.is_some_and(|between| between > self.max_jump);
         let stale = tick
