@@ -88,20 +88,72 @@ pub(crate) fn deploy(text: &str, source: &str, problems: &mut Problems) -> Said 
         }
     }
     let rows = used("observations").map_or(&[][..], Value::pairs);
-    robot.terms = rows
-        .iter()
-        .map(|(name, row)| term(name, row, &commands, &mut refuse))
-        .collect();
-    let longest = robot.terms.iter().filter_map(|term| term.history).max();
-    if longest.is_some_and(|length| length > 1) {
-        robot.history = Some(History {
-            length: None,
-            layout: Some(Layout::Term),
-            order: Some(Order::OldestFirst),
-            start: Some(Start::First),
-        });
+    if rows.iter().any(|(_, row)| is_group(row)) {
+        // Each is an input of the graph, by its name.
+        for (input, row) in rows {
+            let (mut terms, history) = group(row.pairs(), &commands, &mut refuse);
+            for term in &mut terms {
+                term.input = Some(input.clone());
+            }
+            robot.terms.extend(terms);
+            robot.input.entry(input.clone()).or_default().history = history;
+        }
+    } else {
+        (robot.terms, robot.history) = group(rows, &commands, &mut refuse);
     }
     said
+}
+
+/// Switches of a group, which stand among its terms.
+const TIME_MAJOR: &str = "use_gym_history";
+const SCALE_FIRST: &str = "scale_first";
+
+/// Returns whether a row of the observations holds terms, and is none itself.
+fn is_group(row: &Value) -> bool {
+    let is_term = |(name, value): &(String, Value)| name != "params" && !value.pairs().is_empty();
+    row.pairs().iter().any(is_term)
+}
+
+/// Reads the terms that one input of the graph is made of, and how their history lies there.
+fn group(
+    rows: &[(String, Value)],
+    commands: &Value,
+    refuse: &mut impl FnMut(&str, &str),
+) -> (Vec<Term>, Option<History>) {
+    let switch = |name: &str| {
+        rows.iter()
+            .any(|row| *row == (name.to_owned(), Value::Bool(true)))
+    };
+    let scale_first = switch(SCALE_FIRST);
+    let rows_of_terms = rows
+        .iter()
+        .filter(|(name, _)| ![TIME_MAJOR, SCALE_FIRST].contains(&name.as_str()));
+    let mut terms = vec![];
+    for (name, row) in rows_of_terms {
+        let term = term(name, row, commands, refuse);
+        let first = row
+            .get(SCALE_FIRST)
+            .map_or(scale_first, |own| *own == Value::Bool(true));
+        if first && term.clip.is_some() && term.scale.is_some() {
+            refuse(
+                &format!("{name}, {SCALE_FIRST}"),
+                "order that a term has here, which clips first: say the clip in the description, divided by the scale, and take it out here",
+            );
+        }
+        terms.push(term);
+    }
+    let longest = terms.iter().filter_map(|term| term.history).max();
+    let history = longest.filter(|&length| length > 1).map(|_| History {
+        length: None,
+        layout: Some(if switch(TIME_MAJOR) {
+            Layout::Time
+        } else {
+            Layout::Term
+        }),
+        order: Some(Order::OldestFirst),
+        start: Some(Start::First),
+    });
+    (terms, history)
 }
 
 /// Reads a term of the policy's input.
@@ -160,11 +212,28 @@ fn by_policy(map: Option<&[usize]>, values: &[f64]) -> Option<Vec<f64>> {
 /// Reads the field `clip` of a row, if it has one.
 fn clip(name: &str, row: &Value, refuse: &mut impl FnMut(&str, &str)) -> Option<(Each, Each)> {
     let value = row.get("clip").filter(|value| **value != Value::Null)?;
+    if endless(value) {
+        return None;
+    }
     let found = bounds(value);
     if found.is_none() {
         refuse(name, "pair of numbers, nor a list of such pairs");
     }
     found
+}
+
+/// Returns whether a clip, `[low, high]` or a list of such pairs, has no bounds at all.
+fn endless(value: &Value) -> bool {
+    let is = |side: &Value, infinite: f64, text: &str| {
+        side.number() == Some(infinite) || side.text() == Some(text)
+    };
+    match value.list() {
+        Some([low, high]) if low.list().is_none() => {
+            is(low, f64::NEG_INFINITY, "-.inf") && is(high, f64::INFINITY, ".inf")
+        }
+        Some(pairs) => !pairs.is_empty() && pairs.iter().all(endless),
+        None => false,
+    }
 }
 
 /// Reads bounds `[low, high]`, or a list of such pairs.
@@ -228,6 +297,37 @@ mod tests {
         );
         assert_eq!(robot.terms[1].elements, Some(vec!["x".into()]));
         assert_eq!(robot.history.expect("a history").start, Some(Start::First));
+    }
+
+    #[test]
+    fn switches_groups_and_clips_without_bounds_are_read() {
+        let read = |text: &str| {
+            let mut problems = Problems::default();
+            let said = deploy(text, "deploy.yaml", &mut problems);
+            (said.robot, problems.to_string())
+        };
+        let term = "{scale: 2.0, clip: [-.inf, .inf], history_length: 5}";
+        let (robot, problems) = read(&format!(
+            "observations:\n  use_gym_history: true\n  a: {term}"
+        ));
+        assert_eq!(problems, "");
+        assert_eq!((robot.terms.len(), &robot.terms[0].clip), (1, &None));
+        assert_eq!(robot.history.and_then(|it| it.layout), Some(Layout::Time));
+        let (robot, problems) = read(&format!(
+            "observations:\n  obs:\n    use_gym_history: false\n    scale_first: false\n    a: {term}\n  map:\n    b: {{params: {{height: 3}}}}"
+        ));
+        assert_eq!(problems, "");
+        let inputs: Vec<_> = robot
+            .terms
+            .iter()
+            .map(|term| term.input.as_deref())
+            .collect();
+        assert_eq!(inputs, [Some("obs"), Some("map")]);
+        let layout = |name: &str| robot.input[name].history.as_ref().and_then(|it| it.layout);
+        assert_eq!((layout("obs"), layout("map")), (Some(Layout::Term), None));
+        let first = "observations: {scale_first: true, a: {scale: 2.0, clip: [-1, 1]}}";
+        let (_, problems) = read(first);
+        assert!(problems.contains("a, scale_first"), "{problems}");
     }
 
     #[test]
