@@ -5,7 +5,7 @@ import json
 from collections import Counter
 from pathlib import Path
 
-from . import acceptance
+from . import acceptance, contract as contracts
 from .config import LADS, UserError
 from .training import CURVES, SUMMARY
 
@@ -105,7 +105,7 @@ def _plans(summary):
 
 def storage(metadata):
     """Returns the card's line on how a bundle's numbers are stored, and on what evidence; `metadata` is the bundle's, by key."""
-    text = metadata.get("lads.storage")
+    text = metadata.get(contracts.STORAGE_KEY)
     if text is None:
         return "- numbers: 32-bit floats; `lads-run tune` looks for smaller ones that decide the same"
     record = json.loads(text)

@@ -12,7 +12,7 @@ import math
 from .config import UserError
 
 VERSION = 2
-KEY, GOLDEN_KEY = "lads.contract", "lads.golden"
+KEY, GOLDEN_KEY, STORAGE_KEY = "lads.contract", "lads.golden", "lads.storage"
 
 # The channels that the exporter's own policies have. Values of a graph with these names are bound to them.
 OBSERVATION, ACTION, WORDS, NOISE = "observation", "action", "words", "noise"

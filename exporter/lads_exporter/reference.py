@@ -37,6 +37,15 @@ PURPOSE = ("environment", "control_period_s", "channels", "instructions", "langu
 PURPOSE_ROLES = ("observation", "action")
 
 
+def untuned_sha256(model):
+    """Computes the sha256 of a bundle as it was before `lads-run tune`, which names a reference of it in what it adds."""
+    before = onnx.ModelProto()
+    before.CopyFrom(model)
+    del before.metadata_props[:]
+    before.metadata_props.extend(row for row in model.metadata_props if row.key != contracts.STORAGE_KEY)
+    return hashlib.sha256(before.SerializeToString()).hexdigest()
+
+
 def purpose_sha256(contract):
     """Hashes what the contract says the policy is for: equal for two policies that can be compared.
 
@@ -222,7 +231,7 @@ def write(bundle, output, run=None, over=(), episodes=20, traced=2, seed=0, nois
     head = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
-        "bundle_sha256": hashlib.sha256(data).hexdigest(),
+        "bundle_sha256": untuned_sha256(model),
         "purpose_sha256": purpose_sha256(contract),
         "environment": {"id": environment.ID, "version": environment.VERSION, "max_steps": max(environment.max_steps(row["split"]) for row in known)},
         "seed": seed,

@@ -3,6 +3,7 @@
 import base64
 import json
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -52,6 +53,12 @@ def test_the_full_sequence_gives_the_golden_episode(policy):
 def test_noise_is_seeded_as_lads_run_does():
     # sim-harness/src/evaluation/evaluate.rs has the same numbers.
     assert [whole.noise_seed(entropy) for entropy in ([0, 1, 2], [7, 100, 49])] == [6_282_830_349_413_829, 5_255_917_235_266_557]
+
+
+def test_a_reference_names_the_bundle_as_it_was_before_it_was_tuned():
+    for name in ("kitchen", "kitchen-small", "lorel"):
+        file, model = (Path(__file__).parents[2] / f"models/{name}{ending}" for ending in (".reference.json", ".onnx"))
+        assert json.loads(file.read_text())["bundle_sha256"] == reference.untuned_sha256(onnx.load(model))
 
 
 def test_the_purpose_is_what_it_is_for(tiny):
