@@ -60,7 +60,7 @@ def test_it_is_compiled_as_asked(kitchen, tmp_path):
     assert exact.inspect()["stored"] == "f32 weights, f32 cache"
     # Left alone it is as it was tuned.
     assert len(half.image) < 0.7 * len(exact.image) and len(kitchen.image) < 0.9 * len(exact.image)
-    assert kitchen.inspect()["stored"] == "f32 and int16 weights, f16 cache"
+    assert kitchen.inspect()["stored"] == "f32 and int16 and int8 weights, f16 cache"
     assert half.inspect()["stored"] == "f16 weights, f16 cache" and half.self_test().tolerance == pytest.approx(0.05)
     integers = lads.open(kitchen.path, weights="f32", cache="int8")
     assert integers.inspect()["stored"] == "f32 weights, int8 cache" and integers.self_test().largest_error <= 1e-4
