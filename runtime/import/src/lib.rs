@@ -242,14 +242,20 @@ fn known(request: &Request) -> Result<Known, ImportError> {
     for path in neighbours(request) {
         let source = path.display().to_string();
         let json = path.extension().is_some_and(|ending| ending == "json");
-        let read = if json { said::manifest } else { said::deploy };
         match read_text(&path) {
-            Ok(text) => take(read(&text, &source, &mut problems), &source, &mut problems),
+            Ok(text) => {
+                let said = if json {
+                    said::manifest(&text, &own.terms, &source, &mut problems)
+                } else {
+                    said::deploy(&text, &source, &mut problems)
+                };
+                take(said, &source, &mut problems);
+            }
             Err(problem) => problems.add(source, problem),
         }
     }
     for model in &models {
-        let said = said::metadata(model.metadata(), &mut problems);
+        let said = said::metadata(model.metadata(), &own.terms, &mut problems);
         take(said, "metadata", &mut problems);
     }
     // No problem once a description gives them.

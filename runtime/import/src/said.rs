@@ -51,13 +51,14 @@ const RATE: [&str; 4] = [
     "policy_hz",
 ];
 
-/// Reads the metadata of a model file: keys and texts.
+/// Reads the metadata of a model file, keys and texts, beside the terms that a person described.
 pub(crate) fn metadata<'m>(
     pairs: impl Iterator<Item = (&'m str, &'m str)>,
+    own: &[Term],
     problems: &mut Problems,
 ) -> Said {
     let values = pairs.map(|(key, text)| (key.to_owned(), value(text)));
-    flat(&Value::Map(values.collect()), "metadata", problems)
+    flat(&Value::Map(values.collect()), own, "metadata", problems)
 }
 
 /// Parses JSON if the text is JSON, else a comma-separated list of numbers or of names.
@@ -79,9 +80,9 @@ fn value(text: &str) -> Value {
 }
 
 /// Reads a JSON manifest.
-pub(crate) fn manifest(text: &str, source: &str, problems: &mut Problems) -> Said {
+pub(crate) fn manifest(text: &str, own: &[Term], source: &str, problems: &mut Problems) -> Said {
     match serde_json::from_str::<serde_json::Value>(text) {
-        Ok(json) if json.is_object() => flat(&json.into(), source, problems),
+        Ok(json) if json.is_object() => flat(&json.into(), own, source, problems),
         Ok(_) => {
             problems.add(source, "holds no fields");
             Said::default()
@@ -94,7 +95,7 @@ pub(crate) fn manifest(text: &str, source: &str, problems: &mut Problems) -> Sai
 }
 
 /// Reads values under the names that exporters use.
-fn flat(values: &Value, source: &str, problems: &mut Problems) -> Said {
+fn flat(values: &Value, own: &[Term], source: &str, problems: &mut Problems) -> Said {
     let mut said = Said::default();
     let mut find = |names: &[&str]| {
         let name = names.iter().find(|name| values.get(name).is_some())?;
@@ -155,7 +156,7 @@ fn flat(values: &Value, source: &str, problems: &mut Problems) -> Said {
             None => problems.add(format!("{source}, `{name}`"), "is not a list of names"),
         }
     }
-    terms::read(&mut said, values, source, problems);
+    terms::read(&mut said, values, own, source, problems);
     said
 }
 
@@ -229,7 +230,7 @@ mod tests {
             ("action_scale", "0.25"),
         ];
         let mut problems = Problems::default();
-        let said = metadata(pairs.into_iter(), &mut problems);
+        let said = metadata(pairs.into_iter(), &[], &mut problems);
         let robot = said.robot;
         assert_eq!(robot.joints, Some(vec!["hip".into(), "knee".into()]));
         assert_eq!(robot.default_position, Some(vec![0.1, -0.2]));
@@ -249,7 +250,7 @@ mod tests {
             ("robot_urdf", "<robot/>"),
         ];
         let mut problems = Problems::default();
-        let said = metadata(pairs.into_iter(), &mut problems);
+        let said = metadata(pairs.into_iter(), &[], &mut problems);
         assert_eq!(
             said.robot.action.stiffness,
             Some(Each::Many(vec![20.0, 30.0]))

@@ -243,7 +243,8 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
 
     say("policies of one entry");
     let folder = arguments.scratch.join("plain");
-    made(arguments, &folder.join("mlp.onnx"), |python| {
+    // The last that the script writes.
+    made(arguments, &folder.join("history.onnx"), |python| {
         python.arg(script("plain.py")).arg(&folder);
     })?;
     let plain = plain::measure(&folder, &arguments.onnxruntime, effort, &mut say)?;

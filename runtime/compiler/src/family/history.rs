@@ -49,7 +49,7 @@ impl Kind for History {
             ("codebook.dim", self.codebook.dim),
             ("features", self.features.unwrap_or(1)),
         ])?;
-        self.recall.check()?;
+        self.recall.check("")?;
         self.decision.check()?;
         instructed(contract)
     }
@@ -61,7 +61,7 @@ impl Kind for History {
             Blueprint::observed(self.features, &[Event::Step]).kv("context", contract.network);
         let mut blueprint = self
             .recall
-            .states(blueprint)
+            .states(blueprint, "")
             .plain("logits")
             .wide(self.codebook.size, "family.codebook.size");
         let mut decided = Call::step(step).every(h).select("logits");

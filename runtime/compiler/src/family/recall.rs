@@ -28,13 +28,17 @@ pub struct Recall {
 }
 
 impl Recall {
-    pub(crate) fn check(self) -> Result<(), String> {
-        lengths([("window", self.window), ("memory.dim", self.memory.dim)])?;
-        network(Some(self.low_level), "family.low_level").map(drop)
+    /// Checks the sizes, which the contract has `within` the family: nothing, or a field with a point behind it.
+    pub(crate) fn check(self, within: &str) -> Result<(), String> {
+        lengths([
+            (format!("{within}window").as_str(), self.window),
+            (format!("{within}memory.dim").as_str(), self.memory.dim),
+        ])?;
+        network(Some(self.low_level), &format!("family.{within}low_level")).map(drop)
     }
 
     /// Adds the transformer's cache and the window.
-    pub(crate) fn states(self, blueprint: Blueprint) -> Blueprint {
+    pub(crate) fn states(self, blueprint: Blueprint, within: &str) -> Blueprint {
         let ring = Keep::Ring {
             rows: self.window,
             fill: Fill::Zero,
@@ -42,7 +46,7 @@ impl Recall {
         blueprint
             .kv("chunk", Some(self.low_level))
             .state("row", ring, Scope::Episode)
-            .wide(self.memory.dim, "family.memory.dim")
+            .wide(self.memory.dim, &format!("family.{within}memory.dim"))
     }
 
     /// Adds the entries, of a transformer that hears a plan, then rows of the window, then steps.

@@ -77,7 +77,9 @@ impl Kind for Vae {
             ("plan.dim", self.plan.dim),
             ("features", self.features.unwrap_or(1)),
         ])?;
-        self.history.map_or(Ok(()), Recall::check)?;
+        if let Some(recall) = self.history {
+            recall.check("history.")?;
+        }
         one_noise(contract)?;
         instructed(contract)
     }
@@ -88,7 +90,7 @@ impl Kind for Vae {
         let mut blueprint =
             Blueprint::observed(self.features, &[Event::Step]).kv("context", contract.network);
         if let Some(recall) = self.history {
-            blueprint = recall.states(blueprint);
+            blueprint = recall.states(blueprint, "history.");
         }
         blueprint = blueprint
             .plain("plan")

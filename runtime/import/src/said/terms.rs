@@ -1,6 +1,7 @@
 //! Reads what metadata say of each observation term, in the order of `observation_names`: its scale, clip and history.
 //!
-//! What can fail: there is not one value for each term, or one that cannot be followed as it stands; each is a problem with its name.
+//! What can fail: there is not one value for each term, or one that cannot be followed as it stands; each is a problem with its name, which a
+//! person settles by saying that field of the term.
 
 use super::Said;
 use crate::problem::Problems;
@@ -12,8 +13,14 @@ const CLIP: &str = "observation_terms_clip";
 const LENGTH: &str = "observation_terms_history_length";
 const FLATTENED: &str = "observation_terms_flatten_history_dim";
 
-/// Writes them into the terms that were read.
-pub(super) fn read(said: &mut Said, values: &Value, source: &str, problems: &mut Problems) {
+/// Writes them into the terms that were read; `own` are the terms as a person described them.
+pub(super) fn read(
+    said: &mut Said,
+    values: &Value,
+    own: &[Term],
+    source: &str,
+    problems: &mut Problems,
+) {
     let count = said.robot.terms.len();
     let used = &mut said.used;
     let mut rows = |name: &str| {
@@ -22,9 +29,10 @@ pub(super) fn read(said: &mut Said, values: &Value, source: &str, problems: &mut
         let one = std::slice::from_ref(value);
         let rows: Option<Vec<Vec<f64>>> = value.list().unwrap_or(one).iter().map(numbers).collect();
         let rows = rows.filter(|rows| rows.len() == count);
-        if rows.is_none() {
+        let settled = !own.is_empty() && own.iter().all(|term| says(term, name));
+        if rows.is_none() && !settled {
             let wrong = format!(
-                "does not have numbers for each of the {count} terms of `observation_names`"
+                "does not have numbers for each of the {count} terms of `observation_names`; say that field of each term in the description"
             );
             problems.add(format!("{source}, `{name}`"), wrong);
         }
@@ -40,7 +48,10 @@ pub(super) fn read(said: &mut Said, values: &Value, source: &str, problems: &mut
     for (at, term) in said.robot.terms.iter_mut().enumerate() {
         let mut refuse = |name: &str, wrong: &str| {
             let about = format!("{source}, `{name}`, {}", term.name);
-            problems.add(about, format!("{wrong}; say the term in the description"));
+            problems.add(
+                about,
+                format!("{wrong}; say that field of the term in the description"),
+            );
         };
         let (scale, clip) = (scaled(&of(&scales, at)), clipped(&of(&clips, at)));
         let steps = match of(&lengths, at)[..] {
@@ -60,7 +71,9 @@ pub(super) fn read(said: &mut Said, values: &Value, source: &str, problems: &mut
             (CLIP, clip.as_ref().err()),
             (LENGTH, steps.as_ref().err()),
         ] {
-            if let Some(wrong) = fault {
+            if let Some(wrong) = fault
+                && !own.get(at).is_some_and(|term| says(term, name))
+            {
                 refuse(name, wrong);
             }
         }
@@ -79,6 +92,15 @@ pub(super) fn read(said: &mut Said, values: &Value, source: &str, problems: &mut
             order: Some(Order::OldestFirst),
             start: Some(Start::First),
         });
+    }
+}
+
+/// Returns whether a person's description has what a name of the metadata says.
+fn says(term: &Term, name: &str) -> bool {
+    match name {
+        SCALE => term.scale.is_some(),
+        CLIP => term.clip.is_some(),
+        _ => term.history.is_some(),
     }
 }
 
@@ -136,10 +158,15 @@ mod tests {
     use super::*;
 
     fn read(pairs: &[(&str, &str)]) -> (Said, String) {
+        read_beside(&[], pairs)
+    }
+
+    fn read_beside(own: &[Term], pairs: &[(&str, &str)]) -> (Said, String) {
         let mut problems = Problems::default();
         let names = [("observation_names", "base_ang_vel,joint_pos")];
         let said = metadata(
             names.into_iter().chain(pairs.iter().copied()),
+            own,
             &mut problems,
         );
         (said, problems.to_string())
@@ -191,5 +218,16 @@ mod tests {
         }
         let (_, problems) = read(&[(LENGTH, "2,0"), (FLATTENED, "False,True")]);
         assert!(problems.contains("not flattened"), "{problems}");
+        // What a person says of the terms settles it, and of one term that alone.
+        let term = |clip: Option<Clip>| Term {
+            scale: Some(Each::One(1.0)),
+            clip,
+            ..Term::default()
+        };
+        let own = [term(Some(Clip::Around(5.0))), term(None)];
+        let unreadable = [(SCALE, "[1.0,2.0],1.0"), (CLIP, "-1.0;inf,-inf;inf")];
+        assert_eq!(read_beside(&own, &unreadable).1, "");
+        let (_, problems) = read_beside(&own, &[(CLIP, "-inf;inf,-1.0;inf")]);
+        assert!(problems.contains("joint_pos: has one bound"), "{problems}");
     }
 }

@@ -358,7 +358,7 @@ fn whole_verdict_of_kitchen() {
 }
 
 #[test]
-#[ignore = "an hour; prints a table of README.md"]
+#[ignore = "minutes; prints a table of README.md"]
 fn whole_verdict_of_lorel() {
     table("lorel");
 }
