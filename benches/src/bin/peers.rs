@@ -86,14 +86,7 @@ fn run(arguments: &Arguments) -> Result<Report, BenchError> {
     }
     let candidates: Vec<_> = models
         .iter()
-        .map(|(weights, model)| {
-            let golden = model.policy().golden();
-            Candidate {
-                weights,
-                image: model.image(),
-                tolerance: golden.map_or(0.0, |golden| golden.tolerance()),
-            }
-        })
+        .map(|(weights, model)| Candidate::new(weights, model.image(), &model.policy()))
         .collect();
     let python = arguments.python.clone();
     let peers = Peers {

@@ -69,12 +69,8 @@ pub fn bench(request: &Request) -> Result<Report, Refusal> {
     let candidates: Vec<_> = models
         .iter()
         .map(|(weights, model)| {
-            let golden = model.policy().golden();
-            Candidate {
-                weights: if model.is_bundle() { weights } else { "image" },
-                image: model.image(),
-                tolerance: golden.map_or(0.0, |golden| golden.tolerance()),
-            }
+            let weights = if model.is_bundle() { weights } else { "image" };
+            Candidate::new(weights, model.image(), &model.policy())
         })
         .collect();
     let shown = std::io::stderr().is_terminal();

@@ -47,6 +47,17 @@ pub struct Candidate<'i> {
     pub tolerance: f32,
 }
 
+impl<'i> Candidate<'i> {
+    /// Makes the candidate of an image that opens as `policy`, which accepts what its golden episode does.
+    pub fn new(weights: &'i str, image: &'i [u8], policy: &Policy<'_>) -> Self {
+        Self {
+            weights,
+            image,
+            tolerance: policy.golden().map_or(0.0, |golden| golden.tolerance()),
+        }
+    }
+}
+
 /// Other programs that run the same policy.
 pub trait Others {
     /// Opens the other contenders; those that were asked for and cannot be run are reported to

@@ -95,12 +95,7 @@ fn point(bytes: &[u8], value: f64, library: &Path, effort: Effort) -> Result<Poi
     let image = compile(&bundle).map_err(|error| about(&error))?;
     let policy = Policy::new_checked(image.as_bytes()).map_err(|error| about(&error))?;
     let workspace = 4 * (policy.arena_len() + policy.state_len());
-    let tolerance = policy.golden().map_or(0.0, |golden| golden.tolerance());
-    let candidates = [Candidate {
-        weights: "f32",
-        image: image.as_bytes(),
-        tolerance,
-    }];
+    let candidates = [Candidate::new("f32", image.as_bytes(), &policy)];
     let peers = Peers {
         bundle: bytes.to_vec(),
         onnxruntime: Some(library.to_owned()),

@@ -177,12 +177,7 @@ fn run(arguments: &Arguments) -> Result<(), BenchError> {
     for (weights, image) in &images {
         let image = image.as_bytes();
         let policy = Policy::new_checked(image).map_err(|error| about("the image", error))?;
-        let tolerance = policy.golden().map_or(0.0, |golden| golden.tolerance());
-        candidates.push(Candidate {
-            weights,
-            image,
-            tolerance,
-        });
+        candidates.push(Candidate::new(weights, image, &policy));
     }
     let main_peers = Peers {
         bundle: bytes.clone(),

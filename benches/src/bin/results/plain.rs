@@ -77,11 +77,7 @@ fn one(path: &Path, library: &Path, effort: Effort) -> Result<(Run, Run), BenchE
     let mut candidates = vec![];
     for (weights, image) in &images {
         let policy = Policy::new_checked(image.as_bytes()).map_err(|error| about(&error))?;
-        candidates.push(Candidate {
-            weights,
-            image: image.as_bytes(),
-            tolerance: policy.golden().map_or(0.0, |golden| golden.tolerance()),
-        });
+        candidates.push(Candidate::new(weights, image.as_bytes(), &policy));
     }
     // All but some kilobytes of such a bundle are its weights.
     let bare =
