@@ -39,8 +39,8 @@ class HistoryPolicy(nn.Module):
         self.head = nn.Linear(sizes.hidden, sizes.action)
 
     def forward(self, plan, observations, before, previous, steps):
-        """Computes actions [steps, A] under a plan, its index or the vector [D]: the last so many `steps` of normalised observations [T, O] are the plan's own, `before` rows are its
-        window; previous [T, A] are the actions executed before each observation."""
+        """Computes actions [steps, A] under a plan, its index or the vector [D]: the last so many `steps` of normalised observations [T, O] are the
+        plan's own, `before` rows are its window; previous [T, A] are the actions executed before each observation."""
         pairs = torch.stack([self.embed_action(previous), self.embed_observation(observations)], 1)
         places = torch.cat([torch.arange(before), self.window + torch.arange(steps)])
         pairs = pairs[-(before + steps) :] + self.embed_position.weight[places][:, None]
