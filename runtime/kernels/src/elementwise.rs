@@ -93,9 +93,15 @@ impl Kernel for Elements<'_> {
         }
         // In whole blocks, so that a few elements take no longer than a vector of them, and code for what is left is there once.
         for y in self.y.chunks_mut(LANES) {
-            let mut block = [0.0; LANES];
-            assign(&mut block, y);
-            let x = &mut block;
+            let mut spare = [0.0; LANES];
+            let whole = y.len() == LANES;
+            let x: &mut Block = match y.first_chunk_mut() {
+                Some(block) => block,
+                None => {
+                    assign(&mut spare, y);
+                    &mut spare
+                }
+            };
             match self.kind {
                 UnaryKind::Relu => each(x, math::relu),
                 UnaryKind::LeakyRelu => each(x, |x| math::leaky_relu(x, self.alpha)),
@@ -115,7 +121,9 @@ impl Kernel for Elements<'_> {
                 UnaryKind::Mish => each(x, math::mish),
                 UnaryKind::Trunc => each(x, math::trunc),
             }
-            assign(y, &block);
+            if !whole {
+                assign(y, &spare);
+            }
         }
     }
 }
