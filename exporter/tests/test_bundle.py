@@ -214,6 +214,11 @@ def test_an_episode_is_recorded_up_to_its_first_close_decision(tiny, monkeypatch
     golden = load_safetensors(bundle.golden(model, [(0, seen)]))
     assert len(golden["actions"]) == later * period > 0
     assert np.array_equal(golden["actions"], np.stack(whole.actions)[: later * period])
+    # A collapsed codebook decides closely from the first step on: the same part of the episode is the longest clear one by its own bound.
     monkeypatch.setattr(bundle, "LEAST_MARGIN", 2 * whole.margins[0])
+    monkeypatch.setattr(bundle, "CLOSE_MARGIN", whole.margins[0])
+    close = load_safetensors(bundle.golden(model, [(0, seen)]))
+    assert np.array_equal(close["actions"], golden["actions"])
+    monkeypatch.setattr(bundle, "CLOSE_MARGIN", 2 * whole.margins[0])
     with pytest.raises(UserError, match="margin"):
         bundle.golden(model, [(0, seen)])
