@@ -112,7 +112,7 @@ def _card(arguments, saved, sha256):
 
 
 def _export(arguments):
-    from . import acceptance, bundle, systems, training
+    from . import acceptance, bundle, systems, training, tuning
 
     _check_card(arguments, [arguments.output])
     saved, setting = training.load_run(arguments.run, *arguments.system)
@@ -137,7 +137,8 @@ def _export(arguments):
         acceptance.into(model, calibrated)
     sha256 = bundle.save(model, arguments.output)
     print(f"{arguments.output}: sha256 {sha256}")
-    _card(arguments, saved, sha256)
+    print(tuning.beside(arguments.output, sha256, arguments.lads_run))
+    _card(arguments, saved, hashlib.sha256(Path(arguments.output).read_bytes()).hexdigest())
 
 
 def _card_alone(arguments):
@@ -257,6 +258,7 @@ def _parser():
         command.add_argument("--results", help="JSON of lads-run --json for this bundle")
         command.add_argument("--beside", action="append", default=[], metavar="LABEL=FILE", help="results of another run")
         command.set_defaults(run_command=function)
+    export.add_argument("--lads-run", default="target/release/lads-run", help="tunes the bundle by the reference beside it (target/release/lads-run)")
     export.add_argument("--system", action="append", default=[], metavar="FILE", help="export as this system's values say: its sampler or rule of decision")
 
     rollouts = commands.add_parser("reference", help="reference rollouts: PyTorch in the official environment, for lads-run verify")
