@@ -3,6 +3,8 @@
 
 use std::fmt::{self, Display, Write};
 
+use lads_compiler::Line;
+
 use crate::known::known;
 use crate::model::Edge;
 use crate::problem::Problems;
@@ -35,7 +37,7 @@ pub(crate) fn template(edges: &Edges, robot: &Robot, problems: &Problems) -> Str
     }
     form.field(
         "control_period_s",
-        robot.control_period_s.map(|period| period.to_string()),
+        robot.control_period_s.map(number),
         "0.02",
         "seconds from one control step to the next",
     );
@@ -89,7 +91,8 @@ fn listed(edges: &Edges, values: &[Edge]) -> String {
     let values = values
         .iter()
         .map(|edge| format!("`{}` {:?}", edges.name(edge), edge.dims));
-    values.collect::<Vec<_>>().join(", ")
+    // A line break in a name would end the comment.
+    Line::from(values.collect::<Vec<_>>().join(", ")).to_string()
 }
 
 fn history(form: &mut Form, robot: &Robot) {
@@ -318,8 +321,9 @@ impl Form {
 }
 
 fn text(text: &str) -> String {
-    // JSON's texts are TOML's basic strings.
-    serde_json::Value::from(text).to_string()
+    // JSON's texts are TOML's basic strings, which may not hold a delete character as it is.
+    let json = serde_json::Value::from(text).to_string();
+    json.replace('\u{7f}', "\\u007F")
 }
 
 fn texts(names: &[String]) -> String {
@@ -337,9 +341,13 @@ fn each(each: &Each) -> String {
     }
 }
 
-/// Formats a float of TOML: with a point or an exponent.
+/// Formats a float of TOML: with a point or an exponent, or `nan`.
 fn number(value: f64) -> String {
-    format!("{value:?}")
+    if value.is_nan() {
+        "nan".into()
+    } else {
+        format!("{value:?}")
+    }
 }
 
 fn clip(clip: &Clip) -> String {

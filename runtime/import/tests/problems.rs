@@ -230,6 +230,37 @@ fn the_form_names_all_and_is_enough_once_it_is_filled_in() {
 }
 
 #[test]
+fn no_name_or_number_of_a_file_breaks_the_form() {
+    // A line break in a name would end its comment, and the rest of the name would be a field.
+    let name = "obs\nscale = 7\u{7f}";
+    let mut policy = model(
+        vec![value(name, &[1, 2])],
+        vec![node("Identity", &[name], &["actions"])],
+        vec![],
+        vec![value("actions", &[1, 2])],
+    );
+    says(
+        &mut policy,
+        &[
+            ("joint_names", "hip\u{7f},\u{1}knee"),
+            ("default_joint_pos", "nan,inf"),
+            ("action_scale", "NaN"),
+            ("observation_names", "joint_pos,a\nb\u{7f}"),
+        ],
+    );
+    let case = Case::new(&policy, "");
+    case.put("deploy.yaml", b"step_dt: .nan");
+    let form = template(&Request {
+        models: vec![&case.path("policy.onnx")],
+        ..Request::default()
+    })
+    .expect("a form");
+    let read: toml::Table = toml::from_str(&form).unwrap_or_else(|error| panic!("{error}\n{form}"));
+    assert!(!read.contains_key("scale"), "{form}");
+    assert_eq!(read["joints"][0].as_str(), Some("hip\u{7f}"));
+}
+
+#[test]
 fn neighbours_are_read_and_have_to_agree() {
     let deploy = "step_dt: 0.02\njoint_ids_map: [1, 0]\ndefault_joint_pos: [0.5, 0.6]\nstiffness: [10, 20]\ndamping: [1, 2]\n\
         actions: {JointPositionAction: {scale: [0.25, 0.5], offset: [0.5, 0.6], clip: null}}\n\
