@@ -25,6 +25,14 @@ impl Memory {
         Ok(Self { pages, arena })
     }
 
+    /// Memory that a controller of `policy` may come to take, in bytes: what the policy asks for,
+    /// in whole large pages where the system has them.
+    pub fn bytes(policy: &Policy<'_>) -> usize {
+        let elements = policy.arena_len().saturating_add(policy.state_len());
+        let bytes = elements.saturating_mul(size_of::<f32>());
+        Pages::taken(bytes)
+    }
+
     /// Converts a number of f32 elements to bytes, if that is within a policy's limit.
     fn bytes_of(elements: usize) -> Result<usize, MemoryError> {
         let bytes = elements.saturating_mul(size_of::<f32>());

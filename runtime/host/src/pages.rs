@@ -34,6 +34,15 @@ impl Pages {
         Ok(Self { map, start, len })
     }
 
+    /// Memory that `len` bytes may come to take: whole large pages on Linux.
+    pub fn taken(len: usize) -> usize {
+        if cfg!(target_os = "linux") {
+            len.checked_next_multiple_of(LARGE).unwrap_or(usize::MAX)
+        } else {
+            len
+        }
+    }
+
     /// Returns the bytes.
     pub fn as_bytes(&self) -> &[u8] {
         &self.map[self.start..self.start + self.len]
@@ -57,6 +66,14 @@ mod tests {
             assert!(pages.as_bytes().len() == len && pages.as_bytes().iter().all(|&b| b == 0));
             pages.as_mut::<f32>().fill(1.0);
             assert_eq!(pages.as_mut::<f32>().len(), len / 4);
+        }
+    }
+
+    #[test]
+    fn what_bytes_take_is_no_less_than_they_are() {
+        for len in [0, 4, LARGE, LARGE + 1, usize::MAX] {
+            let taken = Pages::taken(len);
+            assert!(taken >= len && taken - len < LARGE, "{len}");
         }
     }
 
