@@ -77,3 +77,25 @@ pub fn compiled(path: &Path) -> Image {
     let bundle = Bundle::open(path).unwrap_or_else(|error| panic!("{error}"));
     compile(&bundle).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
+
+/// Imports the biped's policies for standing and walking and compiles them.
+///
+/// # Panics
+///
+/// When they cannot be imported.
+pub fn biped() -> [(&'static str, Vec<u8>, Image); 2] {
+    let folder = project_path("runtime/host/examples/biped");
+    ["stand", "walk"].map(|name| {
+        let policy = folder.join(name).with_extension("onnx");
+        let robot = folder.join("robot.toml");
+        let request = lads_import::Request {
+            models: vec![&policy],
+            robot: Some(&robot),
+            ..lads_import::Request::default()
+        };
+        let imported = lads_import::import(&request).unwrap_or_else(|error| panic!("{error}"));
+        let bundle = Bundle::from_bytes(&imported.bundle).unwrap_or_else(|error| panic!("{error}"));
+        let image = compile(&bundle).unwrap_or_else(|error| panic!("{name}: {error}"));
+        (name, imported.bundle, image)
+    })
+}

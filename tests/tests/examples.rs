@@ -167,21 +167,8 @@ fn digest(text: &str) -> &str {
 
 #[test]
 fn the_biped_stands_and_walks_alike_in_rust_and_in_c() {
-    let folder = project_path("runtime/host/examples/biped");
-    for name in ["stand", "walk"] {
-        let (policy, robot) = (
-            folder.join(format!("{name}.onnx")),
-            folder.join("robot.toml"),
-        );
-        let request = lads_import::Request {
-            models: vec![&policy],
-            robot: Some(&robot),
-            ..lads_import::Request::default()
-        };
-        let imported = lads_import::import(&request).unwrap_or_else(|error| panic!("{error}"));
-        let bundle = scratch(&format!("{name}.lads.onnx"));
-        fs::write(&bundle, &imported.bundle).expect("it can be written");
-        let image = compiled(&bundle);
+    for (name, bundle, image) in lads_tests::biped() {
+        fs::write(scratch(&format!("{name}.lads.onnx")), bundle).expect("it can be written");
         fs::write(scratch(&format!("{name}.lads")), image.as_bytes()).expect("it can be written");
     }
     let biped = built(&["--example", "biped"]).join("examples/biped");

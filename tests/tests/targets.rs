@@ -1,5 +1,5 @@
-//! Runs the self-test of the small kitchen policy on aarch64 and Cortex-M under qemu, and the kernels' own tests on aarch64, where tools
-//! and targets are installed; what is missing is named.
+//! Runs the self-test of the small kitchen policy on aarch64, armv7 and Cortex-M under qemu, the biped's control loop on those with Linux, and
+//! the kernels' own tests on aarch64, where tools and targets are installed; what is missing is named.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -8,9 +8,9 @@ use std::process::Command;
 
 use lads_core::{Isa, Policy};
 use lads_host::Memory;
-use lads_tests::{compiled, project_path};
+use lads_tests::{biped, compiled, project_path};
 
-/// What the script says of the small policy's image.
+/// What the script says of the small policy's image and of the biped's.
 fn run_on_targets(bytes: &[u8]) -> String {
     // As `lads compile --emit-c` writes it.
     let mut text = format!(
@@ -23,8 +23,14 @@ fn run_on_targets(bytes: &[u8]) -> String {
     text.push_str("};\n");
     let source = Path::new(env!("CARGO_TARGET_TMPDIR")).join("policy.c");
     fs::write(&source, text).expect("it can be written");
+    let walking = biped().map(|(name, _, image)| {
+        let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("{name}.on-targets.lads"));
+        fs::write(&path, image.as_bytes()).expect("it can be written");
+        path
+    });
     let output = Command::new(project_path("runtime/ffi/examples/targets/run.sh"))
         .arg(&source)
+        .args(walking)
         .env("LADS_OPS", "lads,integer-weights,half-cache")
         .output()
         .expect("the script runs");

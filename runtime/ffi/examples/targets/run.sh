@@ -1,15 +1,17 @@
 #!/bin/sh
 # The self-test of a small policy on other targets under qemu, bit for bit as on this machine. What is missing is skipped and named. Of the
 # program for Cortex-M it also says what it takes: flash, RAM, stack, and the instructions of a control step (docs/firmware.md). LADS_OPS as for
-# runtime/ffi/archive.sh.
-# usage: runtime/ffi/examples/targets/run.sh <image.c>     image.c: lads compile models/kitchen-small.onnx --emit-c image.c
+# runtime/ffi/archive.sh. With the images of a biped's two policies, its control loop of three seconds, in C and in Rust, runs on the targets with
+# Linux too. The processors that qemu stands for there have nothing beyond their target's baseline.
+# usage: runtime/ffi/examples/targets/run.sh <image.c> [<stand.lads> <walk.lads>]
+#        image.c: lads compile models/kitchen-small.onnx --emit-c image.c; the others: docs/import.md
 # Needs, per target, the C compiler and the qemu named below, and Rust's core for it: the target added to a toolchain
 # (rustup target add), or a toolchain with rust-src, of which core is built on the way. Every toolchain on PATH and of rustup is tried.
 set -eu
-[ $# -eq 1 ] || { echo "usage: run.sh <image.c>" >&2; exit 2; }
+[ $# -eq 1 ] || [ $# -eq 3 ] || { echo "usage: run.sh <image.c> [<stand.lads> <walk.lads>]" >&2; exit 2; }
 here=$(cd "$(dirname "$0")" && pwd)
 root=$(cd "$here/../../../.." && pwd)
-image=$1
+image=$1 stand=${2:-} walk=${3:-}
 name=$(sed -n 's/^extern const unsigned char \([a-z0-9_]*\)\[[0-9]*\];$/\1/p' "$image" | head -n 1)
 bytes=$(sed -n 's/^extern const unsigned char [a-z0-9_]*\[\([0-9]*\)\];$/\1/p' "$image" | head -n 1)
 [ -n "$name" ] || { echo "run.sh: $image: not a source of lads compile --emit-c" >&2; exit 2; }
@@ -61,12 +63,41 @@ same() {
         exit 1
     fi
 }
+# loop <compiler> <archive> <how to run it>...: what the biped's loop in C says
+loop() {
+    compiler_of_c=$1 library=$2
+    shift 2
+    # shellcheck disable=SC2086
+    "$compiler_of_c" -std=c11 $linked -O2 -Wall -Wextra -I"$here/../../include" "$here/../c/biped.c" "$library" -lm -o "$work/biped"
+    "$@" "$work/biped" "$stand" "$walk" 150
+}
+# biped <target> <prefix of its binutils> <how to run it>...: the loop in C, and the one in Rust where the toolchain has the target's standard library
+biped() {
+    [ -n "$stand" ] || return 0
+    target=$1 prefix=$2
+    shift 2
+    linked=-static
+    [ "$(loop "${prefix}gcc" "$archive" "$@")" = "$walked" ] || { echo "biped in C, $target: differs"; exit 1; }
+    echo "biped in C, $target: the same bits"
+    std=$("$compiler" --print sysroot)/lib/rustlib/$target/lib
+    ls "$std"/libstd-*.rlib >/dev/null 2>&1 || { echo "skipped: biped in Rust, $target: no standard library; rustup target add $target"; return 0; }
+    linker=CARGO_TARGET_$(echo "$target" | tr 'a-z-' 'A-Z_')_LINKER
+    (cd "$root" && env "$linker=${prefix}gcc" RUSTC="$compiler" "${CARGO:-cargo}" build --quiet --locked -p lads-host --example biped --target "$target" --target-dir target/targets)
+    said=$("$@" "$root/target/targets/$target/debug/examples/biped" "$stand" "$walk" 150 --fast)
+    [ "$(echo "$said" | grep '^digest')" = "$(echo "$walked" | grep '^digest')" ] || { echo "biped in Rust, $target: differs: $said"; exit 1; }
+    echo "biped in Rust, $target: the same bits"
+}
 
 "$root/runtime/ffi/archive.sh" "$work/liblads.a"
 # shellcheck disable=SC2086
 cc $flags "$here/selftest.c" "$image" "$work/liblads.a" -o "$work/host"
 expected=$("$work/host")
 echo "$expected"
+if [ -n "$stand" ]; then
+    linked=
+    walked=$(loop cc "$work/liblads.a" env)
+    echo "biped: $(echo "$walked" | tail -n 1)"
+fi
 
 if have aarch64-linux-gnu-gcc qemu-aarch64 && toolchain aarch64-unknown-linux-gnu; then
     archive aarch64-unknown-linux-gnu aarch64-linux-gnu-
@@ -75,12 +106,14 @@ if have aarch64-linux-gnu-gcc qemu-aarch64 && toolchain aarch64-unknown-linux-gn
     for cpu in max cortex-a53; do
         same "aarch64 $cpu" "$(qemu-aarch64 -cpu "$cpu" "$work/aarch64")"
     done
+    biped aarch64-unknown-linux-gnu aarch64-linux-gnu- qemu-aarch64 -L /usr/aarch64-linux-gnu -cpu cortex-a53
 fi
 if have arm-linux-gnueabihf-gcc qemu-arm && toolchain armv7-unknown-linux-gnueabihf; then
     archive armv7-unknown-linux-gnueabihf arm-linux-gnueabihf-
     # shellcheck disable=SC2086
     arm-linux-gnueabihf-gcc -static $flags "$here/selftest.c" "$image" "$archive" -lm -o "$work/armv7"
     same armv7 "$(qemu-arm "$work/armv7")"
+    biped armv7-unknown-linux-gnueabihf arm-linux-gnueabihf- qemu-arm -L /usr/arm-linux-gnueabihf -cpu cortex-a7
 fi
 if have arm-none-eabi-gcc qemu-system-arm && toolchain thumbv7em-none-eabihf; then
     archive thumbv7em-none-eabihf arm-none-eabi-
