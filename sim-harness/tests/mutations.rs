@@ -1,13 +1,16 @@
 //! Tests the certificate against changed policies, a few of each kind; `make mutate` has all of them.
 
+#[path = "common/drive.rs"]
+mod drive;
 #[path = "common/mutate.rs"]
 mod mutate;
 
 use std::path::{Path, PathBuf};
 
-use lads_compiler::Options;
+use drive::Rollouts;
+use lads_compiler::{CacheFormat, Options, Storage, WeightFormat};
 use lads_proof::reference::Reference;
-use mutate::{Judged, Model, Outcome};
+use mutate::{ACTION, Judged, LOGIT, Model};
 use serde_json::{Value, json};
 
 /// Bias that is added at the end of the low level.
@@ -26,12 +29,12 @@ fn shipped() -> (Model, Reference) {
     (model, reference)
 }
 
-fn judged(model: &Model, reference: &Reference) -> Box<Judged> {
+fn judged(model: &Model, reference: &Reference) -> Judged {
     judged_with(model, &Options::exact(), reference)
 }
 
 /// Judges a policy with the formats that the bundle was tuned to.
-fn judged_tuned(model: &Model, reference: &Reference) -> Box<Judged> {
+fn judged_tuned(model: &Model, reference: &Reference) -> Judged {
     let options = Options {
         // The reference is to find what the golden episode would.
         force: true,
@@ -40,10 +43,10 @@ fn judged_tuned(model: &Model, reference: &Reference) -> Box<Judged> {
     judged_with(model, &options, reference)
 }
 
-fn judged_with(model: &Model, options: &Options, reference: &Reference) -> Box<Judged> {
-    match mutate::verify(model.bytes(), options, reference, EVERY) {
-        Outcome::Judged(judged) => judged,
-        Outcome::Refused(why) => panic!("{why}"),
+fn judged_with(model: &Model, options: &Options, reference: &Reference) -> Judged {
+    match mutate::open(model.bytes(), options) {
+        Ok(opened) => mutate::judge(&opened, reference, EVERY),
+        Err(why) => panic!("{why}"),
     }
 }
 
@@ -121,6 +124,69 @@ fn what_chooses_the_same_plans_is_different_all_the_same() {
         found.asked.policy.differing_segments > 0
             && found.asked.policy.largest_action_difference < 1e-4
     );
+}
+
+/// Tests what a row of `make mutate` says: how far a change moves the answers, with 32 bits and with fewer, and what it leaves of the success.
+#[test]
+fn a_change_is_measured_by_what_it_moves() {
+    let (model, reference) = shipped();
+    let moved = |model: &Model| judged(model, &reference).moved();
+    assert!(moved(&model).is_little());
+    let scaled = |name: &str, factor: f32| {
+        let mut changed = model.clone();
+        changed.edit(name, |values| mutate::scale(values, factor));
+        changed
+    };
+    let logits = moved(&scaled("high_level.head.weight", 1.1));
+    assert!(logits.is_much() && logits.logit > LOGIT && logits.action < ACTION);
+    let actions = moved(&scaled("low_level.layer.3.weight", 1.1));
+    assert!(actions.is_much() && actions.action > ACTION && actions.logit < LOGIT);
+    // With fewer bits a logit counts by what it decides.
+    let rounded = |weights: WeightFormat, cache: CacheFormat| {
+        let storage = Storage::of_weights(weights)
+            .with_part("low_level/act", WeightFormat::F32)
+            .with_cache(cache);
+        let options = Options {
+            storage: Some(storage),
+            force: true,
+            ..Options::default()
+        };
+        judged_with(&model, &options, &reference).moved()
+    };
+    let cache = rounded(WeightFormat::F32, CacheFormat::Int8);
+    assert!(cache.logit > 1e-3 && !cache.is_much(), "{cache:?}");
+    let weights = rounded(WeightFormat::Int8, CacheFormat::F32);
+    assert!(weights.logit > LOGIT && weights.decisions == 0);
+    assert!(!weights.is_much() && !weights.is_little(), "{weights:?}");
+
+    let opened = |model: &Model| mutate::open(model.bytes(), &Options::exact()).unwrap();
+    let own = opened(&model);
+    let rollouts = Rollouts::new(&own, &reference, 12, 2);
+    assert_eq!(rollouts.commanded(), 4 * rollouts.instructions().count());
+    let recorded = rollouts.instructions().map(|index| {
+        let episode = &reference.instructions[index].episodes[0];
+        let four = episode.success.then_some(4);
+        (episode.success, four.unwrap_or(episode.completions.len()))
+    });
+    let outcomes = rollouts.run(&own).unwrap();
+    for (outcome, (success, at_most)) in outcomes.iter().zip(recorded) {
+        let done = outcome.sub_tasks.len();
+        assert_eq!((outcome.success, done == 4), (success, success));
+        assert!(done <= at_most, "{done} of {at_most}");
+    }
+    assert!(outcomes.iter().any(|it| it.success));
+    // Who does not move does nothing.
+    let mut still = model.clone();
+    for name in ["low_level.layer.6.weight", LAST_BIAS] {
+        still.edit(name, |values| values.fill(0.0));
+    }
+    let outcomes = rollouts.run(&opened(&still)).unwrap();
+    assert!(outcomes.iter().all(|it| !it.success), "{outcomes:?}");
+    // What the environment does not have is refused before an episode runs.
+    let mut contract = model.contract();
+    contract["control_period_s"] = json!(0.05);
+    let refused = rollouts.run(&opened(&model.with_contract(&contract)));
+    assert!(refused.is_err(), "{refused:?}");
 }
 
 #[test]

@@ -9,9 +9,10 @@ use std::sync::atomic::AtomicBool;
 
 use lads_compiler::Options;
 use lads_core::Isa;
+use lads_host::Opened;
 use lads_proof::contract::Compared;
 use lads_proof::reference::Reference;
-use lads_proof::rounding::Asked;
+use lads_proof::rounding::{Asked, CLEAR_SHARE, Loss};
 use lads_sim::evaluate::Assignment;
 use lads_sim::verify::{self, policy::Questions};
 use serde_json::Value;
@@ -201,12 +202,44 @@ impl Model {
     }
 }
 
-/// Outcome of verifying a changed bundle.
-#[derive(Debug, Clone)]
-pub enum Outcome {
-    /// The bundle was not even opened or compiled.
-    Refused(String),
-    Judged(Box<Judged>),
+/// Opens and compiles a bundle, without its self-test; the error is what a person would read.
+pub fn open(bytes: &[u8], options: &Options) -> Result<Opened, String> {
+    lads_host::from_bytes_with(bytes, options).map_err(|refused| refused.to_string())
+}
+
+/// Difference of a logit from which on a change must be found.
+pub const LOGIT: f64 = 1e-2;
+/// Difference of an action from which on a change must be found.
+pub const ACTION: f64 = 1e-4;
+
+/// What a change moves in the policy's answers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Moved {
+    /// Largest difference of a logit: from the reference's with 32 bits, from those with 32 bits with fewer.
+    pub logit: f64,
+    /// Largest difference of an action element.
+    pub action: f64,
+    /// Number of segments that are encoded as another plan.
+    pub segments: usize,
+    /// Number of decisions that fewer bits let fall out otherwise.
+    pub decisions: usize,
+    /// Whether enough decisions are clear by more than fewer bits move the logits.
+    clear: bool,
+    /// Whether the image has fewer bits than 32: then its logits count by what they decide.
+    fewer_bits: bool,
+}
+
+impl Moved {
+    /// Whether anything moves so far that it is to be found.
+    pub fn is_much(&self) -> bool {
+        let decided = self.decisions > 0 || !self.fewer_bits && self.logit > LOGIT;
+        decided || self.action > ACTION || self.segments > 0
+    }
+
+    /// Whether nothing moves so far that it may be found.
+    pub fn is_little(&self) -> bool {
+        !self.is_much() && self.logit <= LOGIT && self.clear
+    }
 }
 
 #[derive(Debug, Clone)]
@@ -233,15 +266,30 @@ impl Judged {
             .or_else(|| self.asked.differences().into_iter().next())
             .unwrap_or_default()
     }
+
+    pub fn moved(&self) -> Moved {
+        let answers = &self.asked.policy;
+        let rounding = self.asked.rounding.as_ref();
+        // What is changed beside the bits moves the logits with 32.
+        let exact = self.asked.exact.as_ref().unwrap_or(answers);
+        let rounded = rounding.map_or(0.0, |it| it.largest_logit_difference);
+        Moved {
+            logit: exact.largest_logit_difference.max(rounded),
+            action: answers.largest_action_difference,
+            segments: answers.differing_segments,
+            decisions: match rounding.and_then(|it| it.loss.as_ref()) {
+                Some(Loss::Selected { changed, .. }) => *changed,
+                _ => 0,
+            },
+            clear: rounding.is_none_or(|it| it.clear_share >= CLEAR_SHARE),
+            fewer_bits: rounding.is_some(),
+        }
+    }
 }
 
-/// Compares a bundle with its reference: the contract, and the policy's answers to the first traced episode of the instructions whose index
-/// is a multiple of `every`.
-pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usize) -> Outcome {
-    let opened = match lads_host::from_bytes_with(bytes, options) {
-        Ok(opened) => opened,
-        Err(refused) => return Outcome::Refused(refused.to_string()),
-    };
+/// Compares an opened bundle with its reference: the contract, and the policy's answers to the first traced episode of the instructions whose
+/// index is a multiple of `every`.
+pub fn judge(opened: &Opened, reference: &Reference, every: usize) -> Judged {
     let (bundle, policy) = (opened.bundle().unwrap(), opened.policy());
     let known = (0..reference.instructions.len() as u32).step_by(every);
     let assignments: Vec<_> = known
@@ -261,7 +309,7 @@ pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usi
     let image = (&policy, Isa::detect());
     let (asked, _) = verify::policy::judge(image, bundle, questions, &stop, &|| {}).unwrap();
     let stated = serde_json::from_str(bundle.metadata(CONTRACT).unwrap()).unwrap();
-    Outcome::Judged(Box::new(Judged {
+    Judged {
         contract: Compared::new(
             &stated,
             reference.contract.as_ref(),
@@ -271,7 +319,7 @@ pub fn verify(bytes: &[u8], options: &Options, reference: &Reference, every: usi
             ],
         ),
         asked,
-    }))
+    }
 }
 
 /// Changes every value of a contract, one at a time: returns its place, and the contract.
