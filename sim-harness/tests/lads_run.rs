@@ -172,7 +172,7 @@ fn a_log_replays_and_its_plans_run() {
     refused(
         &kitchen_bundle(),
         &["--drop-rate", "2"],
-        &["--drop-rate 2", "from 0 to 1"],
+        &["--drop-rate: ", "a drop rate of 2", "from 0 to 1"],
     );
 }
 

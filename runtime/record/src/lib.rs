@@ -113,7 +113,7 @@ pub enum LogError {
     #[error("it is not a complete MCAP file ({0}); record it again")]
     Mcap(#[from] mcap::McapError),
     /// The file is MCAP, but not a log that [`write()`] makes.
-    #[error("it is not a log of lads ({0}); record one with lads-run --log")]
+    #[error("it is not a log of lads ({0}); record one")]
     Foreign(String),
 }
 

@@ -37,16 +37,16 @@ impl Default for Faults {
 #[non_exhaustive]
 pub enum FaultError {
     /// The delay is longer than any episode.
-    #[error("--delay-steps {0}: give at most {LONGEST_DELAY} control steps")]
+    #[error("a delay of {0} control steps: give at most {LONGEST_DELAY}")]
     Delay(usize),
     /// The drop rate is not a share from 0 to 1.
-    #[error("--drop-rate {0}: give a share from 0 to 1")]
+    #[error("a drop rate of {0}: give a share from 0 to 1")]
     Drop(f64),
     /// The noise scale is not a finite factor from 0.
-    #[error("--noise-scale {0}: give a finite factor that is not negative")]
+    #[error("a noise scale of {0}: give a finite factor that is not negative")]
     Noise(f64),
     /// The action lag is not a finite time from 0.
-    #[error("--action-lag {0}: give a finite number of control steps that is not negative")]
+    #[error("an action lag of {0}: give a finite number of control steps that is not negative")]
     Lag(f64),
 }
 

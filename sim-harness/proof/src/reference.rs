@@ -31,7 +31,7 @@ const MOST_NOISE: f64 = 0.01;
 #[non_exhaustive]
 pub enum ReferenceError {
     /// The file cannot be read.
-    #[error("{path}: cannot be read ({source}); name a reference, or make one: make reference", path = path.display())]
+    #[error("{path}: cannot be read ({source}); name a reference, or make one", path = path.display())]
     File {
         /// Path of the file.
         path: PathBuf,
@@ -39,7 +39,7 @@ pub enum ReferenceError {
         source: std::io::Error,
     },
     /// The file is not a reference, or is damaged.
-    #[error("{path}: {problem}; make it again: make reference", path = path.display())]
+    #[error("{path}: {problem}; make it again", path = path.display())]
     Content {
         /// Path of the file.
         path: PathBuf,

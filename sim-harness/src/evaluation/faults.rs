@@ -202,35 +202,35 @@ mod tests {
                 drop_rate: 1.1,
                 ..faults
             })
-            .contains("--drop-rate 1.1")
+            .contains("a drop rate of 1.1")
         );
         assert!(
             refused(Faults {
                 drop_rate: f64::NAN,
                 ..faults
             })
-            .contains("--drop-rate NaN")
+            .contains("a drop rate of NaN")
         );
         assert!(
             refused(Faults {
                 noise_scale: -1.0,
                 ..faults
             })
-            .contains("--noise-scale -1")
+            .contains("a noise scale of -1")
         );
         assert!(
             refused(Faults {
                 action_lag: f64::INFINITY,
                 ..faults
             })
-            .contains("--action-lag")
+            .contains("an action lag of inf")
         );
         assert!(
             refused(Faults {
                 delay_steps: 2_000,
                 ..faults
             })
-            .contains("--delay-steps 2000")
+            .contains("a delay of 2000")
         );
     }
 }

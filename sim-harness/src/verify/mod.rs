@@ -109,11 +109,14 @@ pub fn run(
         .metadata("lads.contract")
         .and_then(|text| serde_json::from_str(text).ok());
     let bundled = contract::of_bundle(bundle).map_err(EvaluationError::Bundle)?;
-    let compared = Compared::new(
-        &stated.unwrap_or_default(),
-        reference.contract.as_ref(),
-        [&contract::of_image(&evaluation.policy), &bundled],
-    );
+    let compared = Compared {
+        remedy: "complete it: python -m lads_exporter reference --complete",
+        ..Compared::new(
+            &stated.unwrap_or_default(),
+            reference.contract.as_ref(),
+            [&contract::of_image(&evaluation.policy), &bundled],
+        )
+    };
     let mut not_covered = unseen(evaluation, &asked.policy);
     if asked.rounding.is_some() {
         let tuned = lads_compiler::compile(bundle).map_err(EvaluationError::Exact)?;

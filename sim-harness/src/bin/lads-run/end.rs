@@ -4,6 +4,8 @@ use std::fmt::Display;
 use std::io::{ErrorKind, Write as _};
 use std::path::Path;
 
+use lads_sim::verify::reference::ReferenceError;
+
 /// Why a run ends early.
 pub enum End {
     /// Refused, with one line that names the thing and the remedy.
@@ -20,6 +22,16 @@ pub enum End {
 
 pub fn refused(line: impl Display) -> End {
     End::Refused(line.to_string())
+}
+
+/// Refuses a reference, and says how one is made where that is the remedy.
+pub fn unmade(error: ReferenceError) -> End {
+    match error {
+        ReferenceError::File { .. } | ReferenceError::Content { .. } => {
+            refused(format!("{error}: make reference"))
+        }
+        other => refused(other),
+    }
 }
 
 /// Refuses a file that an option asks for and that cannot be written.

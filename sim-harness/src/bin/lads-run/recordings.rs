@@ -9,7 +9,7 @@ use lads_core::{Channel, Policy};
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::Evaluation;
 use lads_sim::plans::{self, Agreement, PlanBook, PlanFile, PlanSequence};
-use lads_sim::recorder::{self, Flight, Log, Origin};
+use lads_sim::recorder::{self, Flight, Log, LogError, Origin};
 use lads_sim::replay::{self, Difference};
 use lads_sim::trace::Trace;
 use lads_sim::{output, results};
@@ -26,7 +26,13 @@ const DIFFERENT: u8 = 1;
 const SHOWN: usize = 10;
 
 fn read(job: &str, path: &Path) -> Result<Log, End> {
-    recorder::read(path).map_err(|error| refused(format!("{job} {}: {error}", path.display())))
+    recorder::read(path).map_err(|error| {
+        let how = match error {
+            LogError::Foreign(_) => " with lads-run --log",
+            _ => "",
+        };
+        refused(format!("{job} {}: {error}{how}", path.display()))
+    })
 }
 
 /// Runs `replay`: computes the actions of a log again and compares them.

@@ -6,6 +6,7 @@ use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 use lads_sim::evaluate::Evaluated;
+use lads_sim::faults::FaultError;
 use lads_sim::results::Results;
 use lads_sim::rollout::Pictures;
 use lads_sim::table::Table;
@@ -26,10 +27,22 @@ pub struct Extra<'e> {
     pub record: Option<&'e Record>,
 }
 
+/// The option that a refused fault was given by.
+fn option(error: FaultError) -> &'static str {
+    match error {
+        FaultError::Delay(_) => "--delay-steps",
+        FaultError::Drop(_) => "--drop-rate",
+        FaultError::Noise(_) => "--noise-scale",
+        FaultError::Lag(_) => "--action-lag",
+        _ => "the faults",
+    }
+}
+
 /// Runs the episodes and writes their files.
 pub fn run(asked: &Rollouts, extra: &Extra<'_>, stop: &AtomicBool) -> Result<ExitCode, End> {
     let (files, episodes) = (&asked.files, &asked.episodes);
-    asked.faults.faults().check().map_err(refused)?;
+    let faults = asked.faults.faults().check();
+    faults.map_err(|error| refused(format!("{}: {error}", option(error))))?;
     some_episodes(Some(episodes.episodes))?;
     let threads = threads(episodes.threads, extra.viewer)?;
     check_outputs(asked, extra)?;

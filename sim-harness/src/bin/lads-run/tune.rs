@@ -18,7 +18,7 @@ use lads_sim::verify::shown::Shown;
 
 use crate::arguments::{LanguageArguments, PolicyArguments, Tune, Wanted};
 use crate::bench::{self, Bench};
-use crate::end::{End, print, refused, unwritable};
+use crate::end::{End, print, refused, unmade, unwritable};
 use crate::{given, unfinished};
 
 /// Tunes, prints what was chosen and why, and writes the bundle.
@@ -34,12 +34,12 @@ pub fn run(asked: &Tune, stop: &AtomicBool) -> Result<ExitCode, End> {
     let bytes = input::read(model)
         .map_err(|error| refused(format_args!("{}: {error}", model.display())))?;
     let questions = input::read(&file).map_err(|source| {
-        refused(ReferenceError::File {
+        unmade(ReferenceError::File {
             path: file.clone(),
             source,
         })
     })?;
-    let reference = Reference::read(&questions, &file).map_err(refused)?;
+    let reference = Reference::read(&questions, &file).map_err(unmade)?;
     let policy = PolicyArguments {
         model: model.clone(),
         image: None,

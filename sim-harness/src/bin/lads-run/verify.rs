@@ -20,7 +20,7 @@ use lads_sim::verify::reference::Reference;
 
 use crate::arguments::{LanguageArguments, Verify, Wanted, reference};
 use crate::bench;
-use crate::end::{End, print, refused, unwritable};
+use crate::end::{End, print, refused, unmade, unwritable};
 use crate::{given, progress, some_episodes, threads, unfinished};
 
 /// Runs the verification, writes and prints the certificate; gives the exit code.
@@ -37,7 +37,7 @@ pub fn run(asked: &Verify, stop: &AtomicBool) -> Result<ExitCode, End> {
     let outputs = given(certificates.map(|path| ("--certificate", Some(path))));
     output::apart(&given(inputs), &outputs).map_err(refused)?;
     output::check(&[], &outputs).map_err(refused)?;
-    let reference = Reference::open(&file).map_err(refused)?;
+    let reference = Reference::open(&file).map_err(unmade)?;
     let most = reference.episodes_per_instruction;
     let episodes = asked.episodes.unwrap_or(most);
     if episodes > most {
