@@ -2,39 +2,34 @@
 //! out.
 //!
 //! All observations are checked before the first controller steps, so that a refusal leaves all
-//! controllers unchanged. The threads are the batch's own, started once.
+//! controllers unchanged. The threads ([`Crew`]) are the batch's own, started once.
 
 use std::num::NonZero;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 use std::thread;
 
-use lads_core::{ChannelId, Data, StepError as CoreStepError};
+use lads_core::StepReport;
 use numpy::PyArray1;
 use pyo3::prelude::*;
-use pyo3::types::{PyList, PyTuple};
-use rayon::prelude::*;
+use pyo3::sync::PyOnceLock;
+use pyo3::types::{PyList, PyTuple, PyType};
 
 use crate::arrays::{self, Staged, Target};
-use crate::cell::{Checked, Working};
+use crate::cell::Checked;
 use crate::controller::{Settings, Told};
+use crate::crew::{Broken, Crew, Row};
 use crate::errors::{self, BusyError, ClosedError, InputError, StepError, WorkspaceError};
+use crate::memory;
+use crate::numbers;
 use crate::policy::Policy;
 use crate::process::Process;
 
-/// One of the controllers, with the results of its last step.
-struct Row {
-    working: Working,
-    report: lads_core::StepReport,
-    failed: Option<CoreStepError>,
-}
-
 struct Inner {
-    /// Threads of the batch; not dropped in a forked child, which has none of its threads.
-    pool: rayon::ThreadPool,
-    rows: Vec<Row>,
-    staged: Vec<Staged>,
+    /// Controllers and threads; not dropped in a forked child, which has none of its threads.
+    crew: Crew,
     given: Vec<bool>,
     actions: Vec<f32>,
+    reports: Vec<StepReport>,
 }
 
 /// Controllers of one policy, stepped together over threads.
@@ -54,8 +49,8 @@ impl Drop for Controllers {
             return;
         }
         let inner = self.inner.get_mut().unwrap_or_else(PoisonError::into_inner);
-        if let Some(Inner { pool, .. }) = inner.take() {
-            std::mem::forget(pool);
+        if let Some(Inner { crew, .. }) = inner.take() {
+            std::mem::forget(crew);
         }
     }
 }
@@ -71,9 +66,7 @@ impl Controllers {
             Err(TryLockError::WouldBlock) => Err(BusyError::new_err(
                 "the batch is at work in another thread; give each thread one of its own",
             )),
-            Err(TryLockError::Poisoned(_)) => {
-                Err(StepError::new_err("the batch failed before; make another"))
-            }
+            Err(TryLockError::Poisoned(_)) => Err(broken(Broken)),
         }
     }
 
@@ -88,44 +81,36 @@ impl Controllers {
     fn contract(&self) -> &lads_core::Contract<'_> {
         self.checked.view().contract()
     }
-
-    /// Returns the selected rows: all, or those of a list.
-    fn chosen(&self, rows: Option<Vec<usize>>) -> PyResult<Vec<usize>> {
-        let rows = rows.unwrap_or_else(|| (0..self.count).collect());
-        match rows.iter().find(|&&row| row >= self.count) {
-            None => Ok(rows),
-            Some(row) => Err(InputError::new_err(format!(
-                "row {row}: the batch has {}; give rows from 0 on",
-                self.count
-            ))),
-        }
-    }
 }
 
 #[pymethods]
 impl Controllers {
-    /// Makes `count` controllers of a policy, with `threads` threads (all of the machine's by
-    /// default, never more than controllers). `instruction` is one for all, or a list with one for
-    /// each. The seed of row i is `sample + i` and `noise + i`.
+    /// Makes `count` controllers of a policy, with `threads` threads, of which the caller's is one
+    /// (all of the machine's by default, never more than controllers). `instruction` is one for
+    /// all, or a list with one for each. The seed of row i is `sample + i` and `noise + i`.
     #[new]
     #[pyo3(signature = (policy, count, instruction=None, *, threads=None, sample=None, noise=None, portable=false))]
     fn new(
         policy: &Bound<'_, Policy>,
-        count: usize,
+        count: &Bound<'_, PyAny>,
         instruction: Option<Bound<'_, PyAny>>,
-        threads: Option<usize>,
-        sample: Option<u64>,
-        noise: Option<u64>,
+        threads: Option<Bound<'_, PyAny>>,
+        sample: Option<Bound<'_, PyAny>>,
+        noise: Option<Bound<'_, PyAny>>,
         portable: bool,
     ) -> PyResult<Self> {
-        if count == 0 || threads == Some(0) {
-            return Err(InputError::new_err(
-                "a batch of no controllers or no threads; give one or more",
-            ));
-        }
+        let most = u64::from(u32::MAX);
         let checked = Arc::clone(policy.get().checked());
         let view = checked.view();
         let contract = view.contract();
+        let count = numbers::whole(count, "count", 1, u64::MAX)?;
+        memory::afford(view, count)?;
+        let count = count as usize;
+        let threads = threads
+            .map(|threads| numbers::whole(&threads, "threads", 1, most))
+            .transpose()?;
+        let sample = numbers::seed(sample.as_ref(), "sample")?;
+        let noise = numbers::seed(noise.as_ref(), "noise")?;
         let rows = (0..count as u64).map(|row| {
             let seed = |seed: Option<u64>| seed.map(|seed| seed.wrapping_add(row));
             let settings = Settings {
@@ -133,14 +118,7 @@ impl Controllers {
                 noise: seed(noise),
                 portable,
             };
-            Ok(Row {
-                working: settings.working(&checked)?,
-                report: lads_core::StepReport {
-                    timestep: 0,
-                    selected: None,
-                },
-                failed: None,
-            })
+            Ok(Row::new(settings.working(&checked)?, contract.action_len()))
         });
         let rows = rows.collect::<PyResult<Vec<_>>>()?;
         let staged = contract.observations();
@@ -148,22 +126,17 @@ impl Controllers {
             .map(|channel| Staged::batch(&channel, count))
             .collect();
         let all = || thread::available_parallelism().map_or(1, NonZero::get);
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(threads.unwrap_or_else(all).min(count))
-            .thread_name(|index| format!("lads-{index}"))
-            .build()
-            .map_err(|error| {
+        let threads = threads.map_or_else(all, |threads| threads as usize);
+        let threads = threads.min(count);
+        let inner = Inner {
+            given: vec![false; staged.len()],
+            crew: Crew::start(rows, staged, threads).map_err(|error| {
                 WorkspaceError::new_err(format!(
                     "the threads cannot be started ({error}); ask for fewer"
                 ))
-            })?;
-        let threads = pool.current_num_threads();
-        let inner = Inner {
-            pool,
-            given: vec![false; staged.len()],
-            staged,
+            })?,
             actions: vec![0.0; count * contract.action_len()],
-            rows,
+            reports: Vec::with_capacity(count),
         };
         let batch = Self {
             policy: policy.clone().unbind(),
@@ -193,50 +166,36 @@ impl Controllers {
     ) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
         self.work(|inner| {
             let (count, len) = (self.count, self.contract().action_len());
-            let needed = inner.staged.len();
-            arrays::read(observations, &mut inner.staged, needed, &mut inner.given)?;
-            let target = Target::of(out, "actions", &[count, len])?;
             let Inner {
-                pool,
-                rows,
-                staged,
+                crew,
+                given,
                 actions,
-                ..
+                reports,
             } = &mut *inner;
+            let needed = given.len();
+            arrays::read(observations, &mut crew.order().staged, needed, given)?;
+            let target = Target::of(out, "actions", &[count, len])?;
             let contract = self.contract();
-            let inputs = |i: usize| -> Vec<(ChannelId, Data<'_>)> {
-                staged.iter().map(|row| row.row(i, count)).collect()
-            };
+            let mut failed = vec![];
             let refused = py.detach(|| {
-                let refused: Vec<_> = (0..count)
-                    .filter_map(|i| Some((i, contract.check_observations(&inputs(i)).err()?)))
-                    .collect();
+                let refused = crew.refused(|inputs| contract.check_observations(inputs));
                 if refused.is_empty() {
-                    let step = |(i, (row, action)): (usize, (&mut Row, &mut [f32]))| {
-                        let stepped = row
-                            .working
-                            .with(|controller| controller.step_with(&inputs(i), action));
-                        row.failed = stepped.as_ref().err().copied();
-                        if let Ok(report) = stepped {
-                            row.report = report;
-                        }
-                    };
-                    let all = rows.par_iter_mut().zip(actions.par_chunks_mut(len));
-                    pool.install(|| all.enumerate().for_each(step));
+                    reports.clear();
+                    crew.step(|i, row| {
+                        actions[i * len..(i + 1) * len].copy_from_slice(&row.action);
+                        reports.push(row.report);
+                        failed.extend(row.failed.map(|error| (i, error)));
+                    })?;
                 }
-                refused
+                Ok(refused)
             });
+            let refused = refused.map_err(broken)?;
             if !refused.is_empty() {
                 let rows = refused
                     .iter()
                     .map(|(i, error)| format!("row {i}: {}", lads_host::refused(error, contract)));
                 return Err(errors::input(rows.collect::<Vec<_>>().join(", ")));
             }
-            let failed: Vec<_> = rows
-                .iter()
-                .enumerate()
-                .filter_map(|(i, row)| Some((i, row.failed?)))
-                .collect();
             if let Some((_, first)) = failed.first() {
                 let rows: Vec<_> = failed.iter().map(|(i, _)| i.to_string()).collect();
                 let error = errors::step(first, contract);
@@ -247,7 +206,7 @@ impl Controllers {
                 );
                 return Err(PyErr::from_type(error.get_type(py), text));
             }
-            Ok((target.put(py, actions)?, report(py, rows)?))
+            Ok((target.put(py, actions)?, report(py, reports)?))
         })
     }
 
@@ -258,9 +217,9 @@ impl Controllers {
         &self,
         py: Python<'_>,
         instruction: &Bound<'_, PyAny>,
-        rows: Option<Vec<usize>>,
+        rows: Option<Bound<'_, PyAny>>,
     ) -> PyResult<()> {
-        let chosen = self.chosen(rows)?;
+        let chosen = numbers::rows(rows.as_ref(), self.count)?;
         let told =
             if instruction.is_instance_of::<PyList>() || instruction.is_instance_of::<PyTuple>() {
                 let each = instruction.try_iter()?.collect::<PyResult<Vec<_>>>()?;
@@ -277,27 +236,33 @@ impl Controllers {
                 vec![Told::of(&self.checked, instruction)?]
             };
         self.work(|inner| {
+            let crew = &inner.crew;
             let done = py.detach(|| {
-                chosen.iter().enumerate().try_for_each(|(place, &row)| {
+                for (place, &row) in chosen.iter().enumerate() {
                     let told = &told[place.min(told.len() - 1)];
-                    inner.rows[row]
+                    let done = crew
+                        .row(row)?
                         .working
-                        .with(|controller| controller.set_instruction(told.as_instruction()))
-                })
+                        .with(|controller| controller.set_instruction(told.as_instruction()));
+                    if done.is_err() {
+                        return Ok(done);
+                    }
+                }
+                Ok(Ok(()))
             });
-            done.map_err(|error| errors::instruction(&error))
+            done.map_err(broken)?
+                .map_err(|error| errors::instruction(&error))
         })
     }
 
     /// Starts new episodes in `rows`, all by default.
     #[pyo3(signature = (rows=None))]
-    fn reset(&self, rows: Option<Vec<usize>>) -> PyResult<()> {
-        let chosen = self.chosen(rows)?;
+    fn reset(&self, rows: Option<Bound<'_, PyAny>>) -> PyResult<()> {
+        let chosen = numbers::rows(rows.as_ref(), self.count)?;
         self.work(|inner| {
             for row in chosen {
-                inner.rows[row]
-                    .working
-                    .with(|controller| controller.reset());
+                let mut row = inner.crew.row(row).map_err(broken)?;
+                row.working.with(|controller| controller.reset());
             }
             Ok(())
         })
@@ -316,7 +281,8 @@ impl Controllers {
                 &[self.count, len],
                 &mut done,
             )?;
-            for (row, done) in inner.rows.iter_mut().zip(done.chunks_exact(len)) {
+            for (i, done) in done.chunks_exact(len).enumerate() {
+                let mut row = inner.crew.row(i).map_err(broken)?;
                 let told = row.working.with(|controller| controller.executed(done));
                 told.map_err(|error| errors::step(&error, self.contract()))?;
             }
@@ -361,27 +327,28 @@ impl Controllers {
     }
 }
 
+/// Makes the exception for a batch in which a step panicked.
+fn broken(_: Broken) -> PyErr {
+    StepError::new_err("the batch failed before; make another")
+}
+
 /// Returns the reports of all rows as arrays.
-fn report<'py>(py: Python<'py>, rows: &[Row]) -> PyResult<Bound<'py, PyAny>> {
-    let timesteps: Vec<_> = rows
-        .iter()
-        .map(|row| i64::from(row.report.timestep))
-        .collect();
-    let selected: Vec<_> = rows.iter().filter_map(|row| row.report.selected).collect();
-    let arrays = (selected.len() == rows.len()).then(|| {
-        let indices: Vec<_> = selected.iter().map(|it| i64::from(it.index)).collect();
-        let margins: Vec<_> = selected.iter().map(|it| it.margin).collect();
-        let fresh: Vec<_> = selected.iter().map(|it| it.fresh).collect();
-        (
-            PyArray1::from_vec(py, indices),
-            PyArray1::from_vec(py, margins),
-            PyArray1::from_vec(py, fresh),
-        )
-    });
-    let timesteps = PyArray1::from_vec(py, timesteps);
-    let class = py.import("lads.vector")?.getattr("Report")?;
-    match arrays {
-        Some((indices, margins, fresh)) => class.call1((timesteps, indices, margins, fresh)),
-        None => class.call1((timesteps, py.None(), py.None(), py.None())),
+fn report<'py>(py: Python<'py>, rows: &[StepReport]) -> PyResult<Bound<'py, PyAny>> {
+    static CLASS: PyOnceLock<Py<PyType>> = PyOnceLock::new();
+    let class = CLASS.import(py, "lads.vector", "Report")?;
+    let timesteps = rows.iter().map(|row| i64::from(row.timestep));
+    let timesteps = PyArray1::from_vec(py, timesteps.collect());
+    let selected: Vec<_> = rows.iter().filter_map(|row| row.selected).collect();
+    if selected.len() < rows.len() {
+        return class.call1((timesteps, py.None(), py.None(), py.None()));
     }
+    let indices = selected.iter().map(|it| i64::from(it.index));
+    let margins = selected.iter().map(|it| it.margin);
+    let fresh = selected.iter().map(|it| it.fresh);
+    class.call1((
+        timesteps,
+        PyArray1::from_vec(py, indices.collect()),
+        PyArray1::from_vec(py, margins.collect()),
+        PyArray1::from_vec(py, fresh.collect()),
+    ))
 }

@@ -14,6 +14,7 @@ use pyo3::types::PyString;
 use crate::arrays::{self, Staged, Target};
 use crate::cell::{Checked, Working};
 use crate::errors::{self, BusyError, ClosedError, InstructionError, StepError, WorkspaceError};
+use crate::numbers;
 use crate::policy::Policy;
 use crate::process::Process;
 use crate::report::StepReport;
@@ -290,9 +291,10 @@ impl Controller {
         &self,
         py: Python<'py>,
         observation: &Bound<'py, PyAny>,
-        index: u32,
+        index: &Bound<'py, PyAny>,
         out: Option<Bound<'py, PyAny>>,
     ) -> PyResult<Bound<'py, PyAny>> {
+        let index = numbers::whole(index, "index", 0, u64::from(u32::MAX))? as u32;
         self.work(|inner| {
             inner.read(observation)?;
             let target = Target::of(out, "action", &[inner.action.len()])?;
@@ -318,12 +320,23 @@ impl Controller {
     }
 
     /// Brings code, weights and caches into the processor's caches; call it right before the first
-    /// step or after a pause.
+    /// step or after a pause, such as a millisecond before a step is due.
     fn warm(&self, py: Python<'_>) -> PyResult<()> {
         self.work(|inner| {
             let working = &mut inner.working;
             py.detach(|| working.with(|controller| controller.warm()));
-            Ok(())
+            // What a step does besides, with arrays of its own: the next one reads all of it anew.
+            for row in &mut inner.staged[..inner.needed] {
+                row.warm(py)?;
+            }
+            let shape = [inner.action.len()];
+            let out = PyArray1::from_slice(py, &inner.action).into_any();
+            Target::of(Some(out), "action", &shape)?.put(py, &inner.action)?;
+            let report = lads_core::StepReport {
+                timestep: 0,
+                selected: None,
+            };
+            Py::new(py, StepReport::from(report)).map(drop)
         })
     }
 

@@ -15,6 +15,7 @@ use crate::arrays;
 use crate::cell::{Checked, Working};
 use crate::controller::{Controller, Settings, Told};
 use crate::errors::{self, InstructionError, OpenError, SelfTestError, WorkspaceError, opening};
+use crate::numbers;
 
 /// A policy that was read and checked. It never changes and may be used by any number of threads.
 #[pyclass(frozen, module = "lads")]
@@ -40,14 +41,20 @@ pub fn open(
     weights: Option<&str>,
     low_level: Option<&str>,
     cache: Option<&str>,
-    tolerance: Option<f32>,
+    tolerance: Option<Bound<'_, PyAny>>,
     force: bool,
 ) -> PyResult<Policy> {
-    if tolerance.is_some_and(|tolerance| !(tolerance.is_finite() && tolerance > 0.0)) {
-        return Err(OpenError::new_err(
-            "tolerance: it has to be a positive number; give the largest difference of an action that is accepted",
-        ));
-    }
+    let tolerance = tolerance
+        .map(|given| {
+            let given = numbers::real::<OpenError>(&given, "tolerance")? as f32;
+            if given.is_finite() && given > 0.0 {
+                return Ok(given);
+            }
+            Err(OpenError::new_err(
+                "tolerance: it has to be a positive number of 32 bits; give the largest difference of an action that is accepted",
+            ))
+        })
+        .transpose()?;
     let weight = |what, name: Option<&str>| {
         let found = name.map(|name| format(what, name, WeightFormat::ALL, WeightFormat::name));
         found.transpose()
@@ -109,7 +116,8 @@ fn format<T: Copy, const N: usize>(
     let found = known.into_iter().find(|&format| name_of(format) == name);
     found.ok_or_else(|| {
         OpenError::new_err(format!(
-            "{what} '{name}': no such format; known are {}",
+            "{what} '{}': no such format; known are {}",
+            errors::shown(name),
             known.map(name_of).join(", ")
         ))
     })
@@ -331,13 +339,13 @@ impl Policy {
     fn controller(
         slf: &Bound<'_, Self>,
         instruction: Option<Bound<'_, PyAny>>,
-        sample: Option<u64>,
-        noise: Option<u64>,
+        sample: Option<Bound<'_, PyAny>>,
+        noise: Option<Bound<'_, PyAny>>,
         portable: bool,
     ) -> PyResult<Controller> {
         let settings = Settings {
-            sample,
-            noise,
+            sample: numbers::seed(sample.as_ref(), "sample")?,
+            noise: numbers::seed(noise.as_ref(), "noise")?,
             portable,
         };
         let controller = Controller::of(slf, settings)?;

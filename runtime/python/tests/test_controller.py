@@ -23,6 +23,22 @@ def test_a_golden_episode_of_every_kind(bundles, kind):
     assert np.abs(replay(controller, golden) - golden.actions).max() <= golden.tolerance, "again after a reset"
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_warming_changes_nothing(bundles, kind):
+    policy = lads.open(bundles[kind])
+    golden = policy.golden
+    controller = policy.controller(golden.instruction)
+    controller.warm()
+    for step in range(10):
+        given = {name: values[step] for name, values in golden.observations.items()}
+        if golden.noise.shape[1]:
+            given["noise"] = golden.noise[step]
+        action, report = controller.step(given)
+        assert np.abs(action - golden.actions[step]).max() <= golden.tolerance and report.timestep == step
+        controller.warm()
+        assert np.array_equal(controller.last_action, action)
+
+
 def test_channels_are_given_by_name(bundles):
     policy = lads.open(bundles["camera"])
     names = [channel.name for channel in policy.contract.observations]

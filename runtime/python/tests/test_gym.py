@@ -91,7 +91,7 @@ def test_progress_is_told(plain):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ({"episodes": 0}, "0 episodes in 1 processes"),
+        ({"episodes": 0}, "episodes is 0; give 1 or more"),
         ({"max_steps": 0}, "max_steps is 0; give 1 or more"),
         ({"make_env": lambda: environments.Servo(observe=5), "observation": lambda seen: seen[:5]}, r"episode 0: channel 'observation': the environment gives shape \(5,\), the policy takes \(8,\); give observation="),
         ({"observation": lambda seen: {"camera": seen}}, "episode 0: the environment's observation has no 'observation', it has 'camera'"),

@@ -304,7 +304,7 @@ def narrow():
     ("arguments", "error", "text"),
     [
         ({"reference": lambda seen: np.zeros(4)}, lads.errors.ProofError, r"the reference gives an action of shape \(4,\), the contract says \(3,\)"),
-        ({"episodes": 0}, lads.errors.ProofError, "0 episodes of which"),
+        ({"episodes": 0}, lads.errors.ProofError, "episodes is 0; give 1 or more"),
         ({"make_env": lambda: gymnasium.make("Pendulum-v1"), "observation": environments.fill, "action": lambda action: action[:1]}, lads.errors.EvaluationError, "says nothing about success; give success="),
         ({"success": "won"}, lads.errors.EvaluationError, "no 'won'; give success="),
         ({"max_steps": 0}, lads.errors.EvaluationError, "max_steps is 0"),

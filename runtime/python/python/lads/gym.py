@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from . import _lads
+from . import _lads, _numbers
 from .errors import EvaluationError, LadsError
 from .rollout import Rollout, Rules, command, convert, episode_seed, play
 
@@ -56,6 +56,10 @@ class Rate:
     """Number of episodes in which it happened."""
     episodes: int
     """Number of episodes in which it could happen."""
+
+    def __post_init__(self) -> None:
+        _numbers.whole("episodes", self.episodes, 1, _numbers.SEED, EvaluationError)
+        _numbers.whole("count", self.count, 0, self.episodes, EvaluationError)
 
     @property
     def rate(self) -> float:
@@ -146,15 +150,19 @@ def evaluate(
     `Policy`. With several processes all of this has to be picklable (with cloudpickle, where that is installed). `progress` is a callable of
     (finished, all), or False; by default progress is shown on a terminal.
     """
-    if episodes < 1 or processes < 1:
-        raise EvaluationError(f"{episodes} episodes in {processes} processes; give one or more of each")
+    _numbers.instance("controller", controller, _lads.Controller, "policy.controller(...)")
+    episodes = _numbers.whole("episodes", episodes, 1, _numbers.MOST, EvaluationError)
+    processes = _numbers.whole("processes", processes, 1, _numbers.MOST, EvaluationError)
+    seed, sub_tasks = _numbers.whole("seed", seed, error=EvaluationError), _numbers.names("sub_tasks", sub_tasks)
+    _numbers.instance("make_env", make_env, Callable, "a callable")
+    _numbers.callables(observation=observation, action=action)
     job = _Job(
         controller.policy,
         controller._settings,
         controller._instruction,
         make_env,
         seed,
-        Rules(options, max_steps, success, tuple(sub_tasks), completed),
+        Rules(options, max_steps, success, sub_tasks, completed),
         observation,
         action,
     )

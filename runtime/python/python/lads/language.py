@@ -20,6 +20,7 @@ _MODEL, _TOKENIZER, _MANIFEST = "encoder.onnx", "tokenizer.json", "manifest.json
 _AGAIN = "export it again with `python -m lads_exporter language`"
 _TOLERANCE = 1e-3  # of a word's elements: the same encoder in another engine
 _SHOWN = 60
+_LONGEST = 10_000  # letters: a tokeniser takes its time for more, only to find that they are too many
 
 
 def default_folder(encoder: str) -> Path:
@@ -42,6 +43,8 @@ class Encoder:
     """
 
     def __init__(self, policy: Policy, folder: str | os.PathLike[str] | None = None) -> None:
+        if not hasattr(policy, "contract"):
+            raise TypeError(f"policy: it is a {type(policy).__name__}; give what lads.open returns")
         language, known = policy.contract.language, policy.contract.instructions
         if language is None or not known:
             raise LanguageError(f"{policy.path}: the policy takes no instructions, so no sentence can be put to it; leave the sentence out")
@@ -138,6 +141,8 @@ class Encoder:
     def _tokens(self, text):
         if not isinstance(text, str):
             raise LanguageError(f"a sentence is a str, not {type(text).__name__}; give the text of an instruction")
+        if len(text) > _LONGEST:
+            raise LanguageError(f"{_shown(text)}: a sentence of {len(text)} letters; no language encoder takes as many, use fewer words")
         try:
             found = self._tokenizer.encode(text)
         except Exception as error:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from . import _lads
+from . import _lads, _numbers
 from .errors import RecordError
 
 
@@ -34,8 +34,13 @@ class Recorder:
         notes: Mapping[str, str] | None = None,
     ) -> None:
         self.controller = controller
+        _numbers.instance("path", path, (str, os.PathLike), "a str or a pathlib.Path")
+        _numbers.instance("noise", noise, str, "a str")
+        _numbers.instance("notes", {} if notes is None else notes, Mapping, "a dictionary of str")
+        for text in (text for row in (notes or {}).items() for text in row):
+            _numbers.instance("notes", text, str, "a dictionary of str")
         self.path = os.fspath(path)
-        self._head = (seed, noise, dict(notes or {}))
+        self._head = (_numbers.whole("seed", seed, 0, _numbers.SEED, RecordError), noise, dict(notes or {}))
         self._episodes: list[dict[str, Any]] = []
         self._steps: list[dict[str, Any]] = []
         _lads.check_log(controller.policy, self.path, *self._head)
@@ -88,6 +93,7 @@ class Recorder:
 
     def end(self, success: bool = False, completions: Sequence[tuple[str, int]] = ()) -> None:
         """Ends the episode with its outcome: `success`, and sub-tasks with the first step, from 1, after which they were done."""
+        completions = _completions(completions)
         if not self._steps:
             return
         told = self.controller._instruction
@@ -103,7 +109,7 @@ class Recorder:
                 "sample": sample,
                 "noise": noise,
                 "success": bool(success),
-                "completions": [(str(name), int(step)) for name, step in completions],
+                "completions": completions,
             }
         )
         self._steps = []
@@ -119,3 +125,12 @@ class Recorder:
     def __exit__(self, error: object, *_: object) -> None:
         if error is None:
             self.close()
+
+
+def _completions(given):
+    """Returns pairs of a sub-task's name and a control step."""
+    try:
+        rows = [(str(name), step) for name, step in given]
+    except (TypeError, ValueError) as error:
+        raise RecordError(f"completions: it is no list of pairs ({error}); give [(name of a sub-task, control step), ...]") from None
+    return [(name, _numbers.whole("completions", step, 0, _numbers.MOST, RecordError)) for name, step in rows]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from . import _numbers
 from .errors import EvaluationError, InputError
 
 SUCCESS = ("is_success", "success")
@@ -46,8 +47,8 @@ class Rules:
     """Names of the sub-tasks that are done: a key of `info`, or a callable of it."""
 
     def __post_init__(self):
-        if self.max_steps is not None and self.max_steps < 1:
-            raise EvaluationError(f"max_steps is {self.max_steps}; give 1 or more, or None for episodes as long as the environment's")
+        if self.max_steps is not None:
+            _numbers.whole("max_steps", self.max_steps, 1, error=EvaluationError)
 
     def reset_options(self, episode):
         """Returns the options of `reset`."""
@@ -82,6 +83,7 @@ class Rules:
 
 def episode_seed(seed, episode):
     """Returns the seed of an episode, of 32 bits, independent of other episodes and of the process."""
+    seed, episode = (_numbers.whole(name, value, error=EvaluationError) for name, value in (("seed", seed), ("episode", episode)))
     return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
 
 

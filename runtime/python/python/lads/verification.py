@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from . import _lads
+from . import _lads, _numbers
 from .errors import EvaluationError, LadsError, ProofError
 from .rollout import Rollout, Rules, command, convert, play
 
@@ -92,12 +92,22 @@ def verify(
     is compared, by default the observation. `control_period` is the reference's, in seconds, by default the environment's `dt`; without
     either the contract is not compared, and nothing is EQUIVALENT. The other arguments are those of `lads.gym.evaluate`. 59 episodes are the fewest that can be EQUIVALENT, 146 with four sub-tasks.
     """
-    if not 1 <= traced or episodes < 1:
-        raise ProofError(f"{episodes} episodes of which {traced} are traced; give one or more of each")
-    known = list(instructions) if instructions is not None else [controller.instruction or ""]
+    _numbers.instance("controller", controller, _lads.Controller, "policy.controller(...)")
+    for name, value in (("reference", reference), ("make_env", make_env)):
+        _numbers.instance(name, value, Callable, "a callable")
+    _numbers.callables(observation=observation, action=action, state=state)
+    episodes, traced = (_numbers.whole(name, value, 1, _numbers.MOST, ProofError) for name, value in (("episodes", episodes), ("traced", traced)))
+    seed = _numbers.whole("seed", seed, 0, _numbers.SEED, ProofError)
+    control_period = control_period if control_period is None else _numbers.real("control_period", control_period, ProofError)
+    known = list(_numbers.names("instructions", instructions, ProofError)) if instructions is not None else [controller.instruction or ""]
+    if not known:
+        raise ProofError("instructions: none is given; give one or more, or leave them out")
     if instructions is None and controller.policy.contract.context.words and not known[0]:
         raise ProofError("the controller follows no known instruction; give instructions=, or a controller that does")
-    tasks = [tuple(sub_tasks[row] if isinstance(sub_tasks, Mapping) else sub_tasks) for row in known]
+    missing = [row for row in known if row not in sub_tasks] if isinstance(sub_tasks, Mapping) else []
+    if missing:
+        raise ProofError(f"sub_tasks: it has none of {missing[0]!r}; give those of every instruction")
+    tasks = [_numbers.names("sub_tasks", sub_tasks[row] if isinstance(sub_tasks, Mapping) else sub_tasks, ProofError) for row in known]
     setting = _Setting(controller, make_env, seed, min(traced, episodes), observation, action, state)
     report = progress if callable(progress) else _progress(progress)
     environment = make_env()
