@@ -4,11 +4,14 @@
     .venv/bin/python benches/python.py [--seconds 10] [--rust target/release/examples/step_cost]
 
 Contenders are measured in turns, a share of some milliseconds at a time; the fastest share of each counts when hot, the median at a control
-period. Needs the exporter's environment (PyTorch, ONNX Runtime).
+period. It asks for SCHED_FIFO, with which other programs take its memory bandwidth and caches but not its cores, and says whether it was
+granted. Needs the exporter's environment (PyTorch, ONNX Runtime).
 """
 
 import argparse
 import gc
+import os
+import platform
 import statistics
 import subprocess
 import sys
@@ -29,6 +32,8 @@ from lads_exporter.twin import Entry  # noqa: E402
 
 # Seconds of a share: shorter than what a busy system gives a process at a time, so that the fastest one was not interrupted.
 SHARE = 0.002
+# Seconds before its deadline at which a contender that warms up does so.
+LEAD = 0.001
 
 
 def hot(contenders, seconds):
@@ -51,24 +56,31 @@ def hot(contenders, seconds):
     return best
 
 
-def paced(contenders, seconds, rate=50):
-    """Measures the contenders at a control period, in turns call by call: microseconds of one call of each, median."""
+def paced(contenders, seconds, warming=None, rate=50):
+    """Measures the contenders at a control period, in turns call by call: microseconds of one call of each, median.
+
+    What `warming` has for a contender is called shortly before its deadline and not measured.
+    """
     found = {name: [] for name in contenders}
     deadline = time.perf_counter()
+    until = lambda moment: time.sleep(max(0.0, moment - time.perf_counter()))
     for _ in range(int(seconds * rate)):
         for name, call in contenders.items():
             deadline += 1 / rate
-            time.sleep(max(0.0, deadline - time.perf_counter()))
+            if warming:
+                until(deadline - LEAD)
+                warming[name]()
+            until(deadline)
             start = time.perf_counter()
             call()
             found[name].append((time.perf_counter() - start) * 1e6)
     return {name: statistics.median(times) for name, times in found.items()}
 
 
-def stepper(policy):
+def stepper(policy, controller=None):
     """Makes a call of `step` on the golden episode's first observation."""
     golden = policy.golden
-    controller = policy.controller(golden.instruction)
+    controller = controller or policy.controller(golden.instruction)
     (seen,) = (values[0].copy() for values in golden.observations.values())
     out = np.zeros(policy.contract.action.shape, np.float32)
     return lambda: controller.step(seen, out)
@@ -88,13 +100,29 @@ def beside_rust(program, path, policy, seconds):
 
 
 def scaling(policy, seconds, count=8):
-    """Measures a step of 8 controllers on one thread and on two, in microseconds."""
+    """Measures a step of 8 controllers on one thread and on two, in microseconds: hot, and at a control period."""
     golden = policy.golden
     (seen,) = (np.repeat(values[:1], count, 0) for values in golden.observations.values())
     out = np.zeros((count, *policy.contract.action.shape), np.float32)
     batches = {threads: Controllers(policy, count, golden.instruction, threads=threads) for threads in (1, 2)}
-    best = hot({threads: lambda batch=batch: batch.step(seen, out) for threads, batch in batches.items()}, seconds)
-    return best[1], best[2]
+    calls = {threads: lambda batch=batch: batch.step(seen, out) for threads, batch in batches.items()}
+    return hot(calls, seconds), paced(calls, seconds)
+
+
+def alone():
+    """Asks the system not to give this process's cores to ordinary ones -> what it granted."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(20))
+    except (AttributeError, OSError):
+        return "other programs get in between"
+    return "SCHED_FIFO"
+
+
+def processor():
+    """Returns the processor's name, as far as the system says it."""
+    told = Path("/proc/cpuinfo")
+    names = [line.split(":")[1].strip() for line in told.read_text().splitlines() if line.startswith("model name")] if told.exists() else []
+    return f"{os.cpu_count()} cores of {names[0] if names else platform.processor() or platform.machine()}"
 
 
 def importing():
@@ -134,9 +162,17 @@ def main():
         session = Entry(model, bundles.ENTRY).session
         (seen,) = (values[0].copy() for values in legged.golden.observations.values())
         given = {f"{bundles.ENTRY}/observation": seen[None]}
+        print(f"{processor()}, {alone()}, load {os.getloadavg()[0]:.1f}, {time.strftime('%Y-%m-%d')}, lads {lads.__version__}")
         print(f"policy {'-'.join(map(str, bundles.LEGGED))}, Elu")
-        contenders = {"lads": stepper(legged), "onnxruntime": lambda: session.run(None, given)}
-        for name, found in (("hot", hot(contenders, arguments.seconds)), ("at 50 Hz", paced(contenders, arguments.seconds))):
+        controller, run = legged.controller(), lambda: session.run(None, given)
+        contenders = {"lads": stepper(legged, controller), "onnxruntime": run}
+        # Each by its own means: what brings its code and weights into the caches.
+        warming = {"lads": controller.warm, "onnxruntime": run}
+        for name, found in (
+            ("hot", hot(contenders, arguments.seconds)),
+            ("at 50 Hz", paced(contenders, arguments.seconds)),
+            ("at 50 Hz, warmed 1 ms before", paced(contenders, arguments.seconds, warming)),
+        ):
             ratio = found["lads"] / found["onnxruntime"]
             print(f"  {name}: lads {found['lads']:.2f} us, onnxruntime {found['onnxruntime']:.2f} us, ratio {ratio:.2f}")
         kitchen = lads.open(PROJECT / "models/kitchen.onnx")
@@ -144,8 +180,8 @@ def main():
             for name, policy in ((str(path), legged), (str(PROJECT / "models/kitchen.onnx"), kitchen)):
                 python, native = beside_rust(arguments.rust, name, policy, arguments.seconds)
                 print(f"  step of {Path(name).stem}: from Python {python:.2f} us, from Rust {native:.2f} us, {python - native:+.2f} us")
-        one, two = scaling(kitchen, arguments.seconds)
-        print(f"8 controllers of kitchen: one thread {one:.0f} us, two {two:.0f} us, {one / two:.2f} times faster")
+        for name, found in zip(("hot", "at 50 Hz"), scaling(kitchen, arguments.seconds)):
+            print(f"8 controllers of kitchen, {name}: one thread {found[1]:.0f} us, two {found[2]:.0f} us, {found[1] / found[2]:.2f} times faster")
         print(f"import: {importing():.1f} ms")
         grown, each = leak(legged, arguments.controllers)
         print(f"{arguments.controllers} controllers: {grown} kB more memory, {each:.0f} us each")
