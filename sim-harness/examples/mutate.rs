@@ -408,6 +408,7 @@ const HEADING: &str = "| kind | change | verdict | largest logit | largest actio
                        sub-tasks done | first reason |\n|---|---|---|---|---|---|---|---|---|---|";
 
 fn run(arguments: &Arguments) -> Result<bool, String> {
+    type Changes = fn(&mut Bench);
     let outputs = arguments.output.iter();
     let outputs: Vec<_> = outputs.map(|path| ("--output", path.as_path())).collect();
     let (model, beside) = (
@@ -430,7 +431,7 @@ fn run(arguments: &Arguments) -> Result<bool, String> {
     };
     println!("{HEADING}");
     harmless(&mut bench);
-    let kinds: [(Kind, fn(&mut Bench)); 3] = [
+    let kinds: [(Kind, Changes); 3] = [
         (Kind::Weights, weights),
         (Kind::Contract, contract),
         (Kind::Options, options),

@@ -112,7 +112,7 @@ fn a_library_names_no_make_target_and_no_option() {
 
 #[test]
 fn what_a_text_names_is_found() {
-    let source = r##"
+    let source = r#"
         // "make reference" in a comment
         const A: &str = "say \"it\", make reference";
         const B: char = '"';
@@ -120,7 +120,7 @@ fn what_a_text_names_is_found() {
         const C: &str = "make one, a - b, make room";
         #[cfg(test)]
         mod tests { const D: &str = "make reference"; }
-    "##;
+    "#;
     let source = source.replace("        ", "");
     let texts = texts(&source);
     assert_eq!(texts.len(), 3, "{texts:?}");
