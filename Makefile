@@ -115,21 +115,36 @@ BOUNDARY = --target $(HOST) -p lads-ffi --test boundary
 PADDED = --skip touches_no_byte
 MEMCHECK = CARGO_TARGET_$(shell echo $(HOST) | tr a-z- A-Z_)_RUNNER="valgrind --quiet --error-exitcode=99" PROPTEST_CASES=8
 
-## sanitize: the tests of kernels, core and C boundary with AddressSanitizer, then under valgrind; some minutes
+# Small random policies of every family. Where the exporter's environment (PyTorch) is, sanitizers and fuzzers see the images of all of them.
+FAMILIES := target/families
+WITH_FAMILIES := $(if $(wildcard $(VENV)/stamp),LADS_FAMILIES=$(abspath $(FAMILIES)))
+FAMILY = --target $(HOST) -p lads-tests --test families
+
+$(FAMILIES)/stamp: tests/parity/families.py $(wildcard exporter/lads_exporter/*.py exporter/lads_exporter/*/*.py)
+	$(PY) tests/parity/families.py $(FAMILIES)
+	touch $@
+
+## sanitize: the tests of kernels, core and C boundary with AddressSanitizer, then under valgrind, and the images of every family where the
+##           exporter's environment is; some minutes
 sanitize: export RUSTC_BOOTSTRAP = 1
-sanitize:
+sanitize: $(if $(WITH_FAMILIES),$(FAMILIES)/stamp)
 	RUSTFLAGS=-Zsanitizer=address cargo test --target-dir target/sanitize $(SANITIZED) -- $(COUNTED)
 	RUSTFLAGS=-Zsanitizer=address cargo test --target-dir target/sanitize $(BOUNDARY)
 	$(MEMCHECK) cargo test --target-dir target/sanitize/plain $(SANITIZED) -- $(COUNTED) --skip subnormal_numbers_are_zero --skip as_exact_as
 	$(MEMCHECK) cargo test --target-dir target/sanitize/plain $(BOUNDARY) -- $(PADDED)
+ifneq ($(WITH_FAMILIES),)
+	$(WITH_FAMILIES) RUSTFLAGS=-Zsanitizer=address cargo test --target-dir target/sanitize $(FAMILY) -- --ignored --skip damaged
+else
+	@echo "skipped: images of every family, which need the exporter's environment: make $(VENV)/stamp"
+endif
 
 # cargo-fuzz and a nightly toolchain are needed; what is found lies in tests/fuzz/artifacts.
 FUZZ_SECONDS ?= 60
 
 ## fuzz: hostile images and bundles, FUZZ_SECONDS=60 each; needs a nightly toolchain and cargo-fuzz
-fuzz:
-	cd tests && cargo +nightly fuzz run image -- -max_len=256 -max_total_time=$(FUZZ_SECONDS)
-	cd tests && cargo +nightly fuzz run bundle -- -max_total_time=$(FUZZ_SECONDS)
+fuzz: $(if $(WITH_FAMILIES),$(FAMILIES)/stamp)
+	cd tests && $(WITH_FAMILIES) cargo +nightly fuzz run image -- -max_len=256 -max_total_time=$(FUZZ_SECONDS)
+	cd tests && $(WITH_FAMILIES) cargo +nightly fuzz run bundle -- -max_total_time=$(FUZZ_SECONDS)
 
 ## package: the crates that are published, packed as a registry would get them, without building them; PACKAGE_ARGS= builds them from the packages
 PACKAGE_ARGS ?= --no-verify
@@ -276,9 +291,10 @@ verify: setup
 tune: setup
 	cargo run --release -p lads-sim --bin lads-run -- tune --model $(MODEL) $(ARGS)
 
-## mutate: changes of every kind to $(MODEL), what each moves and what its verification says; minutes
+## mutate: changes of every kind to $(MODEL), what each moves, what its verification says and what is left of its success; an hour. ARGS="-o rows.md"
+##         writes the row of each; ARGS="--every 3 --run-every 8" asks and runs fewer episodes, minutes
 mutate: setup
-	cargo run --release -p lads-sim --example mutate -- $(MODEL)
+	cargo run --release -p lads-sim --example mutate -- $(MODEL) $(ARGS)
 
 # OpenVINO is a peer of the benchmarks only; where it does not install, the page says so.
 $(VENV)/bench-stamp: $(VENV)/stamp

@@ -15,21 +15,15 @@ from programs import ROOT, SELECTION, newest
 
 pytest.importorskip("onnxruntime")
 pytest.importorskip("lads_exporter.episode")
-from lads_exporter import bundle, episode, kinds  # noqa: E402
-
-# The Makefile's: with another one cargo would build its dependencies once more.
-KINDS = ("lads", "lang_dt", "lisa", "vae", "lcsd", "skilldiffuser", "history", "vae_history", "plain", "recurrent", "stacked", "camera", "images", "frozen_lang_dt", "frozen_lisa", "frozen_vae_history", "sighted", "sighted_history", "sighted_lang_dt", "sighted_lisa", "sighted_vae")
-STEPS = 200
+from families import KINDS, fill  # noqa: E402
+from lads_exporter import bundle, kinds  # noqa: E402
 
 
 @pytest.fixture(scope="module")
 def families(tmp_path_factory):
     """Makes the folder with a bundle and an episode of each kind."""
     folder = tmp_path_factory.mktemp("families")
-    for kind in KINDS:
-        _, model = kinds.export(kind, seed=0)
-        bundle.save(model, folder / f"{kind}.onnx")
-        episode.write(folder / f"{kind}.onnx", folder / f"{kind}.safetensors", STEPS, seed=0)
+    fill(folder)
     return folder
 
 
