@@ -2,7 +2,7 @@
 //! ONNX Runtime.
 //!
 //! `python -m lads_exporter random` makes the bundles and `python -m lads_exporter episode` the episodes; `lads_exporter/episode.py` says
-//! what is in one. `tests/parity/test_families.py` makes them all, in the folder that [`FOLDER`] names.
+//! what is in one. `tests/parity/families.py` makes them all, in the folder that [`FOLDER`] names.
 
 use std::path::{Path, PathBuf};
 
@@ -45,7 +45,7 @@ pub const KINDS: [&str; 21] = [
 pub fn folder() -> PathBuf {
     let named = std::env::var_os(FOLDER);
     named.map_or_else(
-        || panic!("{FOLDER} names no folder; run tests/parity/test_families.py"),
+        || panic!("{FOLDER} names no folder; make one: python tests/parity/families.py FOLDER"),
         PathBuf::from,
     )
 }
