@@ -24,6 +24,9 @@ pub struct Request {
     /// where exporters put them
     #[arg(long, value_name = "FILE")]
     beside: Vec<PathBuf>,
+    /// Leave out the files that lie in those places
+    #[arg(long)]
+    alone: bool,
     /// Path of the bundle to write; by default the policy's name with .lads.onnx
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
@@ -60,6 +63,7 @@ pub fn import(request: &Request) -> Result<(), Refusal> {
         models: request.models.iter().map(PathBuf::as_path).collect(),
         robot: request.contract.as_deref(),
         beside: request.beside.iter().map(PathBuf::as_path).collect(),
+        alone: request.alone,
         output: request.action.as_deref(),
         states: request.state.clone(),
         wires: request.wire.clone(),

@@ -23,6 +23,7 @@ use lads_image::op::{BinaryKind, PoolKind, ReduceKind, UnaryKind};
 
 use crate::tensor::{Data, Tensor};
 
+pub(crate) use build::EMPTY;
 #[cfg(test)]
 pub(crate) use eval::apply;
 pub(crate) use eval::{MAX_FOLDING, Value, cost, evaluate, fold};

@@ -30,7 +30,7 @@ use std::sync::Arc;
 
 use crate::entries::{self, Signature};
 use crate::error::CompileError;
-use crate::graph::{Graph, Id, show};
+use crate::graph::{EMPTY, Graph, Id, show};
 use crate::onnx::{GraphProto, ModelProto, NodeProto, TensorProto};
 use crate::tensor::Tensor;
 
@@ -38,8 +38,8 @@ use attributes::Attributes;
 use sequences::Given;
 pub(crate) use trial::{Declared, Refused, trial};
 
-/// Operator sets that the translations were written for.
-const OPSETS: std::ops::RangeInclusive<i64> = 7..=28;
+/// Versions of ONNX's operator set that are read.
+pub const OPSETS: std::ops::RangeInclusive<i64> = 7..=28;
 
 /// Largest number of nodes of an entry; an LSTM counts its steps.
 const MAX_NODES: usize = 1 << 16;
@@ -224,11 +224,13 @@ impl Builder<'_, '_> {
         }
         let mut inputs = vec![];
         for name in &node.input {
-            inputs.push(if name.is_empty() || self.sequences.contains_key(name) {
-                None
-            } else {
-                Some(self.value(name)?)
-            });
+            match self.sequences.get(name) {
+                // Without elements it adds nothing to the other parts.
+                Some(list) if list.is_empty() && node.op_type == "Concat" => {}
+                Some(_) => inputs.push(None),
+                None if name.is_empty() => inputs.push(None),
+                None => inputs.push(Some(self.value(name)?)),
+            }
         }
         let attributes = Attributes::new(&node.attribute)?;
         if sequences::is_known(&node.op_type) {
@@ -239,7 +241,14 @@ impl Builder<'_, '_> {
             outputs: node.output.len(),
             opset: self.model.opset,
         };
-        let outputs = operators::translate(&mut self.graph, &node.op_type, &operands, &attributes)?;
+        let translated =
+            operators::translate(&mut self.graph, &node.op_type, &operands, &attributes);
+        // PyTorch joins a shape's axes behind the last one, which are none, to a shape.
+        if node.op_type == "Slice" && translated.as_ref().is_err_and(|problem| problem == EMPTY) {
+            attributes.all_read()?;
+            return self.give_sequence(node, vec![]);
+        }
+        let outputs = translated?;
         attributes.all_read()?;
         for (name, id) in node.output.iter().zip(outputs) {
             if !name.is_empty() && self.values.insert(name.clone(), id).is_some() {
@@ -267,11 +276,19 @@ impl Builder<'_, '_> {
         let given = sequences::translate(&mut self.graph, node, inputs, known, attributes)?;
         attributes.all_read()?;
         let name = node.output.first().ok_or("gives nothing")?;
-        let again = match given {
-            Given::Value(id) => self.values.insert(name.clone(), id).is_some(),
-            Given::Sequence(list) => self.sequences.insert(name.clone(), list).is_some(),
-        };
-        if again {
+        match given {
+            Given::Value(id) if self.values.insert(name.clone(), id).is_some() => {
+                Err(format!("gives {name}, which exists already"))
+            }
+            Given::Value(_) => Ok(()),
+            Given::Sequence(list) => self.give_sequence(node, list),
+        }
+    }
+
+    /// Makes a list of values a node's output; one without elements has no values.
+    fn give_sequence(&mut self, node: &NodeProto, list: Vec<Id>) -> Result<(), String> {
+        let name = node.output.first().ok_or("gives nothing")?;
+        if self.sequences.insert(name.clone(), list).is_some() {
             return Err(format!("gives {name}, which exists already"));
         }
         Ok(())

@@ -64,6 +64,7 @@ pub use digest::sha256;
 pub use error::{BundleError, CompileError, Line};
 pub use golden::Golden;
 pub use image::Image;
+pub use import::OPSETS;
 pub use lads_image::op::{CacheFormat, WeightFormat};
 pub use reference::Reference;
 pub use report::{CompileReport, LayerReport, ProgramReport};

@@ -104,7 +104,7 @@ impl Reference {
                 rings.insert(state.name.clone(), rows);
             }
         }
-        let mut values = self.constants.clone();
+        let mut values = HashMap::new();
         for (name, id) in &self.inputs {
             let shape: Vec<usize> = self.graph.shape(*id).iter().map(|dim| dim.fixed).collect();
             let given = if let Some(values) = channels.get(name.as_str()) {
@@ -128,7 +128,7 @@ impl Reference {
             values.insert(*id, value);
         }
         for &id in &self.order {
-            if values.contains_key(&id) {
+            if self.value(id, &values).is_some() {
                 continue;
             }
             let value = self.node(id, &values).ok_or_else(|| {
@@ -145,7 +145,7 @@ impl Reference {
         let mut action = vec![];
         let mut after = rings;
         for (name, id) in &self.outputs {
-            let Some(Value::Float(value)) = values.get(id) else {
+            let Some(Value::Float(value)) = self.value(*id, &values) else {
                 return Err(refused(format!("output `{name}` is not a float")));
             };
             match name.strip_prefix("next_") {
@@ -179,12 +179,17 @@ impl Reference {
         all
     }
 
+    /// Returns a constant, or a value of this step.
+    fn value<'v>(&'v self, id: Id, values: &'v HashMap<Id, Value<f64>>) -> Option<&'v Value<f64>> {
+        self.constants.get(&id).or_else(|| values.get(&id))
+    }
+
     fn node(&self, id: Id, values: &HashMap<Id, Value<f64>>) -> Option<Value<f64>> {
         let node = self.graph.node(id);
         let operands: Option<Vec<_>> = node
             .inputs
             .iter()
-            .map(|input| Some(values.get(input)?.view()))
+            .map(|&input| Some(self.value(input, values)?.view()))
             .collect();
         let shape: Option<Vec<usize>> = node.shape.iter().map(|dim| dim.known()).collect();
         evaluate(&node.op, &operands?, &shape?)

@@ -119,8 +119,9 @@ fn opsets(models: &[Model], problems: &mut Problems) -> Option<Vec<OperatorSetId
             problems.add(
                 model.path.display(),
                 format!(
-                    "has operator set {:?}, the first file has {first:?}; export them alike",
-                    of(model)
+                    "has operator set {:?}, the first file has {first:?}; export them alike, or convert one in Python: `onnx.version_converter.convert_version(model, {})`",
+                    of(model),
+                    first.first().unwrap_or(&17)
                 ),
             );
             return None;

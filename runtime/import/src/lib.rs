@@ -60,6 +60,8 @@ pub struct Request<'r> {
     pub robot: Option<&'r Path>,
     /// Further files that describe the policy, besides those that are found by their names.
     pub beside: Vec<&'r Path>,
+    /// Leave out the files that are found by their names beside the policy.
+    pub alone: bool,
     /// Name of the output that is the action, if there are several.
     pub output: Option<&'r str>,
     /// Names of inputs and of the outputs that are their next values.
@@ -288,7 +290,8 @@ fn neighbours(request: &Request) -> Vec<PathBuf> {
     let mut all: Vec<PathBuf> = request.beside.iter().map(|&path| path.into()).collect();
     for model in &request.models {
         let folder = model.parent().unwrap_or(Path::new(""));
-        let found = NEIGHBOURS.iter().map(|name| folder.join(name));
+        let found = NEIGHBOURS.iter().filter(|_| !request.alone);
+        let found = found.map(|name| folder.join(name));
         all.extend(found.filter(|path| path.is_file()));
     }
     all.dedup();

@@ -13,7 +13,7 @@ use bytes::Bytes;
 use lads_compiler::onnx::{
     self, DimensionProto, GraphProto, ModelProto, TensorProto, ValueInfoProto, data_type,
 };
-use lads_compiler::{BundleError, survey};
+use lads_compiler::{BundleError, OPSETS, survey};
 use prost::Message as _;
 
 use crate::problem::Problems;
@@ -25,6 +25,8 @@ pub(crate) struct Model {
     pub path: PathBuf,
     pub proto: ModelProto,
     pub sha256: String,
+    /// Names of weights that could not be read from where they lie.
+    lost: Vec<String>,
 }
 
 /// An input or output of a graph.
@@ -58,11 +60,12 @@ impl Model {
             lads_host::input::read(path).map_err(|error| named(BundleError::Read(error)))?;
         let sha256 = lads_compiler::sha256(&bytes);
         let mut proto = onnx::decode(&Bytes::from(bytes)).map_err(named)?;
+        let mut lost = vec![];
         if let Some(graph) = &mut proto.graph {
             let folder = path
                 .parent()
                 .filter(|folder| !folder.as_os_str().is_empty());
-            bring_in(graph, folder.unwrap_or(Path::new(".")), problems);
+            lost = bring_in(graph, folder.unwrap_or(Path::new(".")), problems);
             check(graph, problems);
         }
         let stem = path.file_stem().unwrap_or_default();
@@ -71,6 +74,7 @@ impl Model {
             path: path.into(),
             proto,
             sha256,
+            lost,
         })
     }
 
@@ -91,11 +95,32 @@ impl Model {
                 (dim.dim_value, dim.dim_param) = (Some(len as i64), None);
             }
         }
-        for operator in survey(&proto.encode_to_vec())?.missing.operators {
+        let survey = survey(&proto.encode_to_vec())?;
+        let known = survey.opset.is_none_or(|opset| OPSETS.contains(&opset));
+        if let (Some(opset), false) = (survey.opset, known) {
+            let (first, last) = (OPSETS.start(), OPSETS.end());
             problems.add(
-                format!("node `{}`", operator.node),
-                format!("operator {} {}", operator.operator, operator.problem),
+                self.path.display(),
+                format!(
+                    "has ONNX operator set {opset}, {first} to {last} are read; export it with `opset_version=17`, or convert it in Python: `onnx.version_converter.convert_version(model, 17)`"
+                ),
             );
+        }
+        for operator in survey.missing.operators {
+            // What is told already: the operator set, and weights that are not there.
+            let of_set = operator.node.is_empty() && !known;
+            let mut lost = self.lost.iter();
+            let of_lost = |name: &String| {
+                operator
+                    .problem
+                    .starts_with(&format!("initializer {name}: "))
+            };
+            if !of_set && !lost.any(of_lost) {
+                problems.add(
+                    format!("node `{}`", operator.node),
+                    format!("operator {} {}", operator.operator, operator.problem),
+                );
+            }
         }
         Ok(())
     }
@@ -213,8 +238,10 @@ fn length(
     }
 }
 
-/// Puts the elements of external tensors into the model.
-fn bring_in(graph: &mut GraphProto, folder: &Path, problems: &mut Problems) {
+/// Puts the elements of external tensors into the model; returns the names of those that cannot be
+/// read.
+fn bring_in(graph: &mut GraphProto, folder: &Path, problems: &mut Problems) -> Vec<String> {
+    let mut lost = vec![];
     let mut files: HashMap<PathBuf, File> = HashMap::new();
     for tensor in &mut graph.initializer {
         if tensor.data_location == 0 && tensor.external_data.is_empty() {
@@ -226,9 +253,13 @@ fn bring_in(graph: &mut GraphProto, folder: &Path, problems: &mut Problems) {
                 tensor.data_location = 0;
                 tensor.external_data.clear();
             }
-            Err(problem) => problems.add(format!("weight `{}`", tensor.name), problem),
+            Err(problem) => {
+                problems.add(format!("weight `{}`", tensor.name), problem);
+                lost.push(tensor.name.clone());
+            }
         }
     }
+    lost
 }
 
 fn external(

@@ -1,11 +1,12 @@
 //! Problems between a file and a policy, collected so that a person sees all of them at once.
 
+use std::collections::HashSet;
 use std::fmt::{self, Display, Formatter};
 
 use lads_compiler::Line;
 
 /// One missing or contradictory thing.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Problem {
     /// Subject of the problem: a field of the robot's description, a value or a node of the graph,
     /// a file.
@@ -16,7 +17,10 @@ pub struct Problem {
 
 /// All problems of an import, in the order in which they were found.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Problems(Vec<Problem>);
+pub struct Problems {
+    all: Vec<Problem>,
+    known: HashSet<Problem>,
+}
 
 impl Problems {
     /// Adds a problem unless it is there already.
@@ -26,26 +30,26 @@ impl Problems {
             about: line(about.to_string()),
             wrong: line(wrong.to_string()),
         };
-        if !self.0.contains(&problem) {
-            self.0.push(problem);
+        if self.known.insert(problem.clone()) {
+            self.all.push(problem);
         }
     }
 
     /// Returns whether there are no problems.
     pub fn is_empty(&self) -> bool {
-        self.0.is_empty()
+        self.all.is_empty()
     }
 
     /// Returns all problems.
     pub fn all(&self) -> &[Problem] {
-        &self.0
+        &self.all
     }
 }
 
 /// Formats one line for each problem.
 impl Display for Problems {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        for problem in &self.0 {
+        for problem in &self.all {
             writeln!(f, "  {}: {}", problem.about, problem.wrong)?;
         }
         Ok(())

@@ -7,7 +7,7 @@ mod sources;
 mod terms;
 mod widths;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 
 use crate::model::{Edge, Model};
 use crate::plan::{Feed, Plan, State};
@@ -31,14 +31,11 @@ impl Edges {
         for (file, model) in models.iter().enumerate() {
             let (read, given) = model.edges(file, axes, problems);
             let graph = model.graph();
-            let is_weight = |name: &str| graph.initializer.iter().any(|one| one.name == name);
-            let is_settled = |name: &str| read.iter().any(|edge| edge.name == name);
-            let names = graph.input.iter().map(|value| value.name.as_str());
-            unsettled.extend(
-                names
-                    .filter(|name| !is_weight(name) && !is_settled(name))
-                    .map(str::to_owned),
-            );
+            let weights = graph.initializer.iter().map(|tensor| &tensor.name);
+            let settled = read.iter().map(|edge| &edge.name);
+            let known: HashSet<&String> = weights.chain(settled).collect();
+            let names = graph.input.iter().map(|value| &value.name);
+            unsettled.extend(names.filter(|&name| !known.contains(name)).cloned());
             inputs.extend(read);
             outputs.extend(given);
         }

@@ -4,7 +4,7 @@
 mod common;
 
 use common::{Case, HEAD, SENSOR, mirror, model, node, step, value, weight, wide_action};
-use lads_compiler::onnx::StringStringEntryProto;
+use lads_compiler::onnx::{AttributeProto, NodeProto, StringStringEntryProto};
 use prost::Message as _;
 
 fn external(location: &str, extra: &[(&str, &str)]) -> lads_compiler::onnx::ModelProto {
@@ -37,10 +37,10 @@ fn weights_beside_the_model_are_brought_in_and_never_from_elsewhere() {
         &external("policy.onnx.data", &[("offset", "4"), ("length", "16")]),
         &robot,
     );
-    assert!(
-        case.refused()
-            .contains("`policy.onnx.data`, which is missing")
-    );
+    let told = case.refused();
+    assert!(told.contains("`policy.onnx.data`, which is missing"));
+    // Nothing else says that the weights should be elsewhere.
+    assert!(told.contains("1 thing to settle"), "{told}");
     case.put("policy.onnx.data", &weights);
     let actions = case.actions(&[step(&[&[1.0, 10.0]])]);
     common::close(&actions[0], &[31.0, 42.0]);
@@ -180,4 +180,77 @@ fn no_part_of_a_file_makes_it_panic() {
         case.put("policy.onnx", &whole[..at]);
         let _ = case.import();
     }
+}
+
+#[test]
+fn an_operator_set_that_is_not_read_is_told_with_those_that_are() {
+    let robot = format!(
+        "{HEAD}[[term]]\nname = \"a\"\nwidth = 1\n{SENSOR}{}",
+        wide_action(1)
+    );
+    for version in [6, 29] {
+        let mut policy = mirror(1);
+        policy.opset_import[0].version = version;
+        let told = Case::new(&policy, &robot).refused();
+        let wanted = format!("has ONNX operator set {version}, 7 to 28 are read");
+        assert!(
+            told.contains(&wanted) && told.contains("convert_version"),
+            "{told}"
+        );
+        assert!(told.contains("1 thing to settle"), "{told}");
+    }
+}
+
+/// Makes a weight of integers, as shapes and indices are.
+fn integers(name: &str, dims: &[i64], values: &[i64]) -> lads_compiler::onnx::TensorProto {
+    let raw: Vec<u8> = values.iter().flat_map(|x| x.to_le_bytes()).collect();
+    lads_compiler::onnx::TensorProto {
+        dims: dims.to_vec(),
+        data_type: lads_compiler::onnx::data_type::INT64,
+        name: name.into(),
+        raw_data: raw.into(),
+        ..Default::default()
+    }
+}
+
+#[test]
+fn parts_of_an_observation_that_the_policy_estimates_are_put_in_their_place() {
+    // PyTorch's `obs[:, 1:3] = estimate`: the shape's axes behind the last one, which are none, are joined to that of the part.
+    let robot = format!("{HEAD}[[term]]\nname = \"a\"\n{SENSOR}{}", wide_action(4));
+    let policy = |last: NodeProto| {
+        model(
+            vec![value("obs", &[1, 4])],
+            vec![
+                node("Slice", &["obs", "zero", "two", "one"], &["part"]),
+                node("Neg", &["part"], &["estimate"]),
+                node("Shape", &["obs"], &["shape"]),
+                node("Slice", &["shape", "two", "all", "zero"], &["rest"]),
+                last,
+                node("Reshape", &["estimate", "wanted"], &["updates"]),
+                node("ScatterND", &["obs", "at", "updates"], &["actions"]),
+            ],
+            vec![
+                integers("zero", &[1], &[0]),
+                integers("one", &[1], &[1]),
+                integers("two", &[1], &[2]),
+                integers("all", &[1], &[i64::MAX]),
+                integers("part_shape", &[2], &[1, 2]),
+                integers("at", &[1, 2, 2], &[0, 1, 0, 2]),
+            ],
+            vec![value("actions", &[1, 4])],
+        )
+    };
+    let mut joined = node("Concat", &["part_shape", "rest"], &["wanted"]);
+    joined.attribute.push(AttributeProto {
+        name: "axis".into(),
+        kind: 2,
+        ..Default::default()
+    });
+    let case = Case::new(&policy(joined), &robot);
+    let actions = case.actions(&[step(&[&[1.0, 2.0, 3.0, 4.0]])]);
+    common::close(&actions[0], &[1.0, -1.0, -2.0, 4.0]);
+    // Anything else that reads no elements is refused.
+    let read = node("Neg", &["rest"], &["wanted"]);
+    let told = Case::new(&policy(read), &robot).refused();
+    assert!(told.contains("node `wanted`"), "{told}");
 }

@@ -297,6 +297,16 @@ fn neighbours_are_read_and_have_to_agree() {
         ..Request::default()
     });
     assert!(form.expect("a form").contains("Problems of the files"));
+    // Left out, it contradicts nothing; named, it is read all the same.
+    let alone = |beside| {
+        other
+            .import_with(|request| (request.alone, request.beside) = (true, beside))
+            .expect_err("more is needed")
+            .to_string()
+    };
+    let named = other.path("deploy.yaml");
+    assert!(!alone(vec![]).contains("joint_pos_rel"));
+    assert!(alone(vec![&named]).contains("dof_pos here and joint_pos_rel there"));
     let bomb = Case::new(&mirror(2), robot);
     bomb.put("deploy.yaml", "[".repeat(10_000).as_bytes());
     let told = bomb.refused();

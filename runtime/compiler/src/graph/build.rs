@@ -8,6 +8,9 @@ use lads_image::op::{BinaryKind, ReduceKind};
 use super::{Dim, Graph, Id, Kind, MAX_FOLDING, Op, Type, Unary, cost, fold, show};
 use crate::tensor::{MAX_ELEMENTS, MAX_RANK, Tensor, elements};
 
+/// Refusal of a slice without elements; a value has some.
+pub(crate) const EMPTY: &str = "a slice is empty";
+
 /// A node, or the reason why its operands do not fit.
 type Built = Result<Id, String>;
 
@@ -296,7 +299,7 @@ impl Graph {
     pub fn slice(&mut self, x: Id, axis: usize, start: usize, len: usize) -> Built {
         let whole = self.axis_len(x, axis)?;
         if len == 0 {
-            return Err("a slice is empty".into());
+            return Err(EMPTY.into());
         }
         if whole == Dim::of(len) && start == 0 {
             return Ok(x);

@@ -10,7 +10,7 @@ use std::iter::{Product, Sum};
 use std::sync::Arc;
 
 use lads_image::op::{BinaryKind, ReduceKind, UnaryKind};
-use ndarray::{ArrayD, ArrayViewD, Axis, IxDyn, NdFloat, Slice, Zip, concatenate};
+use ndarray::{ArrayD, ArrayViewD, Axis, CowArray, Ix3, IxDyn, NdFloat, Slice, Zip, concatenate};
 
 use super::{Op, Unary};
 use crate::tensor::{Data, Tensor};
@@ -368,18 +368,32 @@ fn best<T: Real>(x: &ArrayViewD<T>, largest: bool) -> i64 {
     found.0
 }
 
+/// Views, or copies where it has to, a tensor as a stack of matrices, broadcast over `batch`.
+fn matrices<'x, T: Real>(
+    x: &'x ArrayViewD<T>,
+    batch: &[usize],
+    [count, rows, cols]: [usize; 3],
+) -> Option<CowArray<'x, T, Ix3>> {
+    let wanted = [batch, &[rows, cols]].concat();
+    let wide = x.broadcast(IxDyn(&wanted))?;
+    // Weights lie as they are read, and are large: they are not copied.
+    if let Ok(view) = wide.clone().into_shape_with_order((count, rows, cols)) {
+        return Some(CowArray::from(view));
+    }
+    let wide = wide.as_standard_layout().into_owned();
+    let owned = wide.into_shape_with_order((count, rows, cols)).ok()?;
+    Some(CowArray::from(owned))
+}
+
 /// Computes products over the last two axes, the others broadcast.
 fn matmul<T: Real>(a: &ArrayViewD<T>, b: &ArrayViewD<T>, shape: &[usize]) -> Option<ArrayD<T>> {
     let (batch, &[m, n]) = shape.split_last_chunk::<2>()?;
     let k = *a.shape().last()?;
     let count = batch.iter().product::<usize>();
-    let matrices = |x: &ArrayViewD<T>, rows: usize, cols: usize| {
-        let wanted = [batch, &[rows, cols]].concat();
-        let wide = x.broadcast(IxDyn(&wanted))?;
-        let wide = wide.as_standard_layout().into_owned();
-        wide.into_shape_with_order((count, rows, cols)).ok()
-    };
-    let (a, b) = (matrices(a, m, k)?, matrices(b, k, n)?);
+    let (a, b) = (
+        matrices(a, batch, [count, m, k])?,
+        matrices(b, batch, [count, k, n])?,
+    );
     let mut y = Vec::with_capacity(count * m * n);
     for (a, b) in a.outer_iter().zip(b.outer_iter()) {
         for row in a.outer_iter() {

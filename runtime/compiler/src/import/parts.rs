@@ -108,12 +108,18 @@ pub(super) fn scatter(g: &mut Graph, x: &Operands, a: &Attributes) -> Result<Id,
     let flat = [Dim::of(count), Dim::of(len)];
     let rows = g.reshape(data, &flat)?;
     let updates = g.reshape(updates, &[Dim::of(at.len() / depth), Dim::of(len)])?;
-    let mut parts = vec![];
+    // Rows that follow each other on both sides are one part.
+    let mut runs: Vec<(Id, usize, usize)> = vec![];
     for (row, update) in source.into_iter().enumerate() {
-        parts.push(match update {
-            Some(update) => g.slice(updates, 0, update, 1)?,
-            None => g.slice(rows, 0, row, 1)?,
-        });
+        let (from, first) = update.map_or((rows, row), |update| (updates, update));
+        match runs.last_mut() {
+            Some((id, start, len)) if *id == from && *start + *len == first => *len += 1,
+            _ => runs.push((from, first, 1)),
+        }
+    }
+    let mut parts = vec![];
+    for (from, first, len) in runs {
+        parts.push(g.slice(from, 0, first, len)?);
     }
     let all = g.concat(&parts, 0)?;
     let shape: Vec<Dim> = shape.iter().map(|&dim| Dim::of(dim)).collect();

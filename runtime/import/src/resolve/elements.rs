@@ -1,5 +1,7 @@
 //! Resolves joints, and lists with a number for each element.
 
+use std::collections::{HashMap, HashSet};
+
 use crate::problem::Problems;
 use crate::robot::{Clip, Each, Robot};
 
@@ -39,8 +41,9 @@ impl Joints {
             ("joints", &policy),
             ("robot_joints", order.as_ref().unwrap_or(&vec![])),
         ] {
-            for (i, name) in names.iter().enumerate() {
-                if name.trim().is_empty() || names[..i].contains(name) {
+            let mut known = HashSet::new();
+            for name in names {
+                if name.trim().is_empty() || !known.insert(name.as_str()) {
                     problems.add(field, format!("names \"{name}\" twice, or not at all"));
                 }
             }
@@ -48,7 +51,8 @@ impl Joints {
         let robot = match order {
             None => policy.clone(),
             Some(order) => {
-                for name in policy.iter().filter(|name| !order.contains(name)) {
+                let known: HashSet<&String> = order.iter().collect();
+                for name in policy.iter().filter(|&name| !known.contains(name)) {
                     problems.add(
                         "robot_joints",
                         format!("misses \"{name}\", which the policy moves"),
@@ -63,8 +67,9 @@ impl Joints {
     /// Returns the indices of joints in the policy's order, sorted by the robot's order.
     pub fn by_robot(&self, names: &[String]) -> Vec<usize> {
         let mut order: Vec<usize> = (0..names.len()).collect();
-        let place = |i: &usize| self.robot.iter().position(|known| *known == names[*i]);
-        order.sort_by_key(|i| place(i).unwrap_or(usize::MAX));
+        let places = self.robot.iter().enumerate().rev();
+        let places: HashMap<&String, usize> = places.map(|(i, name)| (name, i)).collect();
+        order.sort_by_key(|&i| places.get(&names[i]).copied().unwrap_or(usize::MAX));
         order
     }
 }

@@ -1,6 +1,8 @@
 //! Resolves the source of a term's raw values: elements of a channel, or values that the runtime
 //! makes itself.
 
+use std::collections::HashSet;
+
 use super::elements::limits;
 use super::terms::{Context, plain};
 use crate::plan::{Channel, Element, Part, Source};
@@ -149,11 +151,11 @@ fn sensor(context: &mut Context, term: &robot::Term, width: usize, about: &str) 
             append(&mut context.channels[channel], &term.name, elements)
         }
     };
-    let place = |i| order.iter().position(|&other| other == i).unwrap_or(0);
-    Some(Source::Columns {
-        channel,
-        columns: (0..width).map(|i| first + place(i)).collect(),
-    })
+    let mut columns = vec![first; width];
+    for (place, &i) in order.iter().enumerate() {
+        columns[i] = first + place;
+    }
+    Some(Source::Columns { channel, columns })
 }
 
 fn gravity(context: &mut Context, term: &robot::Term, about: &str) -> Option<Source> {
@@ -304,11 +306,9 @@ pub(super) fn check_channels(channels: &[Channel], problems: &mut Problems) {
         );
     }
     for channel in channels {
-        for (i, element) in channel.elements.iter().enumerate() {
-            if channel.elements[..i]
-                .iter()
-                .any(|other| other.name == element.name)
-            {
+        let mut names = HashSet::new();
+        for element in &channel.elements {
+            if !names.insert(element.name.as_str()) {
                 problems.add(
                     format!("channel `{}`", channel.name),
                     format!(
