@@ -71,6 +71,7 @@ pub fn import_onnx(
         states: states.unwrap_or_default().into_iter().collect(),
         wires: wires.unwrap_or_default().into_iter().collect(),
         golden: golden.as_deref(),
+        ..Request::default()
     };
     let first = &models[0];
     if let Some(output) = &output {
