@@ -141,10 +141,11 @@ endif
 # cargo-fuzz and a nightly toolchain are needed; what is found lies in tests/fuzz/artifacts.
 FUZZ_SECONDS ?= 60
 
-## fuzz: hostile images and bundles, FUZZ_SECONDS=60 each; needs a nightly toolchain and cargo-fuzz
+## fuzz: hostile images, bundles and imports, FUZZ_SECONDS=60 each; needs a nightly toolchain and cargo-fuzz
 fuzz: $(if $(WITH_FAMILIES),$(FAMILIES)/stamp)
 	cd tests && $(WITH_FAMILIES) cargo +nightly fuzz run image -- -max_len=256 -max_total_time=$(FUZZ_SECONDS)
 	cd tests && $(WITH_FAMILIES) cargo +nightly fuzz run bundle -- -max_total_time=$(FUZZ_SECONDS)
+	cd tests && cargo +nightly fuzz run import -- -max_total_time=$(FUZZ_SECONDS) -timeout=60
 
 ## package: the crates that are published, packed as a registry would get them, without building them; PACKAGE_ARGS= builds them from the packages
 PACKAGE_ARGS ?= --no-verify

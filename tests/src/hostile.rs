@@ -2,7 +2,9 @@
 //! it has to refuse it or work.
 //!
 //! A script is a row of edits of eight bytes: what to do, where, and with which value. Any bytes are a script, so fuzzers (`tests/fuzz`)
-//! and the seeded mutator of `tests/tests/hostile.rs` drive the same two functions. Both panic when an invariant is broken.
+//! and the seeded mutator of `tests/tests/hostile.rs` drive the same functions. All panic when an invariant is broken.
+
+mod import;
 
 use std::sync::OnceLock;
 
@@ -17,6 +19,8 @@ use lads_image::format::{CRC_WORD, crc32};
 
 use crate::episode::{FOLDER, KINDS, folder};
 use crate::{compiled, wire};
+
+pub use import::{BREAK, import};
 
 /// Number of bytes of one edit.
 const EDIT_BYTES: usize = 8;
