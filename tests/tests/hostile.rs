@@ -92,17 +92,17 @@ const TEXT: &[u8] = b"[]{}:,=\"'\n -.0159e&*!#\\\xff";
 
 #[test]
 fn edited_images_are_refused_or_run() {
-    kept("image")
-        .iter()
-        .for_each(|(_, bytes)| hostile::image(bytes));
+    for (_, bytes) in &kept("image") {
+        hostile::image(bytes);
+    }
     drive("image", hostile::image, generated);
 }
 
 #[test]
 fn edited_bundles_are_refused_or_compile() {
-    kept("bundle")
-        .iter()
-        .for_each(|(_, bytes)| hostile::bundle(bytes));
+    for (_, bytes) in &kept("bundle") {
+        hostile::bundle(bytes);
+    }
     drive("bundle", hostile::bundle, generated);
 }
 

@@ -95,12 +95,11 @@ impl Kernel for Elements<'_> {
         for y in self.y.chunks_mut(LANES) {
             let mut spare = [0.0; LANES];
             let whole = y.len() == LANES;
-            let x: &mut Block = match y.first_chunk_mut() {
-                Some(block) => block,
-                None => {
-                    assign(&mut spare, y);
-                    &mut spare
-                }
+            let x: &mut Block = if let Some(block) = y.first_chunk_mut() {
+                block
+            } else {
+                assign(&mut spare, y);
+                &mut spare
             };
             match self.kind {
                 UnaryKind::Relu => each(x, math::relu),

@@ -106,7 +106,7 @@ pub fn import(bytes: &[u8]) -> bool {
             .lines()
             .filter_map(move |line| Some(line.strip_prefix(&word)?.to_owned()))
     };
-    let output = said("action").last();
+    let output = said("action").next_back();
     let twice = options.lines().any(|line| line == "twice");
     if twice {
         put("second.onnx", &policy);

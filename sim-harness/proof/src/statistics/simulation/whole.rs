@@ -274,12 +274,11 @@ impl Shipped {
             };
             let done = row.episodes.iter().filter(is).count() as f64 / row.episodes.len() as f64;
             let kept = done * (1.0 - share);
-            (place.is_some() || rate == full).then(|| {
-                [
-                    anew * (1.0 - done) * kept,
-                    done * ((1.0 - anew) * share + anew * (1.0 - kept)),
-                ]
-            })
+            let lost_and_gained = [
+                anew * (1.0 - done) * kept,
+                done * ((1.0 - anew) * share + anew * (1.0 - kept)),
+            ];
+            (place.is_some() || rate == full).then_some(lost_and_gained)
         });
         let cells: Vec<[f64; 2]> = cells.collect();
         let pairs = cells.len();
