@@ -286,11 +286,11 @@ reference: $(VENV)/stamp
 
 ## verify: is the compiled policy the reference's? Fails unless EQUIVALENT; `lads-run verify` itself exits with 0, 1 DIFFERENT or 3 INCONCLUSIVE
 verify: setup
-	cargo run --release -p lads-sim --bin lads-run -- verify --model $(MODEL) $(ARGS)
+	cargo run --release -p lads-sim --features camera --bin lads-run -- verify --model $(MODEL) $(ARGS)
 
 ## tune: the smallest weights and caches that keep every plan of $(MODEL)'s reference, written into the bundle; ARGS="-o FILE" leaves it as it is
 tune: setup
-	cargo run --release -p lads-sim --bin lads-run -- tune --model $(MODEL) $(ARGS)
+	cargo run --release -p lads-sim --features camera --bin lads-run -- tune --model $(MODEL) $(ARGS)
 
 ## mutate: changes of every kind to $(MODEL), what each moves, what its verification says and what is left of its success; an hour. ARGS="-o rows.md"
 ##         writes the row of each; ARGS="--every 3 --run-every 8" asks and runs fewer episodes, minutes

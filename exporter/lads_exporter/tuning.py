@@ -1,13 +1,12 @@
 """Formats of numbers at export: where the reference beside a bundle is of that bundle, `lads-run tune` chooses them.
 
-What can fail: a reference that is damaged, a program that does not run, and what it refuses; the bundle stays at 32 bits then.
+Nothing here fails an export: with a damaged reference, or a program that does not run or refuses, the bundle stays at 32 bits, and the sentence
+says why.
 """
 
 import json
 import subprocess
 from pathlib import Path
-
-from .config import UserError
 
 
 def beside(bundle, sha256, program):
@@ -19,7 +18,7 @@ def beside(bundle, sha256, program):
     try:
         of = json.loads(path.read_bytes())["bundle_sha256"]
     except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path}: not a reference ({error!r}); make it anew or move it away") from error
+        return f"{wide}; {path} is not a reference ({error!r}): make it anew, then lads-run tune --model {bundle}"
     if of != sha256:
         return f"{wide}; {path} is of another bundle: make it anew, then lads-run tune --model {bundle}"
     try:
@@ -27,5 +26,5 @@ def beside(bundle, sha256, program):
     except OSError as error:
         return f"{wide}; {program} cannot be run ({error.strerror}): build it, then lads-run tune --model {bundle}"
     if done.returncode:
-        raise UserError(f"{program} tune: {(done.stderr.strip() or 'it says nothing').splitlines()[-1]}")
+        return f"{wide}; {program} tune: {(done.stderr.strip() or 'it says nothing').splitlines()[-1]}"
     return done.stdout.strip()

@@ -18,7 +18,7 @@ def parts_of(name):
     return whole, parts, [row["id"] for row in whole["instructions"]]
 
 
-@pytest.mark.parametrize("name", ["kitchen", "kitchen-small", "lorel", "lorel-image"])
+@pytest.mark.parametrize("name", ["kitchen", "kitchen-small", "kitchen-image", "lorel", "lorel-image"])
 def test_parts_make_the_numbers_of_the_whole(name):
     whole, parts, ids = parts_of(name)
     merged = shards.merge(parts, ids)

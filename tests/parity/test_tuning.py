@@ -7,7 +7,6 @@ import shutil
 import onnx
 import pytest
 from lads_exporter import contract, reference, tuning
-from lads_exporter.config import UserError
 from programs import ROOT, built
 
 MODEL = ROOT / "models" / "kitchen-small.onnx"
@@ -45,11 +44,9 @@ def test_without_its_reference_a_bundle_stays_at_32_bits(untuned):
     assert "cannot be run" in tuning.beside(path, sha256, path.parent / "no-such-program")
     for damaged in ("{", "[]", "{}"):
         beside.write_text(damaged)
-        with pytest.raises(UserError, match="not a reference"):
-            tuning.beside(path, sha256, "no-such-program")
+        assert "is not a reference" in tuning.beside(path, sha256, "no-such-program")
     assert path.read_bytes() == before
     # The program is asked, and what it refuses is said.
     beside.write_text(json.dumps({"bundle_sha256": sha256}))
-    with pytest.raises(UserError, match="tune"):
-        tuning.beside(path, sha256, built("lads-run"))
+    assert "tune: error: " in tuning.beside(path, sha256, built("lads-run"))
     assert path.read_bytes() == before

@@ -11,6 +11,7 @@ fn shipped_references_are_whole() {
         ("kitchen-small", "franka-kitchen", 30),
         ("lorel", "lorel-table", 15),
         ("lorel-image", "lorel-table", 15),
+        ("kitchen-image", "franka-kitchen", 30),
     ] {
         let path = Path::new(env!("CARGO_MANIFEST_DIR"))
             .join("../../models")
