@@ -10,9 +10,13 @@ set -uo pipefail
 export LADS_TALLY=1
 # What is read by awk is written as for a file; colours stay on a terminal.
 [ ! -t 1 ] || export CARGO_TERM_COLOR=${CARGO_TERM_COLOR:-always}
+# mawk, Debian's awk, looks at no line before 4 KiB are there: for minutes a quiet build would show nothing.
+awk=awk
+case $(awk -W version 2>&1 </dev/null) in mawk*) awk="awk -W interactive" ;; esac
 found=$(mktemp)
 trap 'rm -f "$found"' EXIT
-"$@" 2>&1 | awk -v found="$found" '
+# shellcheck disable=SC2086
+"$@" 2>&1 | $awk -v found="$found" '
   # cargo: what passing tests have printed stands between "successes:" and "failures:" or the result.
   /^successes:$/ { quiet = 1 }
   /^(failures:|test result:)/ { quiet = 0 }
