@@ -24,6 +24,9 @@ COUNT = [*NOT_WHOLE, 0, *BELOW, *ABOVE, 10**9, 2**32, 2**63, np.uint64(2**64 - 1
 
 
 def shown(value):
+    """Names a value alike in every process, which workers that share the tests compare."""
+    if type(value) is object:
+        return "object"
     return f"{type(value).__name__}-{value!r}"[:40] if not (type(value) is int and abs(value) > 10**40) else f"int-{'-' if value < 0 else ''}huge"
 
 
