@@ -51,8 +51,8 @@ fn first(text: &str, letters: usize) -> String {
     text.chars().take(letters).collect()
 }
 
-/// Returns a text as a message repeats it.
-fn shown(text: &str) -> String {
+/// Returns a caller's text as a message repeats it: its beginning, where it is long.
+pub fn shown(text: &str) -> String {
     let start = first(text, SHOWN);
     let rest = if start.len() < text.len() { "…" } else { "" };
     start + rest

@@ -12,7 +12,7 @@ use numpy::{
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::errors::{InputError, shown};
+use crate::errors::InputError;
 
 /// Elements up to which an array is copied without rust-numpy's table of borrowed arrays, which
 /// costs more than a copy: at a robot's rate neither is in the processor's caches.
@@ -148,7 +148,7 @@ pub fn read(
             .extract::<String>()
             .unwrap_or_else(|_| name.to_string());
         if !staged.iter().any(|row| row.name == name) {
-            unknown.push(shown(&name));
+            unknown.push(lads_host::instruction::shown(&name));
         }
     }
     let mut missing = vec![];

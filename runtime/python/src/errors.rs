@@ -20,16 +20,6 @@ pyo3::import_exception!(lads.errors, SelfTestError);
 pyo3::import_exception!(lads.errors, StepError);
 pyo3::import_exception!(lads.errors, WorkspaceError);
 
-/// Letters of a caller's text that a message repeats.
-const SHOWN: usize = 60;
-
-/// Returns a caller's text as a message repeats it.
-pub fn shown(text: &str) -> String {
-    let start: String = text.chars().take(SHOWN).collect();
-    let rest = if start.len() < text.len() { "…" } else { "" };
-    start + rest
-}
-
 /// Makes the exception for a file that is not a policy.
 pub fn opening(error: &lads_host::OpenError) -> PyErr {
     let text = lads_cli::chain(error);

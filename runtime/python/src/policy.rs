@@ -117,7 +117,7 @@ fn format<T: Copy, const N: usize>(
     found.ok_or_else(|| {
         OpenError::new_err(format!(
             "{what} '{}': no such format; known are {}",
-            errors::shown(name),
+            lads_host::instruction::shown(name),
             known.map(name_of).join(", ")
         ))
     })
