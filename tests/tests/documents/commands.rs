@@ -111,10 +111,21 @@ fn every_make_that_is_shown_would_do_something() {
     }
 }
 
-/// Returns what `make` would run.
+/// Returns what the `make` that a line begins with would run; what follows it in the line, like `&& pip install`, is left alone.
 fn would_run(command: &str) -> Result<String, String> {
-    let script = format!("make() {{ command make -n \"$@\"; }}\n{command}");
+    let alone = command.split(['&', '|', ';']).next().unwrap_or(command);
+    let script = format!("make() {{ command make -n \"$@\"; }}\n{alone}");
     run(&project_path("."), &script)
+}
+
+#[test]
+fn to_see_what_make_would_do_runs_nothing() {
+    let folder = tempfile::tempdir().expect("there is room");
+    let file = folder.path().join("run");
+    for then in ["&&", ";", "|"] {
+        would_run(&format!("make help {then} touch {}", file.display())).expect("a rule");
+        assert!(!file.exists(), "{then} was run");
+    }
 }
 
 /// Programs that short commands run, by their folders in `target/release`.
