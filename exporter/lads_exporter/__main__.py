@@ -208,7 +208,7 @@ def _parser():
     random = commands.add_parser("random", help="a bundle with random weights, for tests")
     network = random.add_mutually_exclusive_group(required=True)
     network.add_argument("--config", help="a LADS policy of this configuration")
-    network.add_argument("--kind", help="a small policy of this kind: lads, lang_dt, lisa, vae, lcsd, skilldiffuser, history, vae_history, plain, recurrent, stacked, camera, images, sighted, sighted_lang_dt, sighted_lisa, sighted_vae, sighted_history, frozen_lang_dt, frozen_lisa, frozen_vae_history; or with an encoder of the field's sizes: lorel-encoder, lite0, resnet18")
+    network.add_argument("--kind", help="a small policy of a kind in lads_exporter/kinds; another word is refused with the list of them")
     random.add_argument("-o", "--output", required=True)
     random.add_argument("--seed", type=int, default=0)
     random.add_argument("--rendering", metavar="FILE", help="how the frames are drawn that a configuration's policy sees, as lads-run frames --rendering takes it")

@@ -10,6 +10,7 @@ import json
 import math
 
 from .config import UserError
+from .families import FAMILIES
 
 VERSION = 2
 KEY, GOLDEN_KEY, STORAGE_KEY = "lads.contract", "lads.golden", "lads.storage"
@@ -21,18 +22,6 @@ OBSERVATIONS, ACTIONS = "observations", "actions"  # a demonstration: what the t
 ROLES = ("observation", "action", "instruction", "noise", "demonstration")
 DTYPES = {"f32": "float32", "u8": "uint8", "i32": "int32"}
 LARGEST = 1 << 20
-
-# The fields of each family that its schedule depends on.
-FAMILIES = {
-    "lads": ("horizon", "codebook", "decision"),
-    "lang_dt": (),
-    "lisa": ("horizon", "codebook", "decision", "low_level"),
-    "vae": ("horizon", "plan", "decision"),
-    "lcsd": ("codebook", "decision", "denoise", "noise"),
-    "skilldiffuser": ("horizon", "codebook", "decision", "denoise", "noise"),
-    "history": ("horizon", "codebook", "decision", "window", "memory", "low_level"),
-    "plain": (),
-}
 
 
 def vector(name, role, elements, **more):
@@ -182,7 +171,7 @@ def _channel(row, where):
     field = f"channels.{row['name']}"
     role, shape, elements = row.get("role"), row.get("shape"), row.get("elements")
     _need(role in ROLES, where, f"`{field}.role` is {role!r}; known: {', '.join(ROLES)}")
-    _need(row.get("dtype") in DTYPES, where, f"`{field}.dtype` is {row.get('dtype')!r}; known: {', '.join(DTYPES)}")
+    _need(row.get("dtype") in list(DTYPES), where, f"`{field}.dtype` is {row.get('dtype')!r}; known: {', '.join(DTYPES)}")
     good = isinstance(shape, list) and 1 <= len(shape) <= 4 and all(_length(size) for size in shape)
     _need(good, where, f"`{field}.shape` is {shape}; it must be 1 to 4 positive lengths")
     if role == "observation" and elements is None:
@@ -205,30 +194,37 @@ def _positive(value, fields, where):
         _need(_length(size), where, f"`{field}` is {size!r}; it must be 1 to {LARGEST}")
 
 
+def _objects(rows):
+    return isinstance(rows, list) and all(isinstance(row, dict) for row in rows)
+
+
+def _forms(found, where):
+    """Refuses parts that are no objects or lists of objects, so that the rules may read their fields."""
+    parts = {key: found[key] for key in ("environment", "family", "language", "evaluation", "network") if key in found}
+    parts |= {"context": found["context"]} if found.get("context") is not None else {}
+    for key, part in parts.items():
+        _need(isinstance(part, dict), where, f"`{key}` is no object")
+    lists = {key: found[key] for key in ("channels", "instructions", "states") if key in found}
+    lists["evaluation.instructions"] = found.get("evaluation", {}).get("instructions", [])
+    for key, rows in lists.items():
+        _need(_objects(rows), where, f"`{key}` is no list of objects")
+    for row in found["channels"]:
+        _need(row.get("elements") is None or _objects(row["elements"]), where, f"`channels.{row.get('name')}.elements` is no list of objects")
+
+
 def _family(found, where):
-    family = found.get("family", {})
-    kind = family.get("kind")
-    _need(kind in FAMILIES, where, f"`family.kind` is {kind!r}; known: {', '.join(FAMILIES)}")
-    missing = [name for name in FAMILIES[kind] if name not in family]
+    given = found["family"]
+    kind = given.get("kind")
+    _need(isinstance(kind, str) and kind in FAMILIES, where, f"`family.kind` is {kind!r}; known: {', '.join(FAMILIES)}")
+    family = FAMILIES[kind]
+    missing = [name for name in family.fields if name not in given]
     _need(not missing, where, f"`family` lacks {', '.join(missing)}")
-    sizes = {
-        "horizon": ["horizon"],
-        "codebook": ["codebook.size", "codebook.dim"],
-        "plan": ["plan.dim"],
-        "denoise": ["denoise.steps"],
-        "window": ["window"],
-        "memory": ["memory.dim"],
-        "low_level": ["low_level.layers", "low_level.heads", "low_level.head_dim"],
-        "history": [f"history.{name}" for name in ("window", "memory.dim", "low_level.layers", "low_level.heads", "low_level.head_dim")],
-    }
-    given = [*FAMILIES[kind], *(["history"] if kind == "vae" and "history" in family else [])]
-    _positive(family, [name for key in given for name in sizes.get(key, [])], where)
-    rules = {"decision": ("mean", "sample") if kind == "vae" else ("argmax", "sample"), "noise": ("seeded", "zero")}
-    for key in ("decision", "noise"):
-        if key in FAMILIES[kind]:
-            given = family[key].get("rule")
-            _need(given in rules[key], where, f"`family.{key}.rule` is {given!r}; known: {', '.join(rules[key])}")
-            _need(type(family[key].get("seed")) is int, where, f"`family.{key}.seed` is not a whole number")
+    _positive(given, [*family.lengths, *(name for name in family.optional if name.split(".")[0] in given)], where)
+    for key, rules in family.rules.items():
+        _need(isinstance(given[key], dict), where, f"`family.{key}` is no object")
+        rule = given[key].get("rule")
+        _need(rule in rules, where, f"`family.{key}.rule` is {rule!r}; known: {', '.join(rules)}")
+        _need(type(given[key].get("seed")) is int, where, f"`family.{key}.seed` is not a whole number")
 
 
 def _states(found, where):
@@ -279,6 +275,7 @@ def check(found, where="the model"):
     _need(isinstance(found, dict) and found.get("version") == VERSION, where, f"version is not {VERSION}")
     for key in ("environment", "family", "channels", "control_period_s"):
         _need(key in found, where, f"missing field `{key}`")
+    _forms(found, where)
     _need(_number(found["control_period_s"]) and found["control_period_s"] > 0, where, "`control_period_s` is not positive")
     _distinct(found["channels"], "name", "channels", where)
     for row in found["channels"]:

@@ -1,4 +1,4 @@
-"""The controller's twin: runs a bundle with ONNX Runtime, entry by entry, by the schedule of its family.
+"""The controller's twin: runs a bundle with ONNX Runtime, entry by entry, by the schedule of its family (`families`).
 
 Golden episodes and tests are made with it; the product's control loop is the Rust core, which shares nothing with this file
 but the contract. Values are bound by their names: a channel's name is that channel, `timestep`, `phase`, `pass` and `index` are the
@@ -16,6 +16,7 @@ from onnx.utils import Extractor
 from . import contract as contracts
 from .config import UserError
 from .contract import ACTION, NOISE
+from .families import FAMILIES
 from .normals import Normals
 
 PAST, PRESENT = "past_key_values.", "present."
@@ -122,7 +123,7 @@ class Twin:
         context = self.contract.get("context")
         self.steps, self.beyond = (context["steps"], context["beyond"]) if context else (None, None)
         self.period = contracts.period(self.contract)
-        self.schedule = SCHEDULES[self.family["kind"]]
+        self.schedule = FAMILIES[self.family["kind"]].step
         self.states = self._states()
         self.caches, self.words, self.index, self.draws = {}, {}, None, []
         self._begin(("instruction", "episode"))
@@ -270,95 +271,6 @@ class Twin:
                 state.append(value)
             else:
                 state.value = value
-
-
-def _first_or_later(twin):
-    twin.run("high_level/start" if twin.timestep == 0 else "high_level/step")
-
-
-def _lads(twin):
-    _first_or_later(twin)
-    if twin.decides:
-        twin.select()
-        twin.run("codebook/lookup")
-    twin.run("low_level/act")
-
-
-def _lang_dt(twin):
-    _first_or_later(twin)
-
-
-def _lisa(twin):
-    twin.run("high_level/step")
-    if twin.decides:
-        twin.select()
-        twin.clear("low_level")
-        twin.run("low_level/start")
-    else:
-        twin.run("low_level/step")
-
-
-def _vae(twin):
-    _first_or_later(twin)
-    if twin.decides:
-        twin.run("plan/sample")
-    if "history" in twin.family:
-        _recall(twin)
-    else:
-        twin.run("low_level/act")
-
-
-def _lcsd(twin):
-    twin.run("high_level/step")
-    twin.select()
-    twin.run("low_level/init")
-    twin.repeat("low_level/denoise", twin.family["denoise"]["steps"])
-    twin.run("low_level/act")
-
-
-def _skilldiffuser(twin):
-    twin.run("high_level/step")
-    if twin.decides:
-        twin.select()
-        twin.run("low_level/init")
-        twin.repeat("low_level/denoise", twin.family["denoise"]["steps"])
-        twin.run("low_level/inverse")
-    twin.run("low_level/pop")
-
-
-def _history(twin):
-    if twin.family.get("actions"):
-        _first_or_later(twin)
-    else:
-        twin.run("high_level/step")
-    if twin.decides:
-        twin.select()
-    _recall(twin)
-
-
-def _recall(twin):
-    if twin.decides:
-        twin.clear("low_level")
-        twin.run("low_level/plan")
-        twin.repeat("low_level/recall", len(twin.states["row"].rows), ring="row")
-    twin.run("low_level/step")
-    twin.run("memory/append")
-
-
-def _plain(twin):
-    twin.run("policy/act")
-
-
-SCHEDULES = {
-    "lads": _lads,
-    "lang_dt": _lang_dt,
-    "lisa": _lisa,
-    "vae": _vae,
-    "lcsd": _lcsd,
-    "skilldiffuser": _skilldiffuser,
-    "history": _history,
-    "plain": _plain,
-}
 
 
 class Rollout:

@@ -74,6 +74,35 @@ def test_a_broken_rule_is_named(contract, change, message):
     assert message in str(refused.value)
 
 
+def places(value, path=()):
+    """Yields the path of every value inside a value; of a list, of the first two rows."""
+    if path:
+        yield path
+    inside = value.items() if isinstance(value, dict) else list(enumerate(value))[:2] if isinstance(value, list) else ()
+    for key, one in inside:
+        yield from places(one, (*path, key))
+
+
+@pytest.mark.parametrize("kind", ["lads", "stacked", "lcsd", "images", "vae_history"])
+def test_whatever_stands_in_a_place_is_taken_or_refused(kind):
+    """Tests that a value of any form in any place of a contract ends in no other error than a `UserError`."""
+    known = kinds.KINDS[kind]
+    contract = known.contract(known.sizes, 0)
+    refused = 0
+    for *parts, last in places(contract):
+        for value in (None, "x", 3, -1.5, [], {}, True, [[]], [{}]):
+            broken = copy.deepcopy(contract)
+            inside = broken
+            for part in parts:
+                inside = inside[part]
+            inside[last] = value
+            try:
+                contracts.check(broken)
+            except UserError:
+                refused += 1
+    assert refused > 100
+
+
 def test_images_have_limits_as_a_whole():
     image = contracts.array("camera", "observation", [4, 4, 3], "u8", layout="hwc", min=0, max=255)
     seen = copy.deepcopy(STACKED)

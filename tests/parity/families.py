@@ -11,13 +11,12 @@ from pathlib import Path
 
 from lads_exporter import bundle, episode, kinds
 
-KINDS = ("lads", "lang_dt", "lisa", "vae", "lcsd", "skilldiffuser", "history", "vae_history", "plain", "recurrent", "stacked", "camera", "images", "frozen_lang_dt", "frozen_lisa", "frozen_vae_history", "sighted", "sighted_history", "sighted_lang_dt", "sighted_lisa", "sighted_vae")
 STEPS = 200
 
 
 def fill(folder: Path) -> None:
     """Writes a bundle and an episode of each kind into a folder."""
-    for kind in KINDS:
+    for kind in kinds.KINDS:
         _, model = kinds.export(kind, seed=0)
         bundle.save(model, folder / f"{kind}.onnx")
         episode.write(folder / f"{kind}.onnx", folder / f"{kind}.safetensors", STEPS, seed=0)

@@ -12,31 +12,6 @@ use safetensors::{SafeTensors, tensor::TensorView};
 /// Environment variable that names the folder of bundles and episodes.
 pub const FOLDER: &str = "LADS_FAMILIES";
 
-/// Kinds of random policies.
-pub const KINDS: [&str; 21] = [
-    "lads",
-    "lang_dt",
-    "lisa",
-    "vae",
-    "lcsd",
-    "skilldiffuser",
-    "history",
-    "vae_history",
-    "plain",
-    "recurrent",
-    "stacked",
-    "camera",
-    "images",
-    "frozen_lang_dt",
-    "frozen_lisa",
-    "frozen_vae_history",
-    "sighted",
-    "sighted_history",
-    "sighted_lang_dt",
-    "sighted_lisa",
-    "sighted_vae",
-];
-
 /// Returns the folder of the bundles and episodes.
 ///
 /// # Panics
@@ -48,6 +23,24 @@ pub fn folder() -> PathBuf {
         || panic!("{FOLDER} names no folder; make one: python tests/parity/families.py FOLDER"),
         PathBuf::from,
     )
+}
+
+/// Returns the kinds of random policies in the folder, in the order of their names.
+///
+/// # Panics
+///
+/// When the folder cannot be read.
+pub fn kinds() -> Vec<String> {
+    let folder = folder();
+    let rows = std::fs::read_dir(&folder);
+    let rows = rows.unwrap_or_else(|error| panic!("{}: {error}", folder.display()));
+    let mut found: Vec<String> = rows
+        .map(|row| row.expect("it can be read").path())
+        .filter(|path| path.extension().is_some_and(|ending| ending == "onnx"))
+        .filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned()))
+        .collect();
+    found.sort();
+    found
 }
 
 /// Values of a channel over all steps.

@@ -17,7 +17,7 @@ use lads_core::{
 use lads_host::Memory;
 use lads_image::format::{CRC_WORD, crc32};
 
-use crate::episode::{FOLDER, KINDS, folder};
+use crate::episode::{FOLDER, folder, kinds};
 use crate::{compiled, wire};
 
 pub use import::{BREAK, import};
@@ -110,7 +110,7 @@ fn images() -> &'static [Vec<u32>] {
             .collect();
         if std::env::var_os(FOLDER).is_some() {
             let family = |kind| words(&compiled(&folder().join(format!("{kind}.onnx"))));
-            images.extend(KINDS.into_iter().map(family));
+            images.extend(kinds().into_iter().map(family));
         }
         images
     })

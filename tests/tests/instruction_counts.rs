@@ -18,7 +18,7 @@ use lads_core::{
     ChannelId, Contract, Controller, DType, Data, Decision, Instruction, Policy, StepReport,
 };
 use lads_host::{Aligned, Memory};
-use lads_tests::episode::{KINDS, folder};
+use lads_tests::episode::{folder, kinds};
 use lads_tests::project_path;
 
 /// Environment variable that names the image to the program under `callgrind`.
@@ -216,7 +216,7 @@ fn every_place_in_the_schedule_of_every_family_takes_one_number_of_instructions(
     if std::env::var_os(CHILD).is_some() {
         return with_image(episodes);
     }
-    for (number, kind) in KINDS.iter().enumerate() {
+    for (number, kind) in kinds().iter().enumerate() {
         let bundle = Bundle::open(&folder().join(format!("{kind}.onnx"))).unwrap();
         let image = compile_with(&bundle, &Options::default()).unwrap();
         let Some(counts) = counts(NAME, number, image.as_bytes()) else {
