@@ -124,8 +124,7 @@ fn read(bytes: &[u8]) -> Result<Log, recorder::LogError> {
 }
 
 fn replayed(policy: &Policy<'_>, log: &Log) -> Replayed {
-    let period = tiny_contract().period();
-    replay(policy, period, Isa::portable(), log, &|| {}).unwrap()
+    replay(policy, Isa::portable(), log, &|| {}).unwrap()
 }
 
 #[test]
@@ -169,8 +168,7 @@ fn a_log_without_plans_reads_back() {
     assert_eq!(read(&bytes).unwrap(), log);
     let plan = br#"{"index":null,"decided":false,"margin":null}"#;
     assert!(bytes.windows(plan.len()).any(|window| window == plan));
-    let period = tiny_contract().period();
-    let error = replay(&policy, period, Isa::detect(), &log, &|| {}).unwrap_err();
+    let error = replay(&policy, Isa::detect(), &log, &|| {}).unwrap_err();
     assert!(
         error.to_string().contains("control steps per plan is not"),
         "{error}"
@@ -200,8 +198,7 @@ fn the_first_step_that_differs_is_named() {
     assert_eq!(difference.action.as_ref().unwrap().0, "joint2_velocity");
 
     log.origin.action_names[0].push('x');
-    let period = tiny_contract().period();
-    let error = replay(&policy, period, Isa::detect(), &log, &|| {}).unwrap_err();
+    let error = replay(&policy, Isa::detect(), &log, &|| {}).unwrap_err();
     let error = error.to_string();
     assert!(error.contains("joint1_velocityx"), "{error}");
 }
@@ -285,8 +282,7 @@ fn commanded_plans_are_followed_and_encoded() {
         plans: vec![1, 0, 2],
     };
     let file = PlanFile::new(horizon, ids.iter().map(sequence).collect());
-    let period = tiny_contract().period();
-    let book = file.check(&policy, period, index).unwrap();
+    let book = file.check(&policy, Some(horizon), index).unwrap();
     let setup = Setup {
         plans: Some(&book),
         ..Setup::default()
@@ -337,7 +333,9 @@ fn commanded_plans_are_followed_and_encoded() {
     let refused = |change: &dyn Fn(&mut PlanFile)| {
         let mut file = file.clone();
         change(&mut file);
-        file.check(&policy, period, index).unwrap_err().to_string()
+        file.check(&policy, Some(horizon), index)
+            .unwrap_err()
+            .to_string()
     };
     let size = policy.index_count();
     assert!(refused(&|file| file.period += 1).contains("control steps each"));

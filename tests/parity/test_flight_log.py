@@ -44,8 +44,8 @@ def test_a_log_is_what_mcap_and_json_schema_say(flight):
             assert rules["type"] == "object" and schema.name.startswith("lads.")
             for field in rules["properties"].values():
                 assert field["description"] and (field["type"] != "array" or isinstance(field["items"], dict))
-            # May be missing: the words of an instruction in the table, and the noise of a policy that draws none.
-            required = [name for name in rules["properties"] if name not in ("words", "noise_seed")]
+            # May be missing: the words of an instruction in the table, the noise of a policy that draws none, random draws that begin anew.
+            required = [name for name in rules["properties"] if name not in ("words", "noise_seed", "continued")]
             jsonschema.validate(value, rules | {"additionalProperties": False, "required": required})
             count[channel.topic] += 1
             times[channel.topic].append(message.log_time)
@@ -67,3 +67,31 @@ def test_a_log_is_what_mcap_and_json_schema_say(flight):
     first = [later - earlier for earlier, later in zip(times["/action"], times["/action"][1:], strict=False)][: runs[0]["steps"] - 1]
     assert all(abs(gap / 1e9 - period) < 1e-6 for gap in first)
     assert about["bundle_sha256"] == results["bundle_sha256"]
+
+
+@pytest.mark.parametrize("kind", ["lads", "vae", "lcsd", "recurrent", "camera", "sighted_history"])
+def test_a_log_of_act_replays(kind, tmp_path):
+    """Tests that what `lads act` records, two episodes of one command, is computed again bit for bit: states, draws and frames too."""
+    kinds, bundle = pytest.importorskip("lads_exporter.kinds"), pytest.importorskip("lads_exporter.bundle")
+    _, model = kinds.export(kind, seed=0)
+    policy, log = tmp_path / "policy.onnx", tmp_path / "flight.mcap"
+    bundle.save(model, policy)
+    run = lambda *command, **more: subprocess.run(command, capture_output=True, text=True, timeout=300, **more)
+    seen = run(newest("lads"), "inspect", policy, "--observations").stdout
+    instruction = ["--instruction", "open"] if "instructions" in kinds.KINDS[kind].contract(kinds.KINDS[kind].sizes, 0) else []
+    acted = run(newest("lads"), "act", "--model", policy, *instruction, "--log", log, input=f"{seen}\n{seen}")
+    assert acted.returncode == 0, acted.stderr
+    replayed = run(newest("lads-run"), "replay", "--model", policy, log)
+    assert replayed.returncode == 0, replayed.stdout + replayed.stderr
+    assert f"{2 * len(seen.splitlines())}" in replayed.stdout and "2 episodes" in replayed.stdout, replayed.stdout
+    # And a log of other numbers does not.
+    other = run(newest("lads-run"), "replay", "--model", _of_another_seed(kind, tmp_path), log)
+    assert other.returncode == 1, other.stdout + other.stderr
+
+
+def _of_another_seed(kind, folder):
+    from lads_exporter import bundle, kinds
+
+    path = folder / "other.onnx"
+    bundle.save(kinds.export(kind, seed=1)[1], path)
+    return path

@@ -5,15 +5,19 @@
 //! of them, a step needs no line. No more of a line is read than an observation can need. An empty
 //! line starts a new episode of the same instruction and is not answered. An observation that is
 //! refused ends the command with the number of its line; the lines before it have been answered.
+//! [`crate::log`] records the steps.
 
 use std::fmt::Display;
 use std::io::{BufRead, ErrorKind, Read as _, Write};
+use std::path::Path;
+use std::time::Instant;
 
 use lads_core::{Controller, Instruction, Policy, StepError};
 use lads_host::Memory;
 
 use crate::images::Images;
 use crate::line;
+use crate::log::{Answered, Log};
 use crate::model::Model;
 use crate::refusal::Refusal;
 use crate::seen::Seen;
@@ -34,6 +38,8 @@ pub struct Request<'r> {
     pub images: &'r [String],
     /// Sample indices, from the stream with this seed, instead of following the contract's rule.
     pub sample: Option<u64>,
+    /// File for the control steps as a flight log.
+    pub log: Option<&'r Path>,
 }
 
 /// Answers `input` on `output` until the input ends or the output's reader closes it.
@@ -65,9 +71,15 @@ pub fn act(
         .map_err(|error| model.refused(error))?;
     // A policy that answers differently on this machine is not let near a motor.
     self_test::replay(model, &policy, &mut controller)?;
+    let mut decision = policy.contract().decision();
     if let Some(seed) = request.sample {
-        controller.set_decision(policy.contract().sampling(seed));
+        decision = policy.contract().sampling(seed);
+        controller.set_decision(decision);
     }
+    let log = request
+        .log
+        .map(|path| Log::start(path, &model.path, &policy, instruction, decision));
+    let log = log.transpose()?;
     if let Some(instruction) = instruction {
         controller
             .set_instruction(Instruction::Id(instruction))
@@ -80,8 +92,11 @@ pub fn act(
         controller,
         plans: request.plans,
         images,
+        log,
     };
-    pipe.answer_all(input, output)
+    let answered = pipe.answer_all(input, output);
+    let logged = pipe.log.map_or(Ok(()), Log::finish);
+    answered.and(logged)
 }
 
 /// Connects a controller with a reader and a writer.
@@ -90,6 +105,7 @@ struct Pipe<'p, 'm> {
     controller: Controller<'p, 'm>,
     plans: bool,
     images: Option<Images>,
+    log: Option<Log>,
 }
 
 impl Pipe<'_, '_> {
@@ -140,6 +156,9 @@ impl Pipe<'_, '_> {
             let asked = str::from_utf8(&bytes).map_err(|error| unreadable(&error))?;
             if asked.trim().is_empty() {
                 self.controller.reset();
+                if let Some(log) = &mut self.log {
+                    log.end_episode();
+                }
                 continue;
             }
             let form = seen.read(asked);
@@ -162,6 +181,7 @@ impl Pipe<'_, '_> {
 
     /// Runs one control step; on success returns the index in force if requested.
     fn step(&mut self, seen: &Seen, action: &mut [f32]) -> Result<Option<u32>, String> {
+        let start = Instant::now();
         let report =
             self.controller
                 .step_with(&seen.given(), action)
@@ -169,6 +189,15 @@ impl Pipe<'_, '_> {
                     StepError::Input(error) => lads_host::refused(&error, self.policy.contract()),
                     other => other.to_string(),
                 })?;
+        if let Some(log) = &mut self.log {
+            log.step(&Answered {
+                seen,
+                action,
+                report,
+                scores: self.controller.scores(),
+                controller_ns: start.elapsed().as_nanos() as u64,
+            });
+        }
         let selected = report.selected.map(|selected| selected.index);
         Ok(selected.filter(|_| self.plans))
     }

@@ -20,6 +20,7 @@ mod images;
 mod import;
 mod inspect;
 mod line;
+mod log;
 mod model;
 mod refusal;
 mod seen;
@@ -99,6 +100,9 @@ enum Command {
         /// Seed of the sampling
         #[arg(long, default_value_t = 0, requires = "sample")]
         seed: u64,
+        /// Record every control step in this MCAP file, which Foxglove opens; it is complete when the input ends or the command is interrupted
+        #[arg(long, value_name = "FILE")]
+        log: Option<PathBuf>,
     },
     /// Measures the control loop at its real rate: latency by kind of step, deadline misses, first call, growth with the context
     Bench(bench::Request),
@@ -164,6 +168,7 @@ fn run(command: Command) -> Result<(), Refusal> {
             plans,
             sample,
             seed,
+            log,
         } => {
             let sample = sample.then_some(seed);
             let request = act::Request {
@@ -171,6 +176,7 @@ fn run(command: Command) -> Result<(), Refusal> {
                 plans,
                 images: &images,
                 sample,
+                log: log.as_deref(),
             };
             act::act(
                 &Model::open(&model)?,

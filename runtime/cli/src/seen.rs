@@ -19,6 +19,8 @@ pub struct Seen {
 struct Values {
     id: ChannelId,
     name: String,
+    /// Rows and columns of an image.
+    size: [u32; 2],
     /// Names of the elements; empty for images and the like.
     elements: Vec<String>,
     held: Held,
@@ -96,6 +98,26 @@ impl Seen {
         all.map(|values| (values.id, data(&values.held))).collect()
     }
 
+    /// Returns the values of all channels but those of bytes, in the contract's order.
+    pub fn numbers(&self) -> Vec<f32> {
+        let all = self.channels.iter().flat_map(|values| match &values.held {
+            Held::F32(values) => values.clone(),
+            Held::I32(values) => values.iter().map(|&value| value as f32).collect(),
+            Held::U8(_) => vec![],
+        });
+        all.collect()
+    }
+
+    /// Returns name, rows and columns, and the frame of each channel of pixels.
+    pub fn cameras(&self) -> impl Iterator<Item = (&str, [u32; 2], &[u8])> {
+        self.channels
+            .iter()
+            .filter_map(|values| match &values.held {
+                Held::U8(bytes) => Some((values.name.as_str(), values.size, &bytes[..])),
+                _ => None,
+            })
+    }
+
     /// Names channel and element of the value at a position.
     fn at(&self, mut place: usize) -> String {
         for values in self.channels.iter().filter(|values| !values.beside) {
@@ -115,6 +137,10 @@ impl Values {
             id: channel.id(),
             beside,
             name: channel.name().to_owned(),
+            size: match *channel.shape() {
+                [rows, columns, _] => [rows, columns],
+                _ => [0; 2],
+            },
             elements: (channel.elements())
                 .map(|element| element.name.to_owned())
                 .collect(),
@@ -185,6 +211,7 @@ mod tests {
         Values {
             id: ChannelId(id),
             name: name.into(),
+            size: [0; 2],
             elements: elements.iter().map(ToString::to_string).collect(),
             held,
             beside: false,

@@ -211,3 +211,111 @@ fn observations_of_the_golden_episode_go_through_the_pipe() {
         );
     });
 }
+
+/// The observations of the golden episode twice, with a new episode between, and what is answered.
+fn two_episodes(arguments: &[&str]) -> (Vec<String>, Vec<String>) {
+    let episode = answer(&["inspect", tiny().to_str().unwrap(), "--observations"], "");
+    let answered = answer(arguments, &format!("{episode}\n{episode}"));
+    let lines = |text: &str| text.lines().map(str::to_owned).collect();
+    (lines(&episode), lines(&answered))
+}
+
+#[test]
+fn a_log_holds_every_step_of_every_episode() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("flight.mcap");
+    let model = tiny().to_str().unwrap().to_owned();
+    let arguments = act(&model, &["--plans", "--log", path.to_str().unwrap()]);
+    let (asked, answered) = two_episodes(&arguments);
+    let log = lads_record::read(&path).unwrap();
+    with_golden(|policy, _| {
+        assert_eq!(log.origin, lads_record::Origin::of(policy));
+        assert_eq!(log.origin.period, Some(4), "of the contract");
+        assert_eq!(log.origin.observation_names[3], "lamp");
+    });
+    assert_eq!(log.flights.len(), 2);
+    let mut answered = answered.iter();
+    for (number, flight) in (0..).zip(&log.flights) {
+        assert_eq!(
+            (flight.instruction_id.as_str(), flight.trace.episode),
+            ("dl", number)
+        );
+        assert_eq!(flight.trace.continued, number > 0);
+        assert_eq!(flight.trace.steps.len(), asked.len());
+        for ((step, asked), answered) in flight.trace.steps.iter().zip(&asked).zip(&mut answered) {
+            let mut answer = numbers(answered);
+            assert_eq!(step.plan.map(|plan| plan as f32), answer.pop());
+            assert_eq!(
+                (&step.observation, &step.action),
+                (&numbers(asked), &answer)
+            );
+            assert_eq!(step.executed, step.action);
+            assert_eq!(step.scores.is_empty(), !step.decided);
+            assert!(step.controller_ns > 0);
+        }
+    }
+    assert_eq!(
+        fs::read_dir(folder.path()).unwrap().count(),
+        1,
+        "no draft is left"
+    );
+}
+
+#[cfg(unix)]
+#[test]
+fn a_log_is_whole_after_an_interrupt() {
+    use std::io::{BufRead, BufReader};
+
+    let folder = tempfile::tempdir().unwrap();
+    let model = tiny().to_str().unwrap().to_owned();
+    for signal in ["-INT", "-TERM"] {
+        let path = folder.path().join(format!("flight{signal}.mcap"));
+        let mut child = Command::new(env!("CARGO_BIN_EXE_lads"))
+            .args(act(&model, &["--log", path.to_str().unwrap()]))
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut stdin = child.stdin.take().unwrap();
+        let mut stdout = BufReader::new(child.stdout.take().unwrap()).lines();
+        for _ in 0..3 {
+            stdin.write_all(b"0,0,0,0,0\n").unwrap();
+            stdout.next().unwrap().unwrap();
+        }
+        assert!(!path.exists(), "its path is untouched while it runs");
+        let killed = Command::new("kill")
+            .args([signal, &child.id().to_string()])
+            .status();
+        assert!(killed.unwrap().success());
+        assert_eq!(child.wait().unwrap().code(), Some(130), "{signal}");
+        let log = lads_record::read(&path).unwrap();
+        assert_eq!(log.flights[0].trace.steps.len(), 3, "{signal}");
+    }
+}
+
+#[test]
+fn a_log_ends_before_what_is_refused_and_is_refused_itself_where_it_cannot_be() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("flight.mcap");
+    let model = tiny().to_str().unwrap().to_owned();
+    let arguments = act(&model, &["--log", path.to_str().unwrap()]);
+    refused(&arguments, "0,0,0,0,0\n0,0,0,99,0\n", &["line 2"]);
+    let log = lads_record::read(&path).unwrap();
+    assert_eq!(log.flights[0].trace.steps.len(), 1);
+    // Nothing came: a log without an episode.
+    assert_eq!(answer(&arguments, ""), "");
+    assert!(lads_record::read(&path).unwrap().flights.is_empty());
+
+    let absent = folder.path().join("absent/flight.mcap");
+    let good = "0,0,0,0,0\n";
+    let absent = absent.to_str().unwrap();
+    let answered = refused(&act(&model, &["--log", absent]), good, &["--log", "folder"]);
+    assert_eq!(answered, "", "it is refused before the first step");
+    refused(
+        &act(&model, &["--log", &model]),
+        good,
+        &["--log", "--model"],
+    );
+    let full = refused(&act(&model, &["--log", "/dev/full"]), good, &["/dev/full"]);
+    assert_eq!(full.lines().count(), 1, "the policy answers all the same");
+}

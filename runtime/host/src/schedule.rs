@@ -100,6 +100,12 @@ pub fn period(tables: &Tables) -> u32 {
     })
 }
 
+/// Returns the number of control steps from one selection of an index to the next; `None` for a policy that selects none.
+pub fn selection_period(policy: &Policy<'_>) -> Option<usize> {
+    let tables = Tables::new(policy.image()).ok()?;
+    (policy.index_count() > 0).then(|| period(&tables) as usize)
+}
+
 fn gcd(a: u32, b: u32) -> u32 {
     if b == 0 { a } else { gcd(b, a % b) }
 }

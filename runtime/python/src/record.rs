@@ -51,7 +51,7 @@ pub fn check_log(
         .map_err(|error| RecordError::new_err(error.to_string()))
 }
 
-/// Returns the origin of a log, whose period is known once there are episodes.
+/// Returns the origin of a log of a policy that observes one vector of floats.
 fn origin(
     policy: &Policy,
     seed: u64,
@@ -74,16 +74,10 @@ fn origin(
         )));
     }
     Ok(Origin {
-        bundle_sha256: contract.bundle_sha256().to_owned(),
-        environment: contract.environment_id().to_owned(),
-        environment_version: contract.environment_version().to_owned(),
         seed,
         noise,
-        control_period_s: f64::from(contract.control_period_s()),
-        period: None,
-        observation_names: names(observation),
-        action_names: names(&contract.action()),
         notes,
+        ..Origin::of(policy.checked().view())
     })
 }
 
@@ -99,10 +93,7 @@ pub fn write_log(
     notes: BTreeMap<String, String>,
     episodes: Vec<Recorded<'_>>,
 ) -> PyResult<()> {
-    let origin = Origin {
-        period: period(&episodes),
-        ..origin(policy, seed, noise, notes)?
-    };
+    let origin = origin(policy, seed, noise, notes)?;
     let flights = episodes
         .into_iter()
         .enumerate()
@@ -122,27 +113,6 @@ pub fn write_log(
             path.display()
         ))
     })
-}
-
-/// Returns the names of a channel's elements.
-fn names(channel: &Channel<'_>) -> Vec<String> {
-    let named = channel.elements().map(|element| element.name.to_owned());
-    let named: Vec<_> = named.collect();
-    if named.is_empty() {
-        let name = channel.name();
-        return (0..channel.len()).map(|i| format!("{name}{i}")).collect();
-    }
-    named
-}
-
-/// Returns the number of control steps from one decision to the next, if there are two decisions.
-fn period(episodes: &[Recorded<'_>]) -> Option<usize> {
-    let mut steps = episodes.iter().map(|episode| {
-        let decided = episode.decided.iter().enumerate();
-        let mut at = decided.filter_map(|(step, &decided)| decided.then_some(step));
-        Some(at.next()?.abs_diff(at.next()?))
-    });
-    steps.find_map(|period| period)
 }
 
 fn flight(policy: &Policy, number: u32, episode: Recorded<'_>) -> PyResult<Flight> {
@@ -231,6 +201,7 @@ fn flight(policy: &Policy, number: u32, episode: Recorded<'_>) -> PyResult<Fligh
             sampling_seed: episode.sample,
             noise_seed: episode.noise,
             commanded: false,
+            continued: false,
             outcome,
             steps,
         },

@@ -1,11 +1,11 @@
-//! Flight recorder: episodes as an MCAP file, for Foxglove and other programs that read MCAP.
-//! `lads-run replay` repeats the computation of a log that `lads-run --log` wrote.
+//! Flight recorder: episodes as an MCAP file, for Foxglove and other programs that read MCAP. [`write`](write()) writes episodes that are
+//! over, a [`Recorder`] those that run.
 //!
 //! One channel per kind of message, JSON with a JSON schema each:
 //!
 //! | topic | when | what |
 //! |---|---|---|
-//! | `/episode` | at the start of each | instruction, number, decision rule, outcome |
+//! | `/episode` | at the start of each | instruction, number, decision rule; outcome, where it is over |
 //! | `/observation` | every control step | what the policy saw, in the contract's units |
 //! | `/images/NAME` | every control step, for each camera | its frame, as Foxglove's `CompressedImage` in PNG |
 //! | `/action` | every control step | what it answered, and what was executed |
@@ -24,6 +24,7 @@
 #![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 
+pub mod png;
 mod read;
 mod schema;
 #[cfg(test)]
@@ -33,18 +34,20 @@ mod write;
 
 use std::collections::BTreeMap;
 
+use lads_core::{Channel, DType, Policy};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::trace::Trace;
 
 pub use read::read;
-pub use write::write;
+pub use write::{Recorder, write};
 
 /// Version of the messages; it changes when a message changes its meaning or is removed.
 ///
-/// Version 1, which is read too, has names of elements with spaces between them; version 2 has them as a JSON array.
-pub const FORMAT_VERSION: u32 = 2;
+/// Versions 1 and 2 are read too. Version 1 has names of elements with spaces between them, later ones have them as a JSON array; of both,
+/// an episode's message always has its steps and success.
+pub const FORMAT_VERSION: u32 = 3;
 
 /// Name of the metadata record.
 const METADATA: &str = "lads";
@@ -75,6 +78,52 @@ pub struct Origin {
     pub action_names: Vec<String>,
     /// Further facts: faults, versions.
     pub notes: BTreeMap<String, String>,
+}
+
+impl Origin {
+    /// Makes the origin of a log of a policy, under no noise: names of several channels' elements begin with their channel's.
+    pub fn of(policy: &Policy<'_>) -> Self {
+        let contract = policy.contract();
+        let vectors: Vec<_> = contract
+            .observations()
+            .filter(|channel| channel.dtype() != DType::U8)
+            .collect();
+        let observation_names = match &vectors[..] {
+            [only] => names(only),
+            several => {
+                let named = several.iter().flat_map(|channel| {
+                    let of = channel.name();
+                    names(channel)
+                        .into_iter()
+                        .map(move |name| format!("{of}.{name}"))
+                });
+                named.collect()
+            }
+        };
+        Self {
+            bundle_sha256: contract.bundle_sha256().to_owned(),
+            environment: contract.environment_id().to_owned(),
+            environment_version: contract.environment_version().to_owned(),
+            seed: 0,
+            noise: "none".to_owned(),
+            control_period_s: f64::from(contract.control_period_s()),
+            period: lads_host::schedule::selection_period(policy),
+            observation_names,
+            action_names: names(&contract.action()),
+            notes: BTreeMap::new(),
+        }
+    }
+}
+
+/// Returns the names of a channel's elements, made of its own where they have none.
+fn names(channel: &Channel<'_>) -> Vec<String> {
+    let named = channel.elements().map(|element| element.name.to_owned());
+    let named: Vec<_> = named.collect();
+    if named.is_empty() {
+        let name = channel.name();
+        return (0..channel.len()).map(|i| format!("{name}{i}")).collect();
+    }
+    named
 }
 
 /// A recorded episode with the instruction's words, which outlive its index.
@@ -153,8 +202,13 @@ struct EpisodeMessage {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     noise_seed: Option<String>,
     commanded: bool,
-    steps: usize,
-    success: bool,
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    continued: bool,
+    /// Left out, like `success`, where the episode was recorded while it ran.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    steps: Option<usize>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    success: Option<bool>,
 }
 
 /// Message of the topics `/observation` and `/logits`.

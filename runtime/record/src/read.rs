@@ -27,12 +27,18 @@ pub fn read(path: &Path) -> Result<Log, LogError> {
     whole(&bytes)?;
     let (origin, episodes) = origin(&bytes)?;
     let mut flights = Vec::new();
+    // How many steps each says it has: nothing, where it was recorded while it ran.
+    let mut said = Vec::new();
     for message in MessageStream::new(&bytes)? {
         let message = message?;
         let topic = TOPICS
             .iter()
             .position(|known| known.name == message.channel.topic);
-        if let Some(topic) = topic {
+        if topic == Some(EPISODE) {
+            let (flight, steps) = begun(self::message(EPISODE, &message.data)?)?;
+            flights.push(flight);
+            said.push(steps);
+        } else if let Some(topic) = topic {
             take(topic, &message.data, &mut flights)?;
         } else if let Some(camera) = message.channel.topic.strip_prefix(IMAGES) {
             let picture = picture(camera, &message.data)?;
@@ -43,7 +49,8 @@ pub fn read(path: &Path) -> Result<Log, LogError> {
         let got = flights.len();
         return Err(foreign(format!("it has {got} of its {episodes} episodes")));
     }
-    for flight in &flights {
+    for (flight, said) in flights.iter_mut().zip(said) {
+        flight.trace.outcome.steps = said.unwrap_or(flight.trace.steps.len());
         check(flight, &origin)?;
     }
     Ok(Log { origin, flights })
@@ -140,12 +147,7 @@ fn number<N: std::str::FromStr>(
     value.ok_or_else(|| foreign(format!("its metadata lack a sound {key}")))
 }
 
-fn take(topic: usize, data: &[u8], flights: &mut Vec<Flight>) -> Result<(), LogError> {
-    if topic == EPISODE {
-        let start: EpisodeMessage = message(topic, data)?;
-        flights.push(begun(start)?);
-        return Ok(());
-    }
+fn take(topic: usize, data: &[u8], flights: &mut [Flight]) -> Result<(), LogError> {
     let flight = flights
         .last_mut()
         .ok_or_else(|| foreign("a message comes before the first episode"))?;
@@ -224,13 +226,14 @@ fn picture(camera: &str, data: &[u8]) -> Result<Picture, LogError> {
     })
 }
 
-fn begun(start: EpisodeMessage) -> Result<Flight, LogError> {
+/// The episode that begins, and how many steps it says that it has.
+fn begun(start: EpisodeMessage) -> Result<(Flight, Option<usize>), LogError> {
     let seed = |seed: Option<String>| {
         let seed = seed.as_deref().map(str::parse).transpose();
         seed.map_err(|_| foreign("a seed is not a number"))
     };
     let (sampling_seed, noise_seed) = (seed(start.sampling_seed)?, seed(start.noise_seed)?);
-    Ok(Flight {
+    let flight = Flight {
         instruction_id: start.instruction_id,
         instruction_text: start.instruction_text,
         words: start.words,
@@ -241,16 +244,18 @@ fn begun(start: EpisodeMessage) -> Result<Flight, LogError> {
             sampling_seed,
             noise_seed,
             commanded: start.commanded,
+            continued: start.continued,
             outcome: Episode {
-                steps: start.steps,
-                success: start.success,
+                steps: 0,
+                success: start.success.unwrap_or(false),
                 completions: Vec::new(),
                 plans: Vec::new(),
                 final_state: Vec::new(),
             },
             steps: Vec::new(),
         },
-    })
+    };
+    Ok((flight, start.steps))
 }
 
 fn message<M: DeserializeOwned>(topic: usize, data: &[u8]) -> Result<M, LogError> {

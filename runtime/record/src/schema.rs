@@ -125,8 +125,21 @@ pub const TOPICS: [Topic; 8] = [
                 "seed of what else the policy draws at random; absent where it draws nothing",
             ),
             ("commanded", Kind::Flag, "plans were given"),
-            ("steps", Kind::Integer, "control steps that follow"),
-            ("success", Kind::Flag, "the instruction was carried out"),
+            (
+                "continued",
+                Kind::Flag,
+                "random draws go on from the episode before; absent where they begin anew",
+            ),
+            (
+                "steps",
+                Kind::Integer,
+                "control steps that follow; absent where it was recorded while it ran",
+            ),
+            (
+                "success",
+                Kind::Flag,
+                "the instruction was carried out; absent where nobody knew yet",
+            ),
         ],
     },
     Topic {

@@ -47,6 +47,7 @@ fn log() -> Log {
         sampling_seed: Some(u64::MAX),
         noise_seed: None,
         commanded: false,
+        continued: false,
         outcome: Episode {
             steps: steps.len(),
             success: true,

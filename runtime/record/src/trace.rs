@@ -58,6 +58,8 @@ pub struct Trace {
     pub noise_seed: Option<u64>,
     /// True if the plans were given from outside.
     pub commanded: bool,
+    /// True if its random draws are the next of the streams of the episode before, which have the same seeds.
+    pub continued: bool,
     /// Outcome of the episode.
     pub outcome: Episode,
     /// Control steps of the episode, in order.

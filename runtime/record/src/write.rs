@@ -1,10 +1,11 @@
-//! Writes episodes to an MCAP file.
+//! Writes episodes to an MCAP file, all at once or while they run.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufWriter, Seek, Write};
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
+use lads_proof::episode::Episode;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{WriteOptions, Writer};
 use serde::Serialize;
@@ -13,7 +14,7 @@ use crate::schema::{
     ACTION, COMPLETION, EPISODE, GRIPPER, IMAGE, LOGITS, OBSERVATION, PLAN, TIMING, TOPICS,
     image_schema,
 };
-use crate::trace::Picture;
+use crate::trace::{Picture, Step};
 use crate::{
     ActionMessage, CompletionMessage, EpisodeMessage, FORMAT_VERSION, Flight, GripperMessage,
     IMAGES, ImageMessage, Log, METADATA, Origin, PERIOD, PlanMessage, Time, TimingMessage, Values,
@@ -24,22 +25,14 @@ const PAUSE_NS: u64 = 1_000_000_000;
 
 /// Writes a log; the file is complete once this returns without an error.
 pub fn write<W: Write + Seek>(log: &Log, to: W) -> mcap::McapResult<()> {
-    let options = WriteOptions::new()
-        .compression(None)
-        .profile("")
-        .library(concat!("lads-record ", env!("CARGO_PKG_VERSION")));
-    let mut writer = Writer::with_options(BufWriter::new(to), options)?;
-    writer.write_metadata(&metadata(&log.origin, log.flights.len()))?;
     let steps = log.flights.iter().flat_map(|flight| &flight.trace.steps);
     let cameras = steps.flat_map(|step| &step.pictures);
-    let cameras = cameras.map(|picture| picture.channel.as_str()).collect();
-    let mut recorder = Recorder::new(writer, &log.origin, &cameras)?;
+    let cameras: BTreeSet<_> = cameras.map(|picture| picture.channel.as_str()).collect();
+    let mut recorder = Recorder::new(to, &log.origin, cameras)?;
     log.flights
         .iter()
         .try_for_each(|flight| recorder.flight(flight))?;
-    recorder.writer.finish()?;
-    recorder.writer.into_inner().flush()?;
-    Ok(())
+    recorder.finish().map(drop)
 }
 
 fn metadata(origin: &Origin, episodes: usize) -> Metadata {
@@ -71,8 +64,14 @@ fn listed(names: &[String]) -> String {
     serde_json::json!(names).to_string()
 }
 
-struct Recorder<W: Write + Seek> {
-    writer: Writer<W>,
+/// A log that is written while episodes run: [`begin`](Self::begin), [`step`](Self::step) after each control step, and
+/// [`finish`](Self::finish), without which it is no complete file.
+///
+/// What can fail, in every call: the disk.
+pub struct Recorder<W: Write + Seek> {
+    writer: Writer<BufWriter<W>>,
+    origin: Origin,
+    episodes: usize,
     channels: Vec<u16>,
     /// Channels of the cameras, by their names.
     cameras: BTreeMap<String, u16>,
@@ -82,11 +81,17 @@ struct Recorder<W: Write + Seek> {
 }
 
 impl<W: Write + Seek> Recorder<W> {
-    fn new(
-        mut writer: Writer<W>,
+    /// Starts a log of policies that see these cameras.
+    pub fn new<'c>(
+        to: W,
         origin: &Origin,
-        cameras: &BTreeSet<&str>,
+        cameras: impl IntoIterator<Item = &'c str>,
     ) -> mcap::McapResult<Self> {
+        let options = WriteOptions::new()
+            .compression(None)
+            .profile("")
+            .library(concat!("lads-record ", env!("CARGO_PKG_VERSION")));
+        let mut writer = Writer::with_options(BufWriter::new(to), options)?;
         let mut channels = Vec::with_capacity(TOPICS.len());
         for (index, topic) in TOPICS.iter().enumerate() {
             let schema =
@@ -103,7 +108,7 @@ impl<W: Write + Seek> Recorder<W> {
             channels.push(writer.add_channel(schema, topic.name, "json", &about)?);
         }
         let mut images = BTreeMap::new();
-        for &name in cameras {
+        for name in cameras {
             let schema = writer.add_schema(IMAGE, "jsonschema", image_schema().as_bytes())?;
             let topic = format!("{IMAGES}{name}");
             let channel = writer.add_channel(schema, &topic, "json", &BTreeMap::new())?;
@@ -111,15 +116,64 @@ impl<W: Write + Seek> Recorder<W> {
         }
         Ok(Self {
             writer,
+            episodes: 0,
             channels,
             cameras: images,
             time_ns: 0,
             period_ns: (origin.control_period_s * 1e9).round() as u64,
+            origin: origin.clone(),
             sequence: 0,
         })
     }
 
-    fn flight(&mut self, flight: &Flight) -> mcap::McapResult<()> {
+    /// Begins an episode whose steps and outcome are not known yet: those of `flight` are not written.
+    pub fn begin(&mut self, flight: &Flight) -> mcap::McapResult<()> {
+        self.start(flight, None)
+    }
+
+    /// Records a control step of the episode that began last.
+    pub fn step(&mut self, step: &Step) -> mcap::McapResult<()> {
+        let values = step.observation.clone();
+        self.message(OBSERVATION, &Values { values })?;
+        for picture in &step.pictures {
+            self.picture(picture)?;
+        }
+        let action = ActionMessage {
+            policy: step.action.clone(),
+            executed: step.executed.clone(),
+        };
+        self.message(ACTION, &action)?;
+        let plan = PlanMessage {
+            index: step.plan,
+            decided: step.decided,
+            margin: step.margin,
+        };
+        self.message(PLAN, &plan)?;
+        if !step.scores.is_empty() {
+            let values = step.scores.clone();
+            self.message(LOGITS, &Values { values })?;
+        }
+        let controller_ns = step.controller_ns;
+        self.message(TIMING, &TimingMessage { controller_ns })?;
+        if let Some([x, y, z]) = step.gripper {
+            self.message(GRIPPER, &GripperMessage { x, y, z })?;
+        }
+        self.time_ns += self.period_ns;
+        Ok(())
+    }
+
+    /// Completes the file and returns what it was written to.
+    pub fn finish(mut self) -> mcap::McapResult<W> {
+        self.writer
+            .write_metadata(&metadata(&self.origin, self.episodes))?;
+        self.writer.finish()?;
+        let to = self.writer.into_inner();
+        Ok(to
+            .into_inner()
+            .map_err(std::io::IntoInnerError::into_error)?)
+    }
+
+    fn start(&mut self, flight: &Flight, outcome: Option<&Episode>) -> mcap::McapResult<()> {
         let trace = &flight.trace;
         let start = EpisodeMessage {
             instruction: trace.instruction,
@@ -130,43 +184,23 @@ impl<W: Write + Seek> Recorder<W> {
             sampling_seed: trace.sampling_seed.map(|seed| seed.to_string()),
             noise_seed: trace.noise_seed.map(|seed| seed.to_string()),
             commanded: trace.commanded,
-            steps: trace.steps.len(),
-            success: trace.outcome.success,
+            continued: trace.continued,
+            steps: outcome.map(|outcome| outcome.steps),
+            success: outcome.map(|outcome| outcome.success),
         };
-        self.message(EPISODE, &start)?;
-        let mut completions = trace
-            .outcome
-            .completions
-            .iter()
-            .zip(&flight.completed)
-            .peekable();
-        for (number, step) in (1..).zip(&trace.steps) {
-            let values = step.observation.clone();
-            self.message(OBSERVATION, &Values { values })?;
-            for picture in &step.pictures {
-                self.picture(picture)?;
-            }
-            let action = ActionMessage {
-                policy: step.action.clone(),
-                executed: step.executed.clone(),
-            };
-            self.message(ACTION, &action)?;
-            let plan = PlanMessage {
-                index: step.plan,
-                decided: step.decided,
-                margin: step.margin,
-            };
-            self.message(PLAN, &plan)?;
-            if !step.scores.is_empty() {
-                let values = step.scores.clone();
-                self.message(LOGITS, &Values { values })?;
-            }
-            let controller_ns = step.controller_ns;
-            self.message(TIMING, &TimingMessage { controller_ns })?;
-            if let Some([x, y, z]) = step.gripper {
-                self.message(GRIPPER, &GripperMessage { x, y, z })?;
-            }
-            self.time_ns += self.period_ns;
+        if self.episodes > 0 {
+            self.time_ns += PAUSE_NS;
+        }
+        self.episodes += 1;
+        self.message(EPISODE, &start)
+    }
+
+    fn flight(&mut self, flight: &Flight) -> mcap::McapResult<()> {
+        let outcome = &flight.trace.outcome;
+        self.start(flight, Some(outcome))?;
+        let mut completions = outcome.completions.iter().zip(&flight.completed).peekable();
+        for (number, step) in (1..).zip(&flight.trace.steps) {
+            self.step(step)?;
             while let Some((completion, name)) = completions.next_if(|(c, _)| c.step <= number) {
                 let message = CompletionMessage {
                     sub_task: name.clone(),
@@ -175,7 +209,6 @@ impl<W: Write + Seek> Recorder<W> {
                 self.message(COMPLETION, &message)?;
             }
         }
-        self.time_ns += PAUSE_NS;
         Ok(())
     }
 

@@ -10,7 +10,7 @@ pub struct Completion {
 }
 
 /// Outcome of one episode.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Episode {
     /// Control steps executed.
     pub steps: usize,

@@ -287,6 +287,7 @@ impl Evaluation<'_> {
                     Noise::Zero => None,
                 },
                 commanded: task.plans.is_some(),
+                continued: false,
                 outcome: run.clone(),
                 steps: driver.take_recording(),
             });

@@ -11,7 +11,7 @@ pub mod cache;
 #[cfg(feature = "camera")]
 mod draw;
 #[cfg(feature = "camera")]
-pub mod png;
+pub use lads_record::png;
 #[cfg(feature = "camera")]
 mod squeeze;
 #[cfg(feature = "camera")]

@@ -5,13 +5,13 @@
 //! observation that it refuses.
 
 use lads_core::{
-    Channel, ChannelId, Contract, DType, Data, Decision, FollowError, Instruction,
+    Channel, ChannelId, Contract, Controller, DType, Data, Decision, FollowError, Instruction,
     InstructionError, Isa, Noise, Policy, StepError,
 };
 use lads_host::{Memory, MemoryError};
 use thiserror::Error;
 
-use crate::recorder::{Flight, Log};
+use crate::recorder::{Flight, Log, Origin, png};
 use crate::trace::Step;
 
 /// Why a log cannot be replayed.
@@ -110,17 +110,16 @@ pub struct Replayed {
     pub differences: Vec<Difference>,
 }
 
-/// Replays all episodes of a log on the instruction set `isa`, by a policy that selects every `period` control steps; `finished` is called
+/// Replays all episodes of a log on the instruction set `isa`, `finished` is called
 /// after each.
 pub fn replay(
     policy: &Policy<'_>,
-    period: Option<usize>,
     isa: Isa,
     log: &Log,
     finished: &dyn Fn(),
 ) -> Result<Replayed, ReplayError> {
     let contract = policy.contract();
-    fits(contract, period, log)?;
+    fits(policy, log)?;
     let mut memory = Memory::of(policy).map_err(ReplayError::Memory)?;
     let mut controller = memory
         .controller_with(policy, isa)
@@ -128,24 +127,12 @@ pub fn replay(
     let mut replayed = Replayed::default();
     let mut action = vec![0.0; contract.action_len()];
     for flight in &log.flights {
-        let instruction = match &flight.words {
-            Some(words) => Instruction::Words(words),
-            None => Instruction::Id(find(contract, flight)?),
-        };
-        controller.set_decision(match flight.trace.sampling_seed {
-            None => Decision::Argmax,
-            Some(seed) => contract.sampling(seed),
-        });
-        let noise = flight.trace.noise_seed;
-        controller.set_noise(noise.map_or(Noise::Zero, |seed| Noise::Seeded { seed }));
-        controller
-            .set_instruction(instruction)
-            .map_err(ReplayError::Instruct)?;
+        begin(&mut controller, contract, flight)?;
         let episode = || format!("{} episode {}", flight.instruction_id, flight.trace.episode);
         let mut first = None;
         for (number, step) in flight.trace.steps.iter().enumerate() {
-            let images = images(contract, step).map_err(|wrong| wrong.at(episode(), number))?;
-            let seen = seen(contract, step, &images);
+            let given = Given::at(contract, step).map_err(|wrong| wrong.at(episode(), number))?;
+            let seen = given.data();
             let plan = if let Some(plan) = step.plan.filter(|_| flight.trace.commanded) {
                 let acted = controller.follow(&seen, plan, &mut action);
                 acted.map_err(|error| ReplayError::Follow {
@@ -175,6 +162,35 @@ pub fn replay(
     Ok(replayed)
 }
 
+/// Brings a controller to the beginning of an episode.
+fn begin(
+    controller: &mut Controller<'_, '_>,
+    contract: &Contract<'_>,
+    flight: &Flight,
+) -> Result<(), ReplayError> {
+    if flight.trace.continued {
+        controller.reset();
+        return Ok(());
+    }
+    controller.set_decision(match flight.trace.sampling_seed {
+        None => Decision::Argmax,
+        Some(seed) => contract.sampling(seed),
+    });
+    let noise = flight.trace.noise_seed;
+    controller.set_noise(noise.map_or(Noise::Zero, |seed| Noise::Seeded { seed }));
+    let instruction = match &flight.words {
+        Some(words) => Instruction::Words(words),
+        None if contract.instruction_channel().is_none() => {
+            controller.reset();
+            return Ok(());
+        }
+        None => Instruction::Id(find(contract, flight)?),
+    };
+    controller
+        .set_instruction(instruction)
+        .map_err(ReplayError::Instruct)
+}
+
 /// What is wrong with a step's frames.
 pub(super) struct BadFrame {
     camera: String,
@@ -201,57 +217,66 @@ impl BadFrame {
     }
 }
 
-/// Frames of the cameras at a control step, in the contract's order.
-pub(super) fn images(
-    contract: &Contract<'_>,
-    step: &Step,
-) -> Result<Vec<(ChannelId, Vec<u8>)>, BadFrame> {
-    let cameras = contract
-        .observations()
-        .filter(|channel| channel.dtype() == DType::U8);
-    cameras
-        .map(|camera| {
-            let bad = |wrong| BadFrame {
-                camera: camera.name().to_owned(),
-                wrong,
+/// What the controller was given at a control step, channel by channel.
+pub(super) struct Given(Vec<(ChannelId, Held)>);
+
+enum Held {
+    F32(Vec<f32>),
+    I32(Vec<i32>),
+    U8(Vec<u8>),
+}
+
+impl Given {
+    /// Reads it from a step of a log: frames from its pictures, all else from its numbers.
+    pub(super) fn at(contract: &Contract<'_>, step: &Step) -> Result<Self, BadFrame> {
+        let mut rest = &step.observation[..];
+        let mut numbers = |channel: &Channel<'_>| {
+            let (own, behind) = rest.split_at(channel.len().min(rest.len()));
+            rest = behind;
+            own
+        };
+        let channels = contract.observations().map(|channel| {
+            let held = match channel.dtype() {
+                DType::F32 => Held::F32(numbers(&channel).to_vec()),
+                DType::I32 => Held::I32(numbers(&channel).iter().map(|&n| n as i32).collect()),
+                DType::U8 => Held::U8(frame(&channel, step)?),
             };
-            let mut pictures = step.pictures.iter();
-            let picture = pictures.find(|picture| picture.channel == camera.name());
-            let picture = picture.ok_or_else(|| bad(None))?;
-            let frame = pixels(&picture.png).map_err(|wrong| bad(Some(wrong)))?;
-            if frame.len() != camera.len() {
-                let (got, wanted) = (frame.len(), camera.len());
-                return Err(bad(Some(format!("{got} bytes instead of {wanted}"))));
-            }
-            Ok((camera.id(), frame))
-        })
-        .collect()
+            Ok((channel.id(), held))
+        });
+        channels.collect::<Result<_, _>>().map(Self)
+    }
+
+    pub(super) fn data(&self) -> Vec<(ChannelId, Data<'_>)> {
+        let all = self.0.iter().map(|(id, held)| {
+            let data = match held {
+                Held::F32(values) => Data::F32(values),
+                Held::I32(values) => Data::I32(values),
+                Held::U8(bytes) => Data::U8(bytes),
+            };
+            (*id, data)
+        });
+        all.collect()
+    }
 }
 
-#[cfg(feature = "camera")]
-fn pixels(png: &[u8]) -> Result<Vec<u8>, String> {
-    crate::frames::png::decode(png).map(|(pixels, _)| pixels)
+/// Reads a camera's frame at a control step.
+fn frame(camera: &Channel<'_>, step: &Step) -> Result<Vec<u8>, BadFrame> {
+    let bad = |wrong| BadFrame {
+        camera: camera.name().to_owned(),
+        wrong,
+    };
+    let mut pictures = step.pictures.iter();
+    let picture = pictures.find(|picture| picture.channel == camera.name());
+    let picture = picture.ok_or_else(|| bad(None))?;
+    let (frame, _) = png::decode(&picture.png).map_err(|wrong| bad(Some(wrong)))?;
+    if frame.len() != camera.len() {
+        let (got, wanted) = (frame.len(), camera.len());
+        return Err(bad(Some(format!("{got} bytes instead of {wanted}"))));
+    }
+    Ok(frame)
 }
 
-#[cfg(not(feature = "camera"))]
-fn pixels(_: &[u8]) -> Result<Vec<u8>, String> {
-    Err("this program was built without cameras; build it with --features camera".to_owned())
-}
-
-/// What the controller was given at a control step.
-pub(super) fn seen<'s>(
-    contract: &Contract<'_>,
-    step: &'s Step,
-    images: &'s [(ChannelId, Vec<u8>)],
-) -> Vec<(ChannelId, Data<'s>)> {
-    let mut vectors = contract.observations();
-    let vector = vectors.find(|channel| channel.dtype() == DType::F32);
-    let vector = vector.map(|channel| (channel.id(), Data::F32(&step.observation)));
-    let images = images.iter().map(|(id, frame)| (*id, Data::U8(frame)));
-    vector.into_iter().chain(images).collect()
-}
-
-fn fits(contract: &Contract<'_>, period: Option<usize>, log: &Log) -> Result<(), ReplayError> {
+fn fits(policy: &Policy<'_>, log: &Log) -> Result<(), ReplayError> {
     let origin = &log.origin;
     let sizes = |what, log: String, policy: String| {
         if log == policy {
@@ -259,26 +284,30 @@ fn fits(contract: &Contract<'_>, period: Option<usize>, log: &Log) -> Result<(),
         }
         Err(ReplayError::Sizes { what, log, policy })
     };
+    let ours = Origin::of(policy);
     elements(
         "observation",
         &origin.observation_names,
-        &contract.observation(),
+        &ours.observation_names,
     )?;
-    elements("action", &origin.action_names, &contract.action())?;
+    elements("action", &origin.action_names, &ours.action_names)?;
     let said = |period: Option<usize>| period.map_or("none".to_owned(), |steps| steps.to_string());
-    sizes("control steps per plan", said(origin.period), said(period))
+    sizes(
+        "control steps per plan",
+        said(origin.period),
+        said(ours.period),
+    )
 }
 
 /// Compares number and names of the elements; describes the first difference.
-fn elements(what: &'static str, log: &[String], channel: &Channel<'_>) -> Result<(), ReplayError> {
-    let policy: Vec<&str> = channel.elements().map(|element| element.name).collect();
+fn elements(what: &'static str, log: &[String], policy: &[String]) -> Result<(), ReplayError> {
     let sizes = |log: String, policy: String| Err(ReplayError::Sizes { what, log, policy });
     if log.len() != policy.len() {
         let counted = |count| format!("{count} elements");
         return sizes(counted(log.len()), counted(policy.len()));
     }
     match log.iter().zip(policy).find(|(was, is)| was != is) {
-        Some((was, is)) => sizes(was.clone(), is.to_owned()),
+        Some((was, is)) => sizes(was.clone(), is.clone()),
         None => Ok(()),
     }
 }

@@ -70,8 +70,8 @@ pub fn draw(
                 .set_instruction(words.map_or(Instruction::Id(instruction), Instruction::Words))
                 .map_err(ReplayError::Instruct)?;
             let named = || format!("instruction {instruction} episode {episode}");
-            let images = replay::images(contract, step).map_err(|bad| bad.at(named(), 0))?;
-            let seen = replay::seen(contract, step, &images);
+            let given = replay::Given::at(contract, step).map_err(|bad| bad.at(named(), 0))?;
+            let seen = given.data();
             let report = controller.step_with(&seen, &mut action);
             let report = report.map_err(|error| ReplayError::Step {
                 episode: named(),

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use lads_compiler::Bundle;
-use lads_core::{Channel, Policy};
+use lads_core::Policy;
 use lads_sim::environment::Environment;
 use lads_sim::evaluate::Evaluation;
 use lads_sim::plans::{self, Agreement, PlanBook, PlanFile, PlanSequence};
@@ -48,10 +48,7 @@ pub fn replay(asked: &Replay) -> Result<ExitCode, End> {
         ))
     };
     let bar = progress(log.flights.len());
-    let replayed = {
-        let period = program.bundle().contract().period();
-        replay::replay(&policy, period, program.isa(), &log, &|| bar.inc(1))
-    };
+    let replayed = { replay::replay(&policy, program.isa(), &log, &|| bar.inc(1)) };
     bar.finish_and_clear();
     let replayed = replayed.map_err(|error| about(&error))?;
 
@@ -180,10 +177,6 @@ pub fn plans(policy: &Policy<'_>, bundle: &Bundle, path: &Path) -> Result<PlanBo
     book.map_err(|error| refused(format!("--plans {}: {error}", path.display())))
 }
 
-fn names(channel: &Channel<'_>) -> Vec<String> {
-    channel.elements().map(|e| e.name.to_owned()).collect()
-}
-
 /// Writes the recorded control steps to the log.
 pub fn log(
     evaluation: &Evaluation<'_>,
@@ -192,7 +185,6 @@ pub fn log(
     traces: &[Trace],
     path: &Path,
 ) -> Result<(), End> {
-    let contract = evaluation.policy.contract();
     let flight = |trace: &Trace| {
         let known = evaluation.instruction(trace.instruction)?;
         let words = evaluation.setup.words;
@@ -213,16 +205,13 @@ pub fn log(
     notes.insert("faults".to_owned(), faults);
     let log = Log {
         origin: Origin {
-            bundle_sha256: contract.bundle_sha256().to_owned(),
             environment: environment.id().to_owned(),
             environment_version: environment.version().to_owned(),
             seed: evaluation.seed,
             noise: noise.to_owned(),
             control_period_s: environment.control_period_s(),
-            period: evaluation.contract.period(),
-            observation_names: names(&contract.observation()),
-            action_names: names(&contract.action()),
             notes,
+            ..Origin::of(&evaluation.policy)
         },
         flights: traces.iter().filter_map(flight).collect(),
     };

@@ -1,4 +1,4 @@
-//! Frames as PNG files, which lose nothing. What can fail: a file that is none, or has other samples than three bytes a pixel.
+//! Frames of cameras as PNG files, which lose nothing. What can fail: a file that is none, or has other samples than three bytes a pixel.
 
 use std::io::Cursor;
 
