@@ -17,16 +17,16 @@ trap 'rm -rf "$work"' EXIT INT TERM
 case $output in /*) ;; *) output=$PWD/$output ;; esac
 mkdir -p "$(dirname "$output")"
 
-features=static-library${LADS_OPS:+,$LADS_OPS}
+features=archive$(echo ",${LADS_OPS-default}" | sed 's:,\([^,]\):,lads-ffi/\1:g')
 # A folder for each choice of operations: another archive that is built at the same time is not mistaken for this one.
 choice=${LADS_OPS+only-$LADS_OPS}
 build=${CARGO_TARGET_DIR:-$root/target}/archive-build/${choice:-all}
 # shellcheck disable=SC2086
-(cd "$root" && "$CARGO" rustc --quiet --locked ${CARGO_FLAGS:-} -p lads-ffi --profile archive ${LADS_OPS+--no-default-features} --features "$features" \
+(cd "$root" && "$CARGO" rustc --quiet --locked ${CARGO_FLAGS:-} -p lads-static --profile archive --features "$features" \
     --crate-type staticlib --target-dir "$build" ${target:+--target "$target"})
 
 # Some targets' objects carry their bitcode too; binutils with a plugin for it would read that instead.
-"$OBJCOPY" --remove-section=.llvmbc --remove-section=.llvmcmd "$build/${target:+$target/}archive/liblads_ffi.a" "$work/whole.a"
+"$OBJCOPY" --remove-section=.llvmbc --remove-section=.llvmcmd "$build/${target:+$target/}archive/liblads_static.a" "$work/whole.a"
 
 # Beside the crate's own object, a staticlib carries all of Rust's compiler builtins; the linker takes from it what is used.
 # What only a panic would reach is dropped: no root leads there.

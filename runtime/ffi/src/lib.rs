@@ -55,9 +55,6 @@ mod calls;
 mod handle;
 mod layout;
 mod memory;
-/// cbindgen:ignore
-#[cfg(all(feature = "static-library", not(test)))]
-mod panic;
 mod status;
 mod types;
 mod versioned;

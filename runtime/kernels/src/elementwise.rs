@@ -70,59 +70,106 @@ impl Unary {
 
     /// Computes `y[i] = kind(y[i])`.
     pub fn run_in_place(self, isa: Isa, y: &mut [f32]) {
-        let Self { kind, alpha } = self;
-        isa.run(Elements { kind, alpha, y });
+        match self.kind {
+            UnaryKind::Exp
+            | UnaryKind::Tanh
+            | UnaryKind::Sigmoid
+            | UnaryKind::Softplus
+            | UnaryKind::Mish
+            | UnaryKind::Elu => isa.run(Exponential { unary: self, y }),
+            UnaryKind::Log => by_call(y, math::log),
+            UnaryKind::Erf => by_call(y, math::erf),
+            UnaryKind::Trunc => by_call(y, math::trunc),
+            UnaryKind::Sqrt => by_call(y, math::sqrt),
+            UnaryKind::Rsqrt => by_call(y, |x| 1.0 / math::sqrt(x)),
+            _ => in_blocks(y, |x| self.short(x)),
+        }
+    }
+
+    /// Computes a block of a function of an instruction or two: wider vectors gain nothing, so that its code is there once for all
+    /// instruction sets.
+    fn short(self, x: &mut Block) {
+        match self.kind {
+            UnaryKind::Relu => each(x, math::relu),
+            UnaryKind::LeakyRelu => each(x, |x| math::leaky_relu(x, self.alpha)),
+            UnaryKind::Neg => each(x, |x| -x),
+            UnaryKind::Abs => each(x, f32::abs),
+            UnaryKind::Recip => each(x, |x| 1.0 / x),
+            UnaryKind::Square => each(x, |x| x * x),
+            _ => {}
+        }
+    }
+
+    /// Computes a block of a function that stands on the exponential, whose long code is there once for all of them.
+    #[inline(always)]
+    fn long(self, x: &mut Block) {
+        if self.kind == UnaryKind::Elu {
+            return each(x, |x| math::elu(x, self.alpha));
+        }
+        let mut e = *x;
+        match self.kind {
+            UnaryKind::Tanh => each(&mut e, math::tanh_exponent),
+            UnaryKind::Sigmoid => each(&mut e, |x| -x),
+            UnaryKind::Softplus => each(&mut e, |x| -x.abs()),
+            UnaryKind::Mish => each(&mut e, math::mish_exponent),
+            _ => {}
+        }
+        each(&mut e, math::exp);
+        let pairs = x.iter_mut().zip(e);
+        match self.kind {
+            UnaryKind::Tanh => pairs.for_each(|(x, e)| *x = math::tanh_of(*x, e)),
+            UnaryKind::Sigmoid => pairs.for_each(|(x, e)| *x = math::sigmoid_of(e)),
+            UnaryKind::Softplus => pairs.for_each(|(x, e)| *x = math::softplus_of(*x, e)),
+            UnaryKind::Mish => pairs.for_each(|(x, e)| *x = math::mish_of(*x, e)),
+            _ => *x = e,
+        }
     }
 }
 
-/// Operands of a running unary operation.
-struct Elements<'a> {
-    kind: UnaryKind,
-    alpha: f32,
+/// Operands of a running function that stands on the exponential.
+struct Exponential<'a> {
+    unary: Unary,
     y: &'a mut [f32],
 }
 
-impl Kernel for Elements<'_> {
+impl Kernel for Exponential<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
-        #[inline(always)]
-        fn each(block: &mut Block, f: impl Fn(f32) -> f32) {
-            for x in block {
-                *x = f(*x);
-            }
-        }
-        // In whole blocks, so that a few elements take no longer than a vector of them, and code for what is left is there once.
-        for y in self.y.chunks_mut(LANES) {
-            let mut spare = [0.0; LANES];
-            let whole = y.len() == LANES;
-            let x: &mut Block = if let Some(block) = y.first_chunk_mut() {
-                block
-            } else {
-                assign(&mut spare, y);
-                &mut spare
-            };
-            match self.kind {
-                UnaryKind::Relu => each(x, math::relu),
-                UnaryKind::LeakyRelu => each(x, |x| math::leaky_relu(x, self.alpha)),
-                UnaryKind::Tanh => each(x, math::tanh),
-                UnaryKind::Sigmoid => each(x, math::sigmoid),
-                UnaryKind::Exp => each(x, math::exp),
-                UnaryKind::Log => each(x, math::log),
-                UnaryKind::Sqrt => each(x, math::sqrt),
-                UnaryKind::Rsqrt => each(x, |x| 1.0 / math::sqrt(x)),
-                UnaryKind::Neg => each(x, |x| -x),
-                UnaryKind::Abs => each(x, f32::abs),
-                UnaryKind::Recip => each(x, |x| 1.0 / x),
-                UnaryKind::Erf => each(x, math::erf),
-                UnaryKind::Square => each(x, |x| x * x),
-                UnaryKind::Elu => each(x, |x| math::elu(x, self.alpha)),
-                UnaryKind::Softplus => each(x, math::softplus),
-                UnaryKind::Mish => each(x, math::mish),
-                UnaryKind::Trunc => each(x, math::trunc),
-            }
-            if !whole {
-                assign(y, &spare);
-            }
+        in_blocks(self.y, |x| self.unary.long(x));
+    }
+}
+
+/// Computes a function that no vector instruction computes, in one loop for all of them.
+#[inline(never)]
+fn by_call(y: &mut [f32], f: fn(f32) -> f32) {
+    for y in y {
+        *y = f(*y);
+    }
+}
+
+#[inline(always)]
+fn each(block: &mut Block, f: impl Fn(f32) -> f32) {
+    for x in block {
+        *x = f(*x);
+    }
+}
+
+/// Calls `f` with all elements in whole blocks, so that a few elements take no longer than a vector of them, and code for what is left is
+/// there once.
+#[inline(always)]
+fn in_blocks(y: &mut [f32], mut f: impl FnMut(&mut Block)) {
+    for y in y.chunks_mut(LANES) {
+        let mut spare = [0.0; LANES];
+        let whole = y.len() == LANES;
+        let x: &mut Block = if let Some(block) = y.first_chunk_mut() {
+            block
+        } else {
+            assign(&mut spare, y);
+            &mut spare
+        };
+        f(x);
+        if !whole {
+            assign(y, &spare);
         }
     }
 }

@@ -81,7 +81,12 @@ pub fn elu(x: f32, alpha: f32) -> f32 {
 /// `max(x, 0) + log(1 + t)` with `t = exp(-|x|)`, and `log(1 + t) = 2 atanh(s)` with `s = t / (2 + t)`, at most a third, as a series.
 #[inline(always)]
 pub fn softplus(x: f32) -> f32 {
-    let t = exp(-x.abs());
+    softplus_of(x, exp(-x.abs()))
+}
+
+/// [`softplus`] of `x`, with `t = exp(-|x|)`.
+#[inline(always)]
+pub fn softplus_of(x: f32, t: f32) -> f32 {
     let s = t / (2.0 + t);
     let z = s * s;
     let mut p = 1.0 / 13.0;
@@ -99,8 +104,18 @@ pub fn softplus(x: f32) -> f32 {
 /// With `w = exp(x)` the hyperbolic tangent is `n / (n + 2)`, `n = w (w + 2)`.
 #[inline(always)]
 pub fn mish(x: f32) -> f32 {
-    // From 20 on the quotient rounds to one, long before `n` is infinite.
-    let w = exp(min(x, 20.0));
+    mish_of(x, exp(mish_exponent(x)))
+}
+
+/// Exponent of [`mish`]: from 20 on the quotient rounds to one, long before `n` is infinite.
+#[inline(always)]
+pub fn mish_exponent(x: f32) -> f32 {
+    min(x, 20.0)
+}
+
+/// [`mish`] of `x`, with `w = exp(mish_exponent(x))`.
+#[inline(always)]
+pub fn mish_of(x: f32, w: f32) -> f32 {
     let n = w * (w + 2.0);
     x * (n / (n + 2.0))
 }
@@ -133,7 +148,13 @@ fn power_of_two(n: i32) -> f32 {
 /// number.
 #[inline(always)]
 pub fn sigmoid(x: f32) -> f32 {
-    1.0 / (1.0 + exp(-x))
+    sigmoid_of(exp(-x))
+}
+
+/// [`sigmoid`], with `e = exp(-x)`.
+#[inline(always)]
+pub fn sigmoid_of(e: f32) -> f32 {
+    1.0 / (1.0 + e)
 }
 
 /// Hyperbolic tangent; relative error below 2.5e-7.
@@ -141,6 +162,18 @@ pub fn sigmoid(x: f32) -> f32 {
 /// Below 0.625 the odd polynomial of Cephes' `tanhf`, above `1 - 2 / (exp(2|x|) + 1)`.
 #[inline(always)]
 pub fn tanh(x: f32) -> f32 {
+    tanh_of(x, exp(tanh_exponent(x)))
+}
+
+/// Exponent of [`tanh`].
+#[inline(always)]
+pub fn tanh_exponent(x: f32) -> f32 {
+    2.0 * x.abs()
+}
+
+/// [`tanh`] of `x`, with `e = exp(tanh_exponent(x))`.
+#[inline(always)]
+pub fn tanh_of(x: f32, e: f32) -> f32 {
     let z = x * x;
     let mut p = -5.70498872745e-3;
     p = p * z + 2.06390887954e-2;
@@ -148,7 +181,7 @@ pub fn tanh(x: f32) -> f32 {
     p = p * z + 1.33314422036e-1;
     p = p * z - 3.33332819422e-1;
     let small = p * z * x + x;
-    let large = (1.0 - 2.0 / (exp(2.0 * x.abs()) + 1.0)).copysign(x);
+    let large = (1.0 - 2.0 / (e + 1.0)).copysign(x);
     if x.abs() < 0.625 { small } else { large }
 }
 

@@ -1,5 +1,7 @@
 //! Operations over four dimensions with strides: broadcasting arithmetic and copies.
 
+use crate::elementwise::assign;
+use crate::lanes::{Block, LANES};
 use crate::math;
 
 /// Functions of two elements.
@@ -53,6 +55,21 @@ impl<'x> Input<'x> {
     }
 }
 
+impl Row<'_> {
+    /// Copies sixteen elements from `at` on, `y` being those of the result; what is beyond the row is zero.
+    fn block(self, at: usize, y: &[f32]) -> Block {
+        let mut block = [0.0; LANES];
+        match self {
+            Self::Strided(x, stride) => {
+                let x = x.get(at.saturating_mul(stride)..).unwrap_or(&[]);
+                gather(x, stride, &mut block);
+            }
+            Self::Output => assign(&mut block, y),
+        }
+        block
+    }
+}
+
 /// Computes `y[i] = kind(a[i], b[i])` over `dims`; `y` is contiguous.
 pub fn binary(kind: BinaryKind, a: Input, b: Input, dims: [usize; 4], y: &mut [f32]) {
     let mut ys = y.chunks_exact_mut(dims[3].max(1));
@@ -64,58 +81,42 @@ pub fn binary(kind: BinaryKind, a: Input, b: Input, dims: [usize; 4], y: &mut [f
 }
 
 fn binary_row(kind: BinaryKind, a: Row, b: Row, y: &mut [f32]) {
-    // Of two operands the first goes to `y`, and the second is combined with it there.
-    let a = match (a, b) {
-        (Row::Strided(x, stride), Row::Strided(..)) => {
-            combine(y, x, stride, |_, x| x);
-            Row::Output
+    // Block by block, operands first: each function is compiled once, not once for each layout of its operands.
+    for (number, y) in y.chunks_mut(LANES).enumerate() {
+        let [a, b] = [a, b].map(|row| row.block(number * LANES, y));
+        let mut of = [0.0; LANES];
+        let all = of.iter_mut().zip(a.iter().zip(&b));
+        match kind {
+            BinaryKind::Add => all.for_each(|(y, (a, b))| *y = a + b),
+            BinaryKind::Sub => all.for_each(|(y, (a, b))| *y = a - b),
+            BinaryKind::Mul => all.for_each(|(y, (a, b))| *y = a * b),
+            BinaryKind::Div => all.for_each(|(y, (a, b))| *y = a / b),
+            BinaryKind::Max => all.for_each(|(y, (a, b))| *y = math::max(*a, *b)),
+            BinaryKind::Min => all.for_each(|(y, (a, b))| *y = math::min(*a, *b)),
+            BinaryKind::Pow => powers(&mut of, &a, &b),
+            BinaryKind::Greater => all.for_each(|(y, (a, b))| *y = math::greater(*a, *b)),
+            BinaryKind::Keep => all.for_each(|(y, (a, b))| *y = math::keep(*a, *b)),
         }
-        _ => a,
-    };
-    match kind {
-        BinaryKind::Add => apply(a, b, y, |a, b| a + b),
-        BinaryKind::Sub => apply(a, b, y, |a, b| a - b),
-        BinaryKind::Mul => apply(a, b, y, |a, b| a * b),
-        BinaryKind::Div => apply(a, b, y, |a, b| a / b),
-        BinaryKind::Max => apply(a, b, y, math::max),
-        BinaryKind::Min => apply(a, b, y, math::min),
-        BinaryKind::Pow => apply(a, b, y, math::pow),
-        BinaryKind::Greater => apply(a, b, y, math::greater),
-        BinaryKind::Keep => apply(a, b, y, math::keep),
+        assign(y, &of);
     }
 }
 
-/// Computes `y = f(a, b)`, where at least one of them is in `y` already.
-#[inline(always)]
-fn apply(a: Row, b: Row, y: &mut [f32], f: impl Fn(f32, f32) -> f32) {
-    match (a, b) {
-        (Row::Strided(a, stride), _) => combine(y, a, stride, |b, a| f(a, b)),
-        (Row::Output, Row::Strided(b, stride)) => combine(y, b, stride, f),
-        (Row::Output, Row::Output) => {
-            for y in y {
-                *y = f(*y, *y);
-            }
-        }
+/// Computes `y[i] = a[i]^b[i]` in a loop of calls, which unrolled would be long.
+#[inline(never)]
+fn powers(y: &mut [f32], a: &[f32], b: &[f32]) {
+    for (y, (&a, &b)) in y.iter_mut().zip(a.iter().zip(b)) {
+        *y = math::pow(a, b);
     }
 }
 
-/// Computes `y[i] = f(y[i], x[i * stride])`.
-#[inline(always)]
-fn combine(y: &mut [f32], x: &[f32], stride: usize, f: impl Fn(f32, f32) -> f32) {
+/// Copies `y[i] = x[i * stride]`.
+fn gather(x: &[f32], stride: usize, y: &mut [f32]) {
     match (stride, x.first()) {
-        (0, Some(&x)) => {
-            for y in y {
-                *y = f(*y, x);
-            }
-        }
-        (1, _) => {
-            for (y, &x) in y.iter_mut().zip(x) {
-                *y = f(*y, x);
-            }
-        }
+        (0, Some(&x)) => y.fill(x),
+        (1, _) => assign(y, x),
         (_, Some(_)) => {
             for (y, &x) in y.iter_mut().zip(x.iter().step_by(stride)) {
-                *y = f(*y, x);
+                *y = x;
             }
         }
         (_, None) => {}
@@ -144,7 +145,7 @@ impl StridedCopy {
             let y = y.get_mut(i0 * y0 + i1 * y1 + i2 * y2..).unwrap_or(&mut []);
             if y3 == 1 {
                 let len = len.min(y.len());
-                combine(y.get_mut(..len).unwrap_or(&mut []), x, x3, |_, x| x);
+                gather(x, x3, y.get_mut(..len).unwrap_or(&mut []));
             } else {
                 let ys = y.iter_mut().step_by(y3.max(1)).take(len);
                 if let (0, Some(&x)) = (x3, x.first()) {
