@@ -340,9 +340,15 @@ impl Kernel for Quantised<'_, '_> {
             for (head, (k, v)) in of_heads.take(heads).enumerate() {
                 let (column, scale) = (head * head_dim, head * rows + row);
                 let key = (row / LANES * width + column) * LANES + row % LANES;
-                self.keys.set(simd, k, [key, LANES], scale);
                 let value = row * width + column;
-                self.values.set(simd, v, [value, 1], scale);
+                // A loop, so that its long body is compiled once.
+                let both = [
+                    (&mut *self.keys, k, [key, LANES]),
+                    (&mut *self.values, v, [value, 1]),
+                ];
+                for (to, x, places) in both {
+                    to.set(simd, x, places, scale);
+                }
             }
         }
     }
@@ -356,20 +362,24 @@ impl ScaledMut<'_> {
         let last = block(rest);
         let (per_number, per_unit) = scales_of(simd, blocks, &last, INT8_LARGEST);
         let per_number = simd.splat(per_number);
-        let to = self.integers.get_mut(first..).unwrap_or(&mut []);
-        for (to, block) in to.chunks_mut(LANES * step).zip(blocks) {
+        let whole = blocks.len() * LANES;
+        let all = blocks.iter().chain([&last]);
+        for (from, block) in (0..x.len()).step_by(LANES).zip(all) {
             let integers = simd.whole(simd.mul(simd.load(block), per_number));
-            for (to, integer) in to.iter_mut().step_by(step).zip(integers) {
-                *to = integer as i8;
-            }
-        }
-        let to = to.get_mut(blocks.len() * LANES * step..).unwrap_or(&mut []);
-        let integers = simd.whole(simd.mul(simd.load(&last), per_number));
-        for ((to, integer), _) in to.iter_mut().step_by(step).zip(integers).zip(rest) {
-            *to = integer as i8;
+            let len = if from < whole { LANES } else { rest.len() };
+            self.put(first + from * step, step, integers.get(..len).unwrap_or(&[]));
         }
         if let Some(to) = self.scales.get_mut(scale) {
             *to = per_unit;
+        }
+    }
+
+    /// Writes elements from position `first` on, `step` apart, in code that all instruction sets share.
+    #[inline(never)]
+    fn put(&mut self, first: usize, step: usize, from: &[i16]) {
+        let to = self.integers.get_mut(first..).unwrap_or(&mut []);
+        for (to, &integer) in to.iter_mut().step_by(step.max(1)).zip(from) {
+            *to = integer as i8;
         }
     }
 }
