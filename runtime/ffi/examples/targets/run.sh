@@ -6,7 +6,8 @@
 # usage: runtime/ffi/examples/targets/run.sh <image.c> [<stand.lads> <walk.lads>]
 #        image.c: lads compile models/kitchen-small.onnx --emit-c image.c; the others: docs/import.md
 # Needs, per target, the C compiler and the qemu named below, and Rust's core for it: the target added to a toolchain
-# (rustup target add), or a toolchain with rust-src, of which core is built on the way. Every toolchain on PATH and of rustup is tried.
+# (rustup target add), or a toolchain with rust-src, of which core is built on the way. Every toolchain on PATH and of rustup is tried, but
+# for those that are older than the project's rust-version.
 set -eu
 [ $# -eq 1 ] || [ $# -eq 3 ] || { echo "usage: run.sh <image.c> [<stand.lads> <walk.lads>]" >&2; exit 2; }
 here=$(cd "$(dirname "$0")" && pwd)
@@ -24,10 +25,16 @@ have() {
         command -v "$tool" >/dev/null || { echo "skipped: $tool is not installed"; return 1; }
     done
 }
+oldest=$(sed -n 's/^rust-version = "\(.*\)"$/\1/p' "$root/Cargo.toml")
 compilers() {
-    echo "${RUSTC:-rustc}"
-    echo "$PATH" | tr ':' '\n' | sed 's:$:/rustc:'
-    echo "${RUSTUP_HOME:-$HOME/.rustup}"/toolchains/*/bin/rustc | tr ' ' '\n'
+    {
+        echo "${RUSTC:-rustc}"
+        echo "$PATH" | tr ':' '\n' | sed 's:$:/rustc:'
+        echo "${RUSTUP_HOME:-$HOME/.rustup}"/toolchains/*/bin/rustc | tr ' ' '\n'
+    } | while read -r compiler; do
+        version=$("$compiler" --version 2>/dev/null | sed -n 's/^rustc \([0-9.]*\).*/\1/p')
+        [ -z "$version" ] || [ "$(printf '%s\n' "$oldest" "$version" | sort -V | head -n 1)" != "$oldest" ] || echo "$compiler"
+    done
 }
 # toolchain <target>: finds a compiler that can, as $compiler with $bootstrap and $build_core
 toolchain() {
@@ -45,7 +52,7 @@ toolchain() {
             return
         fi
     done
-    echo "skipped: $1: no Rust toolchain has it; rustup target add $1, or install a rust-src (rustup component add rust-src)"
+    echo "skipped: $1: no Rust toolchain of $oldest or later has it; rustup target add $1, or install a rust-src (rustup component add rust-src)"
     return 1
 }
 # archive <target> <prefix of its binutils>: builds the library, as for this machine, into $archive
