@@ -17,12 +17,21 @@ def _encode(setting):
     return language.encode(setting.config.language, [row["text"] for row in setting.instructions])
 
 
+def _seed(text):
+    """Reads a seed: what numpy, PyTorch and the runtime all take."""
+    if not (text.isascii() and text.isdigit() and int(text) < 1 << 63):
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 0 to {(1 << 63) - 1}")
+    return int(text)
+
+
 def _random(arguments):
     from . import bundle, config, kinds, random_policy
 
     read = [path for path in (arguments.config, arguments.rendering) if path]
     output.check_apart(read, [arguments.output])
-    if arguments.kind:
+    if arguments.kind is not None:
+        if arguments.rendering:
+            raise UserError("--rendering: it is of a configuration's policy; give --config, or leave it out")
         _, model = kinds.export(arguments.kind, arguments.seed)
     else:
         rendering = json.loads(Path(arguments.rendering).read_text()) if arguments.rendering else None
@@ -210,7 +219,7 @@ def _parser():
     network.add_argument("--config", help="a LADS policy of this configuration")
     network.add_argument("--kind", help="a small policy of a kind in lads_exporter/kinds; another word is refused with the list of them")
     random.add_argument("-o", "--output", required=True)
-    random.add_argument("--seed", type=int, default=0)
+    random.add_argument("--seed", type=_seed, default=0)
     random.add_argument("--rendering", metavar="FILE", help="how the frames are drawn that a configuration's policy sees, as lads-run frames --rendering takes it")
     random.set_defaults(run_command=_random)
 
@@ -218,13 +227,13 @@ def _parser():
     episode.add_argument("model", metavar="MODEL", help="the bundle")
     episode.add_argument("-o", "--output", required=True, help="the .safetensors file; lads_exporter/episode.py says what is in it")
     episode.add_argument("--steps", type=int, default=200)
-    episode.add_argument("--seed", type=int, default=0)
+    episode.add_argument("--seed", type=_seed, default=0)
     episode.set_defaults(run_command=_episode)
 
     growth = commands.add_parser("growth", help="random bundles in which one dimension grows, for the benchmarks")
     growth.add_argument("--config", required=True, help="the sizes of everything else")
     growth.add_argument("-o", "--output", required=True, help="the folder to write them to")
-    growth.add_argument("--seed", type=int, default=0)
+    growth.add_argument("--seed", type=_seed, default=0)
     growth.set_defaults(run_command=_growth)
 
     seen = commands.add_parser("features", help="what a frozen encoder makes of every state of a dataset, drawn by lads-run; goes on where it was stopped")
@@ -246,7 +255,7 @@ def _parser():
     train.add_argument("--out", required=True, help="folder of the run: checkpoint, curves, summary")
     train.add_argument("--resume", action="store_true", help="continue from the run's checkpoint")
     train.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    train.add_argument("--seed", type=int, default=0)
+    train.add_argument("--seed", type=_seed, default=0)
     train.add_argument("--threads", type=int, default=0, help="CPU threads; 0 leaves the choice to PyTorch")
     train.set_defaults(run_command=_train)
 
@@ -268,7 +277,7 @@ def _parser():
     rollouts.add_argument("--system", action="append", default=[], metavar="FILE", help="what the bundle was exported with, as export has it")
     rollouts.add_argument("--episodes", type=int, default=20, help="of each instruction (20)")
     rollouts.add_argument("--traced", type=int, default=2, help="of these, so many with all actions and the first states (2)")
-    rollouts.add_argument("--seed", type=int, default=0)
+    rollouts.add_argument("--seed", type=_seed, default=0)
     rollouts.add_argument("--complete", action="store_true", help="add to the reference that is there what an earlier version did not record")
     rollouts.add_argument("--noise", default="v0", help="observation noise: v0, v1 or none")
     rollouts.add_argument("--lads-run", default="target/release/lads-run", help="draws the frames of a policy with a camera (target/release/lads-run)")

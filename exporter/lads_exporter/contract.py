@@ -224,7 +224,10 @@ def _family(found, where):
         _need(isinstance(given[key], dict), where, f"`family.{key}` is no object")
         rule = given[key].get("rule")
         _need(rule in rules, where, f"`family.{key}.rule` is {rule!r}; known: {', '.join(rules)}")
-        _need(type(given[key].get("seed")) is int, where, f"`family.{key}.seed` is not a whole number")
+        seed, temperature = given[key].get("seed"), given[key].get("temperature", 1.0)
+        _need(type(seed) is int and 0 <= seed < 1 << 64, where, f"`family.{key}.seed` is {seed!r}; it must be a whole number of 64 bits")
+        _need(_number(temperature), where, f"`family.{key}.temperature` is {temperature!r}, no number")
+    _positive(given, [key for key in ("features",) if key in given], where)
 
 
 def _states(found, where):
@@ -240,7 +243,8 @@ def _states(found, where):
             _need(row.get("fill") in ("first", "zero"), where, f"`{field}.fill` is {row.get('fill')!r}; known: first, zero")
         else:
             _need(row.get("kind") == "plain", where, f"`{field}.kind` is {row.get('kind')!r}; known: plain, ring")
-            _need(all(_length(size) for size in row.get("shape", [0])), where, f"`{field}.shape` is {row.get('shape')}")
+            shape = row.get("shape")
+            _need(isinstance(shape, list) and shape and all(_length(size) for size in shape), where, f"`{field}.shape` is {shape}")
         cleared = row.get("cleared_by", "episode")
         _need(cleared in ("episode", "instruction"), where, f"`{field}.cleared_by` is {cleared!r}; known: episode, instruction")
 

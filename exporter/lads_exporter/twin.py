@@ -230,7 +230,9 @@ class Twin:
 
     def run(self, name, number=0, ring=None):
         """Runs an entry and stores its outputs. `number` is the pass of a repeated call, `ring` the state that it walks along."""
-        entry = self.entries[name]
+        entry = self.entries.get(name)
+        if entry is None:
+            raise UserError(f"the graph has no entry {name}, which the contract's family runs")
         cache = self.caches.setdefault(name.split("/")[0], {})
         inputs = {port: self._input(port, shape, cache, number, ring) for port, shape in entry.inputs.items()}
         for port, value in entry.run(inputs).items():
@@ -254,7 +256,9 @@ class Twin:
             return self.previous.reshape(shape)
         if port.startswith(PAST):
             return cache.get(port, np.zeros([size if isinstance(size, int) else 0 for size in shape], np.float32))
-        state = self.states[port]
+        state = self.states.get(port)
+        if state is None:
+            raise UserError(f"an entry reads {port}, which is no channel, no state and nothing of the controller's")
         if state.ring:
             return (state.rows[number] if port == ring else state.window()).reshape(shape)
         return state.value.reshape(shape)

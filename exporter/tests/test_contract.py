@@ -83,7 +83,7 @@ def places(value, path=()):
         yield from places(one, (*path, key))
 
 
-@pytest.mark.parametrize("kind", ["lads", "stacked", "lcsd", "images", "vae_history"])
+@pytest.mark.parametrize("kind", ["lads", "stacked", "recurrent", "lcsd", "images", "vae_history", "sighted"])
 def test_whatever_stands_in_a_place_is_taken_or_refused(kind):
     """Tests that a value of any form in any place of a contract ends in no other error than a `UserError`."""
     known = kinds.KINDS[kind]

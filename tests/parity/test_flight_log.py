@@ -89,6 +89,14 @@ def test_a_log_of_act_replays(kind, tmp_path):
     assert other.returncode == 1, other.stdout + other.stderr
 
 
+def test_a_log_without_steps_is_not_called_equal(tmp_path):
+    log, kitchen = tmp_path / "flight.mcap", ROOT / "models/kitchen-small.onnx"
+    acted = subprocess.run([newest("lads"), "act", "--model", kitchen, "--instruction", "mkbh", "--log", log], input="", text=True, timeout=300)
+    assert acted.returncode == 0
+    replayed = subprocess.run([newest("lads-run"), "replay", "--model", kitchen, log], capture_output=True, text=True, timeout=300)
+    assert replayed.returncode == 2 and "no control step" in replayed.stderr and replayed.stdout == ""
+
+
 def _of_another_seed(kind, folder):
     from lads_exporter import bundle, kinds
 

@@ -76,9 +76,14 @@ pub fn act(
         decision = policy.contract().sampling(seed);
         controller.set_decision(decision);
     }
+    let frames = images.iter().flat_map(Images::files);
+    let read: Vec<_> = [("--model", model.path.as_path())]
+        .into_iter()
+        .chain(frames.map(|file| ("--images", file)))
+        .collect();
     let log = request
         .log
-        .map(|path| Log::start(path, &model.path, &policy, instruction, decision));
+        .map(|path| Log::start(path, &read, &policy, instruction, decision));
     let log = log.transpose()?;
     if let Some(instruction) = instruction {
         controller

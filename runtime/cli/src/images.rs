@@ -84,6 +84,17 @@ impl Images {
         Ok(Some(Self::Folders(folders)))
     }
 
+    /// The files that frames are read from.
+    pub fn files(&self) -> impl Iterator<Item = &Path> {
+        let folders = match self {
+            Self::Folders(folders) => &folders[..],
+            Self::Raw(_) => &[],
+        };
+        folders
+            .iter()
+            .flat_map(|folder| folder.files.iter().map(PathBuf::as_path))
+    }
+
     /// The channels that get their values from here.
     pub fn channels(&self) -> Vec<ChannelId> {
         match self {

@@ -210,8 +210,9 @@ fn inspect(path: &Path, json: bool, observations: bool) -> Result<(), Refusal> {
     }
 }
 
-/// Prints to stdout; a closed reader is not an error.
+/// Prints to stdout; a closed reader is not an error. Whatever a file's names hold, nothing but lines reaches the terminal.
 fn print(text: &str) -> Result<(), Refusal> {
+    let text = &refusal::without_controls(text);
     let mut stdout = io::stdout().lock();
     match stdout
         .write_all(text.as_bytes())

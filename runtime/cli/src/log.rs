@@ -7,7 +7,9 @@
 
 use std::path::{Path, PathBuf};
 use std::process;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::thread;
+use std::time::Duration;
 
 use lads_core::{DType, Decision, Noise, Policy, StepReport};
 use lads_host::output::{self, Draft};
@@ -15,12 +17,14 @@ use lads_proof::episode::Episode;
 use lads_record::trace::{Picture, Step, Trace};
 use lads_record::{Flight, Origin, Recorder, png};
 
-use crate::refusal::Refusal;
+use crate::refusal::{Refusal, chain};
 use crate::seen::Seen;
 
 const OPTION: &str = "--log";
 /// Exit code of a command that was interrupted.
 const INTERRUPTED: i32 = 130;
+/// Longest time that an interrupted command takes to complete its log.
+const PATIENCE: Duration = Duration::from_secs(2);
 
 /// A log that is being written.
 pub struct Log {
@@ -44,15 +48,18 @@ pub struct Answered<'a> {
 }
 
 impl Log {
-    /// Starts a log at `path` of a policy that was read from `model`.
+    /// Starts a log at `path`, which is none of the files that are read, nor what answers go to.
     pub fn start(
         path: &Path,
-        model: &Path,
+        read: &[output::Named<'_>],
         policy: &Policy<'_>,
         instruction: Option<u32>,
         decision: Decision,
     ) -> Result<Self, Refusal> {
-        output::apart(&[("--model", model)], &[(OPTION, path)]).map_err(Refusal::of)?;
+        let lines = ("", Path::new("/dev/stdin"));
+        let answers = ("", Path::new("/dev/stdout"));
+        output::apart(&[read, &[lines]].concat(), &[answers, (OPTION, path)])
+            .map_err(Refusal::of)?;
         let contract = policy.contract();
         let cameras: Vec<_> = contract
             .observations()
@@ -134,7 +141,7 @@ impl Log {
         if !self.begun {
             recorder
                 .begin(&self.flight)
-                .map_err(|error| error.to_string())?;
+                .map_err(|error| chain(&error))?;
             self.begun = true;
         }
         let selected = answered.report.selected;
@@ -158,7 +165,7 @@ impl Log {
             shown: None,
             pictures: pictures(answered.seen)?,
         };
-        recorder.step(&step).map_err(|error| error.to_string())
+        recorder.step(&step).map_err(|error| chain(&error))
     }
 
     /// Completes the file.
@@ -173,7 +180,11 @@ impl Log {
     fn complete_on_interrupt(&self) -> Result<(), Refusal> {
         let (recorder, path) = (Arc::clone(&self.recorder), self.path.clone());
         let handler = move || {
-            if let Err(error) = complete(&recorder) {
+            let recorder = Arc::clone(&recorder);
+            let (done, completed) = mpsc::channel();
+            thread::spawn(move || done.send(complete(&recorder)));
+            // The input may have ended just now, and the file be on its way to a pipe that nobody reads.
+            if let Ok(Err(error)) = completed.recv_timeout(PATIENCE) {
                 eprintln!("error: {}", unwritable(&path, &error));
             }
             process::exit(INTERRUPTED);
@@ -198,8 +209,8 @@ fn complete(recorder: &Mutex<Option<Recorder<Draft>>>) -> Result<(), String> {
     let Some(recorder) = recorder.take() else {
         return Ok(());
     };
-    let draft = recorder.finish().map_err(|error| error.to_string())?;
-    draft.commit().map_err(|error| error.to_string())
+    let draft = recorder.finish().map_err(|error| chain(&error))?;
+    draft.commit().map_err(|error| chain(&error))
 }
 
 fn unwritable(path: &Path, error: &dyn std::fmt::Display) -> Refusal {

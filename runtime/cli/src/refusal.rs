@@ -73,9 +73,28 @@ pub fn one_line(text: &str) -> String {
         .join(" ")
 }
 
+/// Replaces control characters but line ends by what names them, such as `\u{1b}`.
+pub fn without_controls(text: &str) -> String {
+    let mut shown = String::with_capacity(text.len());
+    for c in text.chars() {
+        if c.is_control() && c != '\n' {
+            shown.extend(c.escape_default());
+        } else {
+            shown.push(c);
+        }
+    }
+    shown
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn no_control_character_is_left() {
+        let shown = without_controls("hip\u{1b}[2J\u{7}\r\nknee é\n");
+        assert_eq!(shown, "hip\\u{1b}[2J\\u{7}\\r\nknee é\n");
+    }
 
     #[test]
     fn always_one_line() {

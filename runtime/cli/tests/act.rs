@@ -3,7 +3,7 @@
 mod common;
 
 use std::fs;
-use std::io::Write;
+use std::io::{BufRead, BufReader, Write};
 use std::process::{Command, Stdio};
 
 use serde_json::Value;
@@ -264,8 +264,6 @@ fn a_log_holds_every_step_of_every_episode() {
 #[cfg(unix)]
 #[test]
 fn a_log_is_whole_after_an_interrupt() {
-    use std::io::{BufRead, BufReader};
-
     let folder = tempfile::tempdir().unwrap();
     let model = tiny().to_str().unwrap().to_owned();
     for signal in ["-INT", "-TERM"] {
@@ -318,4 +316,66 @@ fn a_log_ends_before_what_is_refused_and_is_refused_itself_where_it_cannot_be() 
     );
     let full = refused(&act(&model, &["--log", "/dev/full"]), good, &["/dev/full"]);
     assert_eq!(full.lines().count(), 1, "the policy answers all the same");
+}
+
+#[cfg(unix)]
+#[test]
+fn a_log_is_neither_what_is_read_nor_what_is_answered() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("file");
+    let model = tiny().to_str().unwrap().to_owned();
+    for [read, written] in [[true, false], [false, true]] {
+        fs::write(&path, "0,0,0,0,0\n").unwrap();
+        let file = || {
+            fs::OpenOptions::new()
+                .read(true)
+                .append(true)
+                .open(&path)
+                .unwrap()
+        };
+        let mut command = Command::new(env!("CARGO_BIN_EXE_lads"));
+        command.args(act(&model, &["--log", path.to_str().unwrap()]));
+        command.stdin(if read { file().into() } else { Stdio::null() });
+        command.stdout(if written {
+            file().into()
+        } else {
+            Stdio::null()
+        });
+        let output = command.stderr(Stdio::piped()).output().unwrap();
+        let errors = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{errors}");
+        assert!(
+            errors.contains("--log") && errors.contains("the command"),
+            "{errors}"
+        );
+        assert_eq!(fs::read_to_string(&path).unwrap(), "0,0,0,0,0\n");
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn a_log_on_its_way_to_a_pipe_that_nobody_reads_can_be_interrupted() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("pipe");
+    let made = Command::new("mkfifo").arg(&path).status().unwrap();
+    assert!(made.success());
+    let model = tiny().to_str().unwrap().to_owned();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_lads"))
+        .args(act(&model, &["--log", path.to_str().unwrap()]))
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    // Its input ends after one answer; what is left is the log.
+    let mut stdin = child.stdin.take().unwrap();
+    stdin.write_all(b"0,0,0,0,0\n").unwrap();
+    BufReader::new(child.stdout.take().unwrap())
+        .read_line(&mut String::new())
+        .unwrap();
+    drop(stdin);
+    let killed = Command::new("kill")
+        .args(["-INT", &child.id().to_string()])
+        .status();
+    assert!(killed.unwrap().success());
+    assert_eq!(child.wait().unwrap().code(), Some(130));
 }

@@ -322,6 +322,9 @@ fn of_bundle(
 
 const GOLDEN: &str = "a recorded episode, with which every target tests itself: the observations, the actions, and how far an action may be from them";
 
+/// Largest number of outputs that are named as what may feed an input.
+const MOST_FED: usize = 8;
+
 /// Lists the fields that a person has to state for a graph without a contract.
 fn of_stranger(inputs: &[&ValueInfoProto], graph: &GraphProto, missing: &mut Missing) {
     for (name, needed) in FIELDS {
@@ -352,8 +355,15 @@ fn of_stranger(inputs: &[&ValueInfoProto], graph: &GraphProto, missing: &mut Mis
         let state = if fed.is_empty() {
             String::new()
         } else {
+            let more = fed.len().saturating_sub(MOST_FED);
+            fed.truncate(MOST_FED);
+            let more = if more > 0 {
+                format!(" and {more} more")
+            } else {
+                String::new()
+            };
             let fed = fed.join(", ");
-            format!("; or a state that an output feeds ({fed}) and what clears it")
+            format!("; or a state that an output feeds ({fed}{more}) and what clears it")
         };
         missing.field(
             format!("channels[{}]", input.name),

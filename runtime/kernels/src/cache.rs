@@ -16,7 +16,7 @@ use crate::dispatch::{Isa, Kernel};
 use crate::elementwise::assign;
 use crate::integers::scales_of;
 use crate::lanes::{Block, LANES};
-use crate::simd::{Portable, Simd};
+use crate::simd::Simd;
 use crate::stored::{self, F16, F32, INT8_LARGEST, Int8, Stored};
 
 /// Storage format of the elements of a cache.
@@ -179,12 +179,6 @@ pub(crate) trait Cached: Stored<Bits: Copy> {
     fn number(bits: Self::Bits) -> f32;
 }
 
-/// A format of floats, which have no scales.
-trait Float: Cached {
-    /// Converts sixteen numbers to the stored format.
-    fn stored<S: Simd>(simd: S, from: &Block) -> [Self::Bits; LANES];
-}
-
 impl Cached for F32 {
     #[inline(always)]
     fn number(bits: f32) -> f32 {
@@ -192,24 +186,10 @@ impl Cached for F32 {
     }
 }
 
-impl Float for F32 {
-    #[inline(always)]
-    fn stored<S: Simd>(_: S, from: &Block) -> Block {
-        *from
-    }
-}
-
 impl Cached for F16 {
     #[inline(always)]
     fn number(bits: u16) -> f32 {
         stored::from_f16(bits)
-    }
-}
-
-impl Float for F16 {
-    #[inline(always)]
-    fn stored<S: Simd>(simd: S, from: &Block) -> [u16; LANES] {
-        simd.round_to_f16(simd.load(from))
     }
 }
 
@@ -249,8 +229,7 @@ impl Append<'_> {
     /// Writes the keys and values of the new tokens to the cache.
     pub fn run(&self, isa: Isa, cache: &mut CacheMut) {
         match cache {
-            // A mere copy.
-            CacheMut::F32 { keys, values } => self.write::<F32, _>(Portable, keys, values),
+            CacheMut::F32 { keys, values } => self.copy(keys, values),
             CacheMut::F16 { keys, values } => {
                 if cfg!(feature = "half-cache") {
                     isa.run(Rounded {
@@ -273,9 +252,25 @@ impl Append<'_> {
         }
     }
 
-    /// Writes keys and values row by row, sixteen elements at a time.
+    /// Copies keys and values row by row.
+    fn copy(&self, keys: &mut [f32], values: &mut [f32]) {
+        let width = self.width.max(1);
+        let rows = values.chunks_exact_mut(width).skip(self.first);
+        for (row, x) in rows.zip(self.v.chunks(self.v_stride.max(1))) {
+            assign(row, x);
+        }
+        for (row, x) in (self.first..).zip(self.k.chunks(self.k_stride.max(1))) {
+            let first = (row / LANES).saturating_mul(width).saturating_mul(LANES) + row % LANES;
+            let keys = keys.get_mut(first..).unwrap_or(&mut []);
+            for (to, &x) in keys.iter_mut().step_by(LANES).zip(x.iter().take(width)) {
+                *to = x;
+            }
+        }
+    }
+
+    /// Rounds keys and values to half precision row by row, sixteen elements at a time.
     #[inline(always)]
-    fn write<C: Float, S: Simd>(&self, simd: S, keys: &mut [C::Bits], values: &mut [C::Bits]) {
+    fn round<S: Simd>(&self, simd: S, keys: &mut [u16], values: &mut [u16]) {
         let width = self.width.max(1);
         let rows = values
             .get_mut(self.first * width..)
@@ -283,7 +278,7 @@ impl Append<'_> {
             .chunks_exact_mut(width);
         for (row, x) in rows.zip(self.v.chunks(self.v_stride.max(1))) {
             for (row, x) in row.chunks_mut(LANES).zip(x.chunks(LANES)) {
-                let bits = C::stored(simd, &block(x));
+                let bits = simd.round_to_f16(simd.load(&block(x)));
                 row.iter_mut().zip(bits).for_each(|(to, bits)| *to = bits);
             }
         }
@@ -293,7 +288,7 @@ impl Append<'_> {
                 .nth(row / LANES);
             let (lines, _) = block_of_keys.unwrap_or(&mut []).as_chunks_mut::<LANES>();
             for (lines, x) in lines.chunks_mut(LANES).zip(x.chunks(LANES)) {
-                let bits = C::stored(simd, &block(x));
+                let bits = simd.round_to_f16(simd.load(&block(x)));
                 for (line, bits) in lines.iter_mut().zip(bits) {
                     if let Some(to) = line.get_mut(row % LANES) {
                         *to = bits;
@@ -367,7 +362,11 @@ impl ScaledMut<'_> {
         for (from, block) in (0..x.len()).step_by(LANES).zip(all) {
             let integers = simd.whole(simd.mul(simd.load(block), per_number));
             let len = if from < whole { LANES } else { rest.len() };
-            self.put(first + from * step, step, integers.get(..len).unwrap_or(&[]));
+            self.put(
+                first + from * step,
+                step,
+                integers.get(..len).unwrap_or(&[]),
+            );
         }
         if let Some(to) = self.scales.get_mut(scale) {
             *to = per_unit;
@@ -394,6 +393,6 @@ struct Rounded<'a> {
 impl Kernel for Rounded<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        self.append.write::<F16, S>(simd, self.keys, self.values);
+        self.append.round(simd, self.keys, self.values);
     }
 }

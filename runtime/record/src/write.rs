@@ -158,7 +158,7 @@ impl<W: Write + Seek> Recorder<W> {
         if let Some([x, y, z]) = step.gripper {
             self.message(GRIPPER, &GripperMessage { x, y, z })?;
         }
-        self.time_ns += self.period_ns;
+        self.time_ns = self.time_ns.saturating_add(self.period_ns);
         Ok(())
     }
 
@@ -189,7 +189,7 @@ impl<W: Write + Seek> Recorder<W> {
             success: outcome.map(|outcome| outcome.success),
         };
         if self.episodes > 0 {
-            self.time_ns += PAUSE_NS;
+            self.time_ns = self.time_ns.saturating_add(PAUSE_NS);
         }
         self.episodes += 1;
         self.message(EPISODE, &start)

@@ -47,8 +47,19 @@ pub fn replay(asked: &Replay) -> Result<ExitCode, End> {
             path.display()
         ))
     };
+    if log
+        .flights
+        .iter()
+        .all(|flight| flight.trace.steps.is_empty())
+    {
+        let wrong = "it holds no control step, so that nothing would be compared";
+        return Err(refused(format!(
+            "replay {}: {wrong}; record one",
+            path.display()
+        )));
+    }
     let bar = progress(log.flights.len());
-    let replayed = { replay::replay(&policy, program.isa(), &log, &|| bar.inc(1)) };
+    let replayed = replay::replay(&policy, program.isa(), &log, &|| bar.inc(1));
     bar.finish_and_clear();
     let replayed = replayed.map_err(|error| about(&error))?;
 
