@@ -21,7 +21,7 @@ trap 'rm -f "$found"' EXIT
   /^successes:$/ { quiet = 1 }
   /^(failures:|test result:)/ { quiet = 0 }
   /^---- .* stdout ----$/ { test = $2 }
-  /^skipped: / { skips[++n] = (quiet ? test ": " : "") substr($0, 10); missing += / is not installed|no Rust toolchain has it|toolchain has no standard library/ }
+  /^skipped: / { skips[++n] = (quiet ? test ": " : "") substr($0, 10); missing += / is not installed|no Rust toolchain|no standard library/ }
   /^test .* \.\.\. ignored, / { why = $0; sub(/^test .* \.\.\. ignored, /, "", why); if (!ignored[why]++) first[why] = $2 }
   # pytest -rs
   /^SKIPPED \[[0-9]+\] / { line = $0; sub(/^SKIPPED \[[0-9]+\] /, "", line); skips[++n] = line; missing += / not installed|could not import/ }

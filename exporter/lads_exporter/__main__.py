@@ -43,6 +43,7 @@ def _random(arguments):
 def _episode(arguments):
     from . import episode
 
+    output.check_apart([arguments.model], [arguments.output])
     margin = episode.write(arguments.model, arguments.output, arguments.steps, arguments.seed)
     print(f"{arguments.output}: {arguments.steps} steps, selections with a margin of {margin:.4g}")
 
@@ -191,6 +192,7 @@ def _language(arguments):
 def _calibrate(arguments):
     from . import acceptance, config
 
+    output.check_apart([config.find(arguments.config), config.find(arguments.sentences)], [arguments.output])
     setting = config.load(arguments.config)
     calibrated = acceptance.calibrate(setting, acceptance.read_sentences(config.find(arguments.sentences), setting))
     acceptance.write(calibrated, arguments.output)

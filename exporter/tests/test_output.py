@@ -79,3 +79,15 @@ def test_setup_replaces_no_folder_of_somebody_else(tmp_path):
     done = subprocess.run([sys.executable, setup, "--vendor", tmp_path], capture_output=True, text=True)
     assert done.returncode == 2 and "something else" in done.stderr and len(done.stderr.splitlines()) == 1
     assert (tmp_path / "mine").read_text() == "work of years"
+
+
+def test_commands_do_not_write_over_what_they_read(tmp_path):
+    model, sentences = tmp_path / "policy.onnx", tmp_path / "sentences.json"
+    for command, read in (
+        (["episode", model], model),
+        (["calibrate", "--config", "configs/kitchen-small.toml", "--sentences", sentences], sentences),
+    ):
+        read.write_bytes(b"kept")
+        done = subprocess.run([sys.executable, "-m", "lads_exporter", *map(str, command), "-o", str(read)], capture_output=True, text=True)
+        assert done.returncode == 2 and str(read) in done.stderr, done.stderr
+        assert read.read_bytes() == b"kept"

@@ -119,6 +119,28 @@ def test_every_form_is_imported_and_does_what_onnx_runtime_does(lads, tmp_path):
     assert count > 60
 
 
+BIPED = pathlib.Path(__file__).resolve().parents[2] / "runtime/host/examples/biped"
+
+
+def test_an_output_is_nothing_that_was_read(lads, tmp_path):
+    """Tests that external weights and neighbours are not written over, which nobody names on the command line."""
+    model, weights, neighbour = tmp_path / "stand.onnx", tmp_path / "stand.bin", tmp_path / "manifest.json"
+    onnx.save(onnx.load(BIPED / "stand.onnx"), model, save_as_external_data=True, location="stand.bin", size_threshold=16)
+    neighbour.write_text("{}")
+    for read in (weights, neighbour):
+        before = read.read_bytes()
+        done = subprocess.run([lads, "import", model, "--contract", BIPED / "robot.toml", "-o", read], capture_output=True, text=True)
+        assert done.returncode == 2 and "-o" in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
+        assert read.read_bytes() == before
+
+
+def test_a_recording_is_a_file_that_ends(lads, tmp_path):
+    command = [lads, "import", BIPED / "stand.onnx", "--contract", BIPED / "robot.toml", "--golden", "/dev/zero", "-o", tmp_path / "out.onnx"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and "/dev/zero" in done.stderr, done.stderr
+    assert not (tmp_path / "out.onnx").exists()
+
+
 if __name__ == "__main__":
     folder = pathlib.Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)

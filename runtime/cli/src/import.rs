@@ -88,8 +88,13 @@ pub fn import(request: &Request) -> Result<(), Refusal> {
         .chain(asked.golden.map(|path| ("--golden", path)))
         .collect();
     output::check(&inputs, &[("-o", &output)]).map_err(Refusal::of)?;
-    let Imported { bundle, notes } =
-        lads_import::import(&asked).map_err(|error| refusal(first, error))?;
+    let Imported {
+        bundle,
+        notes,
+        read,
+    } = lads_import::import(&asked).map_err(|error| refusal(first, error))?;
+    let read: Vec<output::Named> = read.iter().map(|path| ("", path.as_path())).collect();
+    output::apart(&read, &[("-o", &output)]).map_err(Refusal::of)?;
     output::write(&output, &bundle).map_err(|error| {
         let remedy = "name a file in an existing, writable folder";
         Refusal::new(output.display(), error, remedy)

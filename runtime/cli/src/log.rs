@@ -184,7 +184,8 @@ impl Log {
             let (done, completed) = mpsc::channel();
             thread::spawn(move || done.send(complete(&recorder)));
             // The input may have ended just now, and the file be on its way to a pipe that nobody reads.
-            if let Ok(Err(error)) = completed.recv_timeout(PATIENCE) {
+            let late = || Err("it takes longer than an interrupt waits".to_owned());
+            if let Err(error) = completed.recv_timeout(PATIENCE).unwrap_or_else(|_| late()) {
                 eprintln!("error: {}", unwritable(&path, &error));
             }
             process::exit(INTERRUPTED);

@@ -21,7 +21,8 @@
 //! Rules for every function:
 //! - It returns a [`Status`], an `int32_t`. A refused call changes nothing, unless the function
 //!   states otherwise.
-//! - It allocates nothing, never blocks, never unwinds, has no global state, and calls nothing but `memcpy` and `memset`.
+//! - It allocates nothing, never blocks, never unwinds, has no global state, and calls nothing but `memcpy` and `memset`, on aarch64
+//!   Linux also `getauxval`, on 32-bit Arm also what `libm` has.
 //! - Null and misaligned pointers, policies and controllers that were never set up, and areas that overlap where one of them is written
 //!   are refused, the workspace and the image among them.
 //! - Options and reports begin with `struct_bytes`, their size as the caller knows it. The library

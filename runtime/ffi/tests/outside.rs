@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use lads_compiler::{Bundle, Image, Options, compile, compile_with};
+use lads_compiler::{Bundle, Image, Options, Storage, WeightFormat, compile, compile_with};
 use lads_ffi::LADS_STACK_BYTES;
 
 /// Functions that an archive may require from its environment: those that compilers call on their
@@ -389,13 +389,30 @@ fn valgrind_finds_nothing() {
 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
 fn the_stack_is_what_the_header_says() {
     let program = build("cc", "stack.c", "stack", &["-std=gnu99", "-O2", "-pthread"]);
-    let printed = run(Command::new(&program).arg(kitchen()));
-    let bytes: usize = printed.trim().parse().expect("it prints a number");
-    println!("stack: {bytes} bytes");
+    // Integer convolutions have the largest tiles.
+    let bundle = Bundle::open(&crate_path("../../models/lorel-image.onnx")).expect("it is sound");
+    let options = Options {
+        storage: Some(Storage::of_weights(WeightFormat::Int16)),
+        force: true,
+        ..Options::default()
+    };
+    let image = compile_with(&bundle, &options).expect("it compiles");
+    let seeing = scratch("seeing.lads");
+    fs::write(&seeing, image.as_bytes()).expect("it can be written");
+    let mut largest = 0;
+    for (path, passes) in [(kitchen(), true), (&*seeing, false)] {
+        let output = Command::new(&program).arg(path).output().expect("it runs");
+        // With all weights of 16 bits the self-test is refused, after its steps.
+        assert!(!passes || output.status.success(), "{output:?}");
+        let printed = String::from_utf8_lossy(&output.stdout);
+        let bytes: usize = printed.trim().parse().expect("it prints a number");
+        println!("stack of {}: {bytes} bytes", path.display());
+        largest = largest.max(bytes);
+    }
     // Three per cent of growth are tolerated; more needs a decision.
     assert!(
-        bytes * 100 <= LADS_STACK_BYTES * 103,
-        "{bytes} bytes of stack, LADS_STACK_BYTES is {LADS_STACK_BYTES}"
+        largest * 100 <= LADS_STACK_BYTES * 103 && largest * 2 > LADS_STACK_BYTES,
+        "{largest} bytes of stack, LADS_STACK_BYTES is {LADS_STACK_BYTES}"
     );
 }
 

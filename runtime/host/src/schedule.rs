@@ -100,10 +100,11 @@ pub fn period(tables: &Tables) -> u32 {
     })
 }
 
-/// Returns the number of control steps from one selection of an index to the next; `None` for a policy that selects none.
-pub fn selection_period(policy: &Policy<'_>) -> Option<usize> {
+/// Returns the number of control steps from one plan to the next, be it an index or a vector; `None` for a policy without plans.
+pub fn plan_period(policy: &Policy<'_>) -> Option<usize> {
     let tables = Tables::new(policy.image()).ok()?;
-    (policy.index_count() > 0).then(|| period(&tables) as usize)
+    let period = period(&tables) as usize;
+    (period > 1 || policy.index_count() > 0).then_some(period)
 }
 
 fn gcd(a: u32, b: u32) -> u32 {

@@ -132,11 +132,10 @@ pub(crate) fn computed(
 /// that is 1 where one begins.
 pub(crate) fn recorded(path: &Path, plan: &Plan, problems: &mut Problems) -> Option<Episode> {
     let about = path.display().to_string();
-    let mut reader = match csv::ReaderBuilder::new()
-        .trim(csv::Trim::All)
-        .from_path(path)
-    {
-        Ok(reader) => reader,
+    let mut reader = match lads_host::input::open(path) {
+        Ok(file) => csv::ReaderBuilder::new()
+            .trim(csv::Trim::All)
+            .from_reader(file),
         Err(error) => {
             problems.add(about, format!("cannot be read: {error}"));
             return None;

@@ -79,6 +79,9 @@ pub struct Imported {
     pub bundle: Vec<u8>,
     /// Notes, one line for each fact that was read or found.
     pub notes: Vec<String>,
+    /// Files that were read besides those of the request: external data and neighbours of the
+    /// policy. An output must be none of them.
+    pub read: Vec<PathBuf>,
 }
 
 /// Reason why there is no bundle.
@@ -170,7 +173,13 @@ pub fn import(request: &Request) -> Result<Imported, ImportError> {
         steps.episode.len(),
         steps.tolerance
     ));
-    Ok(Imported { bundle, notes })
+    let external = models.iter().flat_map(|model| model.external.clone());
+    let read = external.chain(neighbours(request)).collect();
+    Ok(Imported {
+        bundle,
+        notes,
+        read,
+    })
 }
 
 /// Makes the form to fill in: everything known, everything missing with its meaning, and the faults

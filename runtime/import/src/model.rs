@@ -25,6 +25,8 @@ pub(crate) struct Model {
     pub path: PathBuf,
     pub proto: ModelProto,
     pub sha256: String,
+    /// Files with its external data.
+    pub external: Vec<PathBuf>,
     /// Names of weights that could not be read from where they lie.
     lost: Vec<String>,
 }
@@ -60,12 +62,12 @@ impl Model {
             lads_host::input::read(path).map_err(|error| named(BundleError::Read(error)))?;
         let sha256 = lads_compiler::sha256(&bytes);
         let mut proto = onnx::decode(&Bytes::from(bytes)).map_err(named)?;
-        let mut lost = vec![];
+        let (mut lost, mut external) = (vec![], vec![]);
         if let Some(graph) = &mut proto.graph {
             let folder = path
                 .parent()
                 .filter(|folder| !folder.as_os_str().is_empty());
-            lost = bring_in(graph, folder.unwrap_or(Path::new(".")), problems);
+            (lost, external) = bring_in(graph, folder.unwrap_or(Path::new(".")), problems);
             check(graph, problems);
         }
         let stem = path.file_stem().unwrap_or_default();
@@ -74,6 +76,7 @@ impl Model {
             path: path.into(),
             proto,
             sha256,
+            external,
             lost,
         })
     }
@@ -239,8 +242,12 @@ fn length(
 }
 
 /// Puts the elements of external tensors into the model; returns the names of those that cannot be
-/// read.
-fn bring_in(graph: &mut GraphProto, folder: &Path, problems: &mut Problems) -> Vec<String> {
+/// read, and the files that were.
+fn bring_in(
+    graph: &mut GraphProto,
+    folder: &Path,
+    problems: &mut Problems,
+) -> (Vec<String>, Vec<PathBuf>) {
     let mut lost = vec![];
     let mut files: HashMap<PathBuf, File> = HashMap::new();
     for tensor in &mut graph.initializer {
@@ -259,7 +266,7 @@ fn bring_in(graph: &mut GraphProto, folder: &Path, problems: &mut Problems) -> V
             }
         }
     }
-    lost
+    (lost, files.into_keys().collect())
 }
 
 fn external(

@@ -78,7 +78,19 @@ pub fn import_onnx(
         free(&request, output)?;
     }
     let imported = py.detach(|| lads_import::import(&request));
-    let Imported { bundle, notes } = imported.map_err(|error| refused(first, &error))?;
+    let Imported {
+        bundle,
+        notes,
+        read,
+    } = imported.map_err(|error| refused(first, &error))?;
+    if let Some(output) = &output {
+        let read: Vec<_> = read
+            .iter()
+            .map(|path| ("the import", path.as_path()))
+            .collect();
+        output::apart(&read, &[("output", output)])
+            .map_err(|error| OpenError::new_err(error.to_string()))?;
+    }
     let path = output.clone().unwrap_or_else(|| first.clone());
     let opened = py.detach(|| lads_host::from_bytes(&bundle));
     let opened = opened.map_err(|error| {

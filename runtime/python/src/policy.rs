@@ -159,7 +159,7 @@ impl Policy {
 impl Policy {
     /// Returns the path of the file that the policy was read from.
     #[getter]
-    fn path(&self) -> String {
+    pub fn path(&self) -> String {
         self.path.display().to_string()
     }
 

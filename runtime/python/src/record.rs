@@ -4,7 +4,7 @@
 //! one vector of floats, arrays that contradict each other, the disk.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use lads_core::{Channel, DType};
 use lads_proof::episode::{Completion, Episode};
@@ -47,8 +47,11 @@ pub fn check_log(
     notes: BTreeMap<String, String>,
 ) -> PyResult<()> {
     origin(policy, seed, noise, notes)?;
-    lads_host::output::check(&[], &[("log", &path)])
-        .map_err(|error| RecordError::new_err(error.to_string()))
+    lads_host::output::check(
+        &[("the policy", Path::new(&policy.path()))],
+        &[("log", &path)],
+    )
+    .map_err(|error| RecordError::new_err(error.to_string()))
 }
 
 /// Returns the origin of a log of a policy that observes one vector of floats.

@@ -107,7 +107,7 @@ impl Origin {
             seed: 0,
             noise: "none".to_owned(),
             control_period_s: f64::from(contract.control_period_s()),
-            period: lads_host::schedule::selection_period(policy),
+            period: lads_host::schedule::plan_period(policy),
             observation_names,
             action_names: names(&contract.action()),
             notes: BTreeMap::new(),
