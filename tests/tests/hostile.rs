@@ -77,10 +77,11 @@ fn edited(case: &[u8], state: &mut u64) -> Vec<u8> {
     bytes.extend_from_slice(case);
     let texts = case.len().min(1024);
     for _ in 0..next(state) % 4 {
-        let at = own + next(state) as usize % texts;
+        // Earlier edits may have made it shorter.
+        let at = (own + next(state) as usize % texts).min(bytes.len());
         match next(state) % 3 {
-            0 => bytes[at] = TEXT[next(state) as usize % TEXT.len()],
-            1 => bytes.insert(at, TEXT[next(state) as usize % TEXT.len()]),
+            0 if at < bytes.len() => bytes[at] = TEXT[next(state) as usize % TEXT.len()],
+            0 | 1 => bytes.insert(at, TEXT[next(state) as usize % TEXT.len()]),
             _ => drop(bytes.drain(at..(at + next(state) as usize % 16).min(bytes.len()))),
         }
     }

@@ -254,7 +254,7 @@ typedef int32_t lads_status;
 
 /**
  * Largest stack, in bytes, that a call of the library takes: measured on x86-64 with all functions
- * of the archive. Convolutions with integer weights take most; without them it is half.
+ * of the archive. Convolutions with integer weights take most; `lads inspect` tells a policy's own.
  */
 #define LADS_STACK_BYTES 19456
 

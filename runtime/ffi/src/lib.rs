@@ -65,7 +65,7 @@ use core::ffi::c_char;
 use lads_core::Policy;
 
 pub use calls::{control::*, describe::*, instruct::*, setup::*, step::*};
-pub use layout::{LADS_STACK_BYTES, LADS_WORKSPACE_ALIGN};
+pub use layout::{LADS_STACK_BYTES, LADS_WORKSPACE_ALIGN, stack_bytes};
 pub use status::Status;
 pub use types::*;
 

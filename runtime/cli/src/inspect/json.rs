@@ -30,7 +30,7 @@ impl Report<'_> {
                 "state_bytes": bytes(self.policy.state_len()),
                 "controller_bytes": Self::controller_bytes(),
                 "guard_bytes": bytes(GuardedController::memory_len(&self.policy)),
-                "stack_bytes": lads_ffi::LADS_STACK_BYTES,
+                "stack_bytes": lads_ffi::stack_bytes(&self.policy),
             },
             "golden_steps": golden.map(|golden| golden.len()),
             "golden_tolerance": golden.map(|golden| decimal(golden.tolerance())),

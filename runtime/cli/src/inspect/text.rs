@@ -191,7 +191,7 @@ impl Report<'_> {
         writeln!(
             f,
             "  stack      {:>9}, measured with the static library on x86-64",
-            lads_ffi::LADS_STACK_BYTES
+            lads_ffi::stack_bytes(&self.policy)
         )
     }
 }
