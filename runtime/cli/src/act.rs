@@ -12,7 +12,7 @@ use std::io::{BufRead, ErrorKind, Read as _, Write};
 use std::path::Path;
 use std::time::Instant;
 
-use lads_core::{Controller, Instruction, Policy, StepError};
+use lads_core::{Controller, Instruction, Policy, StepError, StepReport};
 use lads_host::Memory;
 
 use crate::images::Images;
@@ -113,6 +113,12 @@ struct Pipe<'p, 'm> {
     log: Option<Log>,
 }
 
+/// What a control step says besides its action.
+struct Stepped {
+    report: StepReport,
+    controller_ns: u64,
+}
+
 impl Pipe<'_, '_> {
     fn answer_all(
         &mut self,
@@ -132,14 +138,15 @@ impl Pipe<'_, '_> {
                     break;
                 }
                 frame += 1;
-                let plan = self.step(&seen, &mut action).map_err(|wrong| {
+                let step = self.step(&seen, &mut action).map_err(|wrong| {
                     let remedy = "send frames that `lads inspect` describes";
                     Refusal::new(format_args!("frame {frame}"), wrong, remedy)
                 })?;
-                line::format(line::Form::Csv, &action, plan, &mut answered);
+                line::format(line::Form::Csv, &action, self.plan(&step), &mut answered);
                 if !send(&mut output, &answered)? {
                     break;
                 }
+                self.record(&seen, &action, &step);
                 continue;
             }
             bytes.clear();
@@ -174,18 +181,19 @@ impl Pipe<'_, '_> {
                 }
                 frame += 1;
             }
-            let plan = self.step(&seen, &mut action);
-            let plan = plan.map_err(|wrong| Self::refuse(seen.len(), number, &wrong))?;
-            line::format(form, &action, plan, &mut answered);
+            let step = self.step(&seen, &mut action);
+            let step = step.map_err(|wrong| Self::refuse(seen.len(), number, &wrong))?;
+            line::format(form, &action, self.plan(&step), &mut answered);
             if !send(&mut output, &answered)? {
                 break;
             }
+            self.record(&seen, &action, &step);
         }
         Ok(())
     }
 
-    /// Runs one control step; on success returns the index in force if requested.
-    fn step(&mut self, seen: &Seen, action: &mut [f32]) -> Result<Option<u32>, String> {
+    /// Runs one control step.
+    fn step(&mut self, seen: &Seen, action: &mut [f32]) -> Result<Stepped, String> {
         let start = Instant::now();
         let report =
             self.controller
@@ -194,17 +202,29 @@ impl Pipe<'_, '_> {
                     StepError::Input(error) => lads_host::refused(&error, self.policy.contract()),
                     other => other.to_string(),
                 })?;
+        Ok(Stepped {
+            report,
+            controller_ns: start.elapsed().as_nanos() as u64,
+        })
+    }
+
+    /// Returns the index in force if it was asked for.
+    fn plan(&self, step: &Stepped) -> Option<u32> {
+        let selected = step.report.selected.filter(|_| self.plans);
+        selected.map(|selected| selected.index)
+    }
+
+    /// Records a step that has been answered: an action does not wait for a disk.
+    fn record(&mut self, seen: &Seen, action: &[f32], step: &Stepped) {
         if let Some(log) = &mut self.log {
             log.step(&Answered {
                 seen,
                 action,
-                report,
+                report: step.report,
                 scores: self.controller.scores(),
-                controller_ns: start.elapsed().as_nanos() as u64,
+                controller_ns: step.controller_ns,
             });
         }
-        let selected = report.selected.map(|selected| selected.index);
-        Ok(selected.filter(|_| self.plans))
     }
 
     /// Refuses an input line, which takes `len` numbers.
