@@ -365,6 +365,7 @@ fn a_log_on_its_way_to_a_pipe_that_nobody_reads_can_be_interrupted() {
         .args(act(&model, &["--log", path.to_str().unwrap()]))
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
         .spawn()
         .unwrap();
     // Its input ends after one answer; what is left is the log.
@@ -378,5 +379,11 @@ fn a_log_on_its_way_to_a_pipe_that_nobody_reads_can_be_interrupted() {
         .args(["-INT", &child.id().to_string()])
         .status();
     assert!(killed.unwrap().success());
-    assert_eq!(child.wait().unwrap().code(), Some(130));
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(130));
+    let errors = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        errors.contains("--log"),
+        "it says that there is none: {errors}"
+    );
 }
