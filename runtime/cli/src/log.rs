@@ -16,6 +16,8 @@ use lads_host::output::{self, Draft};
 use lads_proof::episode::Episode;
 use lads_record::trace::{Picture, Step, Trace};
 use lads_record::{Flight, Origin, Recorder, png};
+use signal_hook::consts::{SIGINT, SIGTERM};
+use signal_hook::iterator::Signals;
 
 use crate::refusal::{Refusal, chain};
 use crate::seen::Seen;
@@ -129,7 +131,8 @@ impl Log {
             );
             self.failed = Some(error);
             // What was written is no complete file.
-            drop(take(&self.recorder));
+            let mut recorder = self.recorder.lock().unwrap_or_else(PoisonError::into_inner);
+            *recorder = None;
         }
     }
 
@@ -179,8 +182,12 @@ impl Log {
 
     fn complete_on_interrupt(&self) -> Result<(), Refusal> {
         let (recorder, path) = (Arc::clone(&self.recorder), self.path.clone());
-        let handler = move || {
-            let recorder = Arc::clone(&recorder);
+        let mut signals = Signals::new([SIGINT, SIGTERM]).map_err(|error| {
+            let wrong = format!("interrupts cannot be handled ({error})");
+            Refusal::new(OPTION, wrong, "run it in another shell")
+        })?;
+        thread::spawn(move || {
+            signals.forever().next();
             let (done, completed) = mpsc::channel();
             thread::spawn(move || done.send(complete(&recorder)));
             // The input may have ended just now, and the file be on its way to a pipe that nobody reads.
@@ -189,19 +196,9 @@ impl Log {
                 eprintln!("error: {}", unwritable(&path, &error));
             }
             process::exit(INTERRUPTED);
-        };
-        ctrlc::set_handler(handler).map_err(|error| {
-            let wrong = format!("interrupts cannot be handled ({error})");
-            Refusal::new(OPTION, wrong, "run it in another shell")
-        })
+        });
+        Ok(())
     }
-}
-
-fn take(recorder: &Mutex<Option<Recorder<Draft>>>) -> Option<Recorder<Draft>> {
-    recorder
-        .lock()
-        .unwrap_or_else(PoisonError::into_inner)
-        .take()
 }
 
 fn complete(recorder: &Mutex<Option<Recorder<Draft>>>) -> Result<(), String> {

@@ -268,24 +268,30 @@ fn a_log_is_whole_after_an_interrupt() {
     let model = tiny().to_str().unwrap().to_owned();
     for signal in ["-INT", "-TERM"] {
         let path = folder.path().join(format!("flight{signal}.mcap"));
-        let mut child = Command::new(env!("CARGO_BIN_EXE_lads"))
+        // As under `nohup`: a hang-up that is switched off stays off.
+        let mut child = Command::new("sh")
+            .args(["-c", "trap '' HUP; exec \"$@\"", "sh"])
+            .arg(env!("CARGO_BIN_EXE_lads"))
             .args(act(&model, &["--log", path.to_str().unwrap()]))
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();
+        let pid = child.id().to_string();
+        let kill = |signal: &str| {
+            let sent = Command::new("kill").arg(signal).arg(&pid).status();
+            assert!(sent.unwrap().success());
+        };
         let mut stdin = child.stdin.take().unwrap();
         let mut stdout = BufReader::new(child.stdout.take().unwrap()).lines();
         // Three are recorded for certain: a step is once it has been answered.
         for _ in 0..4 {
             stdin.write_all(b"0,0,0,0,0\n").unwrap();
             stdout.next().unwrap().unwrap();
+            kill("-HUP");
         }
         assert!(!path.exists(), "its path is untouched while it runs");
-        let killed = Command::new("kill")
-            .args([signal, &child.id().to_string()])
-            .status();
-        assert!(killed.unwrap().success());
+        kill(signal);
         assert_eq!(child.wait().unwrap().code(), Some(130), "{signal}");
         let log = lads_record::read(&path).unwrap();
         assert!(log.flights[0].trace.steps.len() >= 3, "{signal}");

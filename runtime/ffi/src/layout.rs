@@ -4,7 +4,7 @@
 use core::ffi::c_void;
 
 use lads_core::{GuardedController, Policy};
-use lads_image::{Op, Tables};
+use lads_image::Tables;
 
 /// Alignment of a workspace, in bytes: a cache line, which is also the widest vector.
 pub const LADS_WORKSPACE_ALIGN: usize = 64;
@@ -19,16 +19,12 @@ const WITHOUT_INTEGER_CONVOLUTIONS: usize = 9216;
 /// Returns the largest stack, in bytes, that a call of the library takes for a policy.
 pub fn stack_bytes(policy: &Policy<'_>) -> usize {
     let tables = Tables::new(policy.image());
-    let entries = tables.iter().flat_map(|tables| {
-        let entries = (0..tables.entries_len()).filter_map(|i| tables.entry(i));
-        entries.flat_map(|entry| tables.ops(&entry))
-    });
     let integers = |op| match op {
         #[cfg(feature = "conv")]
-        Op::IntegerConv(_) => true,
+        lads_image::Op::IntegerConv(_) => true,
         _ => false,
     };
-    if entries.filter_map(Op::decode).any(integers) {
+    if tables.iter().flat_map(Tables::every_op).any(integers) {
         LADS_STACK_BYTES
     } else {
         WITHOUT_INTEGER_CONVOLUTIONS

@@ -28,13 +28,7 @@ fn formats(policy: &Policy<'_>) -> (Vec<WeightFormat>, Vec<CacheFormat>) {
     let Ok(tables) = Tables::new(policy.image()) else {
         return (vec![], vec![]);
     };
-    let ops: Vec<Op> = (0..tables.entries_len())
-        .filter_map(|i| tables.entry(i))
-        .flat_map(|entry| {
-            let ops = tables.ops(&entry).iter();
-            ops.filter_map(Op::decode)
-        })
-        .collect();
+    let ops: Vec<Op> = tables.every_op().collect();
     let weights = WeightFormat::ALL.into_iter().filter(|&format| {
         let stores = |op: &Op| match op {
             Op::Linear(op) => op.format == format,

@@ -8,7 +8,6 @@
 use core::error::Error;
 use core::fmt;
 
-use crate::OP_WORDS;
 use crate::codec::{Field, Reader};
 use crate::format::{self, CRC_WORD, FormatError, Sections, Tag};
 use crate::place::WeightSpan;
@@ -16,6 +15,7 @@ use crate::records::{
     CallRecord, ChannelRecord, ContractRecord, ElementRecord, EntryRecord, InstructionRecord,
     PortRecord, StateRecord, Text,
 };
+use crate::{OP_WORDS, Op};
 
 /// The sections of one image.
 #[derive(Debug, Clone, Copy)]
@@ -288,6 +288,14 @@ impl<'a> Tables<'a> {
     #[inline]
     pub fn ops(&self, entry: &EntryRecord) -> &'a [[u32; OP_WORDS]] {
         part(self.ops, entry.first_op, entry.ops_len)
+    }
+
+    /// Decodes the ops of all entries.
+    pub fn every_op(&self) -> impl Iterator<Item = Op> + use<'_, 'a> {
+        let entries = (0..self.entries_len()).filter_map(|i| self.entry(i));
+        entries
+            .flat_map(|entry| self.ops(&entry))
+            .filter_map(Op::decode)
     }
 
     /// Returns the number of ops of all entries.
