@@ -102,25 +102,38 @@ impl Unary {
 
     /// Computes a block of a function that stands on the exponential, whose long code is there once for all of them.
     #[inline(always)]
+    #[expect(
+        clippy::indexing_slicing,
+        reason = "constant bounds; compilers vectorise this form best"
+    )]
     fn long(self, x: &mut Block) {
-        if self.kind == UnaryKind::Elu {
-            return each(x, |x| math::elu(x, self.alpha));
-        }
         let mut e = *x;
         match self.kind {
             UnaryKind::Tanh => each(&mut e, math::tanh_exponent),
             UnaryKind::Sigmoid => each(&mut e, |x| -x),
             UnaryKind::Softplus => each(&mut e, |x| -x.abs()),
             UnaryKind::Mish => each(&mut e, math::mish_exponent),
+            UnaryKind::Elu => each(&mut e, math::elu_exponent),
             _ => {}
         }
-        each(&mut e, math::exp);
-        let pairs = x.iter_mut().zip(e);
+        let mut powers = [0; LANES];
+        for i in 0..LANES {
+            (powers[i], e[i]) = math::split(e[i]);
+        }
+        if self.kind == UnaryKind::Elu {
+            for i in 0..LANES {
+                x[i] = math::elu_of(x[i], self.alpha, (powers[i], e[i]));
+            }
+            return;
+        }
+        for i in 0..LANES {
+            e[i] = math::exp_of((powers[i], e[i]));
+        }
         match self.kind {
-            UnaryKind::Tanh => pairs.for_each(|(x, e)| *x = math::tanh_of(*x, e)),
-            UnaryKind::Sigmoid => pairs.for_each(|(x, e)| *x = math::sigmoid_of(e)),
-            UnaryKind::Softplus => pairs.for_each(|(x, e)| *x = math::softplus_of(*x, e)),
-            UnaryKind::Mish => pairs.for_each(|(x, e)| *x = math::mish_of(*x, e)),
+            UnaryKind::Tanh => combine(x, &e, math::tanh_of),
+            UnaryKind::Sigmoid => combine(x, &e, |_, e| math::sigmoid_of(e)),
+            UnaryKind::Softplus => combine(x, &e, math::softplus_of),
+            UnaryKind::Mish => combine(x, &e, math::mish_of),
             _ => *x = e,
         }
     }
@@ -151,6 +164,21 @@ fn by_call(y: &mut [f32], f: fn(f32) -> f32) {
 fn each(block: &mut Block, f: impl Fn(f32) -> f32) {
     for x in block {
         *x = f(*x);
+    }
+}
+
+/// Computes `x[i] = f(x[i], other[i])`.
+///
+/// By index: of two iterators compilers have made a loop over single elements, in which a selection is a branch, so that the time depends on
+/// the values.
+#[inline(always)]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "constant bounds; compilers vectorise this form best"
+)]
+pub(crate) fn combine(x: &mut Block, other: &Block, f: impl Fn(f32, f32) -> f32) {
+    for i in 0..LANES {
+        x[i] = f(x[i], other[i]);
     }
 }
 

@@ -34,21 +34,26 @@ pub fn min(a: f32, b: f32) -> f32 {
 /// product with `n` is exact). The polynomial and the two parts are those of Cephes' `expf` (S. Moshier).
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
-    // Beyond these the result is infinite or rounds to zero.
-    let (n, p) = split(x.clamp(-104.0, 89.0));
+    exp_of(split(x))
+}
+
+/// [`exp`] of `x`, with `(n, p) = split(x)`.
+#[inline(always)]
+pub fn exp_of((n, p): (i32, f32)) -> f32 {
     // 2^n in two factors, each a normal number, so that results below the normal numbers are rounded once.
     let half = n >> 1;
     (p + 1.0) * power_of_two(half) * power_of_two(n.wrapping_sub(half))
 }
 
-/// Splits an exponential: returns `n` and `p` with `exp(x) = 2^n * (1 + p)`, for an `x` between
-/// -104 and 89.
+/// Splits an exponential: returns `n` and `p` with `exp(x) = 2^n * (1 + p)`.
 #[inline(always)]
-fn split(x: f32) -> (i32, f32) {
+pub fn split(x: f32) -> (i32, f32) {
     // 1.5 * 2^23: adding it leaves the rounded number in the low bits of the mantissa.
     const ROUND: f32 = 12582912.0;
     const LN2_HIGH: f32 = 0.693359375;
     const LN2_LOW: f32 = -2.12194440e-4;
+    // Beyond these the exponential is infinite or rounds to zero.
+    let x = x.clamp(-104.0, 89.0);
     let rounded = x * core::f32::consts::LOG2_E + ROUND;
     let n = rounded - ROUND;
     let r = (x - n * LN2_HIGH) - n * LN2_LOW;
@@ -69,8 +74,18 @@ fn split(x: f32) -> (i32, f32) {
 /// cancellation; relative error below 1.2e-7 with an `alpha` of 1.
 #[inline(always)]
 pub fn elu(x: f32, alpha: f32) -> f32 {
-    // Below -30 the exponential is lost beside one.
-    let (n, p) = split(x.clamp(-30.0, 0.0));
+    elu_of(x, alpha, split(elu_exponent(x)))
+}
+
+/// Exponent of [`elu`]: below -30 the exponential is lost beside one.
+#[inline(always)]
+pub fn elu_exponent(x: f32) -> f32 {
+    x.clamp(-30.0, 0.0)
+}
+
+/// [`elu`] of `x`, with `(n, p) = split(elu_exponent(x))`.
+#[inline(always)]
+pub fn elu_of(x: f32, alpha: f32, (n, p): (i32, f32)) -> f32 {
     let scale = power_of_two(n);
     let below = alpha * (p * scale + (scale - 1.0));
     if x < 0.0 { below } else { x }

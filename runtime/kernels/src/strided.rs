@@ -1,6 +1,6 @@
 //! Operations over four dimensions with strides: broadcasting arithmetic and copies.
 
-use crate::elementwise::assign;
+use crate::elementwise::{assign, combine};
 use crate::lanes::{Block, LANES};
 use crate::math;
 
@@ -83,29 +83,27 @@ pub fn binary(kind: BinaryKind, a: Input, b: Input, dims: [usize; 4], y: &mut [f
 fn binary_row(kind: BinaryKind, a: Row, b: Row, y: &mut [f32]) {
     // Block by block, operands first: each function is compiled once, not once for each layout of its operands.
     for (number, y) in y.chunks_mut(LANES).enumerate() {
-        let [a, b] = [a, b].map(|row| row.block(number * LANES, y));
-        let mut of = [0.0; LANES];
-        let all = of.iter_mut().zip(a.iter().zip(&b));
+        let [mut of, b] = [a, b].map(|row| row.block(number * LANES, y));
         match kind {
-            BinaryKind::Add => all.for_each(|(y, (a, b))| *y = a + b),
-            BinaryKind::Sub => all.for_each(|(y, (a, b))| *y = a - b),
-            BinaryKind::Mul => all.for_each(|(y, (a, b))| *y = a * b),
-            BinaryKind::Div => all.for_each(|(y, (a, b))| *y = a / b),
-            BinaryKind::Max => all.for_each(|(y, (a, b))| *y = math::max(*a, *b)),
-            BinaryKind::Min => all.for_each(|(y, (a, b))| *y = math::min(*a, *b)),
-            BinaryKind::Pow => powers(&mut of, &a, &b),
-            BinaryKind::Greater => all.for_each(|(y, (a, b))| *y = math::greater(*a, *b)),
-            BinaryKind::Keep => all.for_each(|(y, (a, b))| *y = math::keep(*a, *b)),
+            BinaryKind::Add => combine(&mut of, &b, |a, b| a + b),
+            BinaryKind::Sub => combine(&mut of, &b, |a, b| a - b),
+            BinaryKind::Mul => combine(&mut of, &b, |a, b| a * b),
+            BinaryKind::Div => combine(&mut of, &b, |a, b| a / b),
+            BinaryKind::Max => combine(&mut of, &b, math::max),
+            BinaryKind::Min => combine(&mut of, &b, math::min),
+            BinaryKind::Pow => powers(&mut of, &b),
+            BinaryKind::Greater => combine(&mut of, &b, math::greater),
+            BinaryKind::Keep => combine(&mut of, &b, math::keep),
         }
         assign(y, &of);
     }
 }
 
-/// Computes `y[i] = a[i]^b[i]` in a loop of calls, which unrolled would be long.
+/// Computes `a[i] = a[i]^b[i]` in a loop of calls, which unrolled would be long.
 #[inline(never)]
-fn powers(y: &mut [f32], a: &[f32], b: &[f32]) {
-    for (y, (&a, &b)) in y.iter_mut().zip(a.iter().zip(b)) {
-        *y = math::pow(a, b);
+fn powers(a: &mut [f32], b: &[f32]) {
+    for (a, &b) in a.iter_mut().zip(b) {
+        *a = math::pow(*a, b);
     }
 }
 
