@@ -98,20 +98,27 @@ impl<'p> Observed<'p> {
         }
     }
 
-    /// Draws values from all over the contract's limits. They always lie where the first did: how many instructions the C library's
-    /// copies take depends on where from.
+    /// Draws values from all over the contract's limits.
     fn draw(&mut self, random: &mut Random) {
+        self.floats.clear();
+        self.bytes.clear();
+        self.integers.clear();
         for channel in self.contract.observations() {
             // Limits may be as wide as all numbers; a machine's are not.
             let values = channel.limits().map(|limits| {
                 let (min, max) = (limits.min.max(-10.0), limits.max.min(10.0));
                 min + (max - min) * random.next()
             });
-            let id = channel.id();
             match channel.dtype() {
-                DType::F32 => keep(&mut self.floats, id, values),
-                DType::U8 => keep(&mut self.bytes, id, values.map(|x| x as u8)),
-                DType::I32 => keep(&mut self.integers, id, values.map(|x| x as i32)),
+                DType::F32 => self.floats.push((channel.id(), values.collect())),
+                DType::U8 => {
+                    let bytes = values.map(|x| x as u8).collect();
+                    self.bytes.push((channel.id(), bytes));
+                }
+                DType::I32 => {
+                    let integers = values.map(|x| x as i32).collect();
+                    self.integers.push((channel.id(), integers));
+                }
             }
         }
     }
@@ -124,17 +131,6 @@ impl<'p> Observed<'p> {
         let integers = self.integers.iter();
         let integers = integers.map(|(id, values)| (*id, Data::I32(values)));
         floats.chain(bytes).chain(integers).collect()
-    }
-}
-
-/// Puts the values of a channel where its last ones were.
-fn keep<T>(all: &mut Vec<(ChannelId, Vec<T>)>, id: ChannelId, values: impl Iterator<Item = T>) {
-    match all.iter_mut().find(|(own, _)| *own == id) {
-        Some((_, own)) => own
-            .iter_mut()
-            .zip(values)
-            .for_each(|(own, value)| *own = value),
-        None => all.push((id, values.collect())),
     }
 }
 
