@@ -138,13 +138,13 @@ class Twin:
                 found[row["name"]] = _State(shape, scope, row["rows"], row["fill"])
             else:
                 found[row["name"]] = _State(row["shape"], scope)
+        rings = FAMILIES[self.family["kind"]].rings(self.family)
         taken = {"timestep", "phase", "pass", "index", *PREVIOUS, *self.channels}
         for name, entry in self.entries.items():
             if name not in ("instruction/lookup", "trajectory_encoder/encode", "high_level/instruct"):
                 for port, shape in entry.inputs.items():
                     if port not in taken and port not in found and not port.startswith(PAST):
-                        ring = self.family.get("history", self.family).get("window", 0) if port == "row" else 0
-                        found[port] = _State(shape, "episode", ring)
+                        found[port] = _State(shape, "episode", rings.get(port, 0))
         return found
 
     def set_instruction(self, instruction):

@@ -14,6 +14,7 @@ class Family:
     lengths: tuple = ()  # fields of the contract's `family` that are positive lengths, dotted
     rules: dict = field(default_factory=dict)  # field with a `rule` and a `seed` -> its rules
     optional: tuple = ()  # lengths that are asked for where the contract has their field
+    rings: Callable = lambda family: {}  # the contract's `family` -> rows of each state that is a ring
 
     @property
     def fields(self):

@@ -13,4 +13,9 @@ def step(twin):
     recall(twin)
 
 
-FAMILY = Family(step, ("horizon", *CODEBOOK, "window", "memory.dim", *LOW_LEVEL), {"decision": ARGMAX})
+FAMILY = Family(
+    step,
+    ("horizon", *CODEBOOK, "window", "memory.dim", *LOW_LEVEL),
+    {"decision": ARGMAX},
+    rings=lambda family: {"row": family["window"]},
+)

@@ -15,4 +15,8 @@ def step(twin):
         twin.run("low_level/act")
 
 
-FAMILY = Family(step, ("horizon", "plan.dim"), {"decision": MEAN}, optional=HISTORY)
+def rings(family):
+    return {"row": family["history"]["window"]} if "history" in family else {}
+
+
+FAMILY = Family(step, ("horizon", "plan.dim"), {"decision": MEAN}, optional=HISTORY, rings=rings)

@@ -75,7 +75,7 @@ impl Bundle {
         };
         let contract = Contract::parse(property("lads.contract").ok_or(BundleError::NoContract)?)?;
         let golden = property("lads.golden").ok_or_else(|| BundleError::Golden {
-            problem: "missing from the model's metadata".into(),
+            problems: vec!["missing from the model's metadata".into()],
         })?;
         let golden = Golden::parse(golden, &contract)?;
         let tuned = Tuned::find(property);
@@ -201,7 +201,7 @@ impl Bundle {
                 self.entries().join(", ")
             );
             return Err(BundleError::Entry {
-                problem: problem.into(),
+                problems: vec![problem.into()],
             });
         }
         let roots = outputs.iter().map(|value| value.name.as_str());

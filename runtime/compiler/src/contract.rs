@@ -6,17 +6,22 @@
 //! version.
 
 mod channel;
+mod check;
+mod faults;
+mod form;
 mod language;
-
-use std::collections::HashSet;
 
 use lads_image::records::{NoiseRule, SelectionRule};
 use serde::Deserialize;
 
 use crate::error::BundleError;
-use crate::family::{Family, RESERVED};
+use crate::family::Family;
+
+pub(crate) use faults::Faults;
+pub(crate) use form::REQUIRED;
 
 pub use channel::{Channel, DType, Element, QuaternionOrder, Role};
+pub use faults::Fault;
 pub use language::{Acceptance, Language, Pooling, Similarity};
 
 /// Version of the contract that this crate reads.
@@ -188,29 +193,53 @@ pub(crate) const MAX_LEN: usize = 1 << 20;
 impl Contract {
     /// Reads and checks a contract.
     pub fn parse(json: &str) -> Result<Self, BundleError> {
-        let refused = |problem: String| BundleError::Contract {
-            problem: problem.into(),
+        match Self::read(json)? {
+            (Some(contract), faults) if faults.is_empty() => Ok(contract),
+            (_, faults) => Err(BundleError::Contract {
+                faults: faults.into_vec(),
+            }),
+        }
+    }
+
+    /// Reads a contract together with all its faults; it has sound values in place of those that
+    /// cannot be read. Refuses only a contract of another version, whose remedy is another program.
+    pub(crate) fn read(json: &str) -> Result<(Option<Self>, Faults), BundleError> {
+        let mut faults = Faults::default();
+        let value: serde_json::Value = match serde_json::from_str(json) {
+            Ok(value) => value,
+            Err(error) => {
+                faults.add("lads.contract", format!("is not JSON: {error}"));
+                return Ok((None, faults));
+            }
         };
-        let value: serde_json::Value =
-            serde_json::from_str(json).map_err(|error| refused(format!("is not JSON: {error}")))?;
-        let version = value
+        match value
             .get("version")
-            .ok_or_else(|| refused("missing field `version`".into()))?;
-        match version.as_u64() {
-            Some(1) => return Err(BundleError::ContractV1),
-            Some(found) if found == u64::from(CONTRACT_VERSION) => {}
-            _ => {
+            .map(|version| (version, version.as_u64()))
+        {
+            Some((_, Some(1))) => return Err(BundleError::ContractV1),
+            Some((version, found)) if found != Some(u64::from(CONTRACT_VERSION)) => {
                 return Err(BundleError::ContractVersion {
                     found: version.to_string().into(),
                     supported: CONTRACT_VERSION,
                 });
             }
+            _ => {}
         }
-        // From the text, so that the error tells where.
-        let contract: Self =
-            serde_json::from_str(json).map_err(|error| refused(error.to_string()))?;
-        contract.check().map_err(refused)?;
-        Ok(contract)
+        let contract = match serde_json::from_str(json) {
+            Ok(contract) => Some(contract),
+            Err(error) => {
+                let repaired = form::read(&value, &mut faults);
+                // Read as parts it is sound, as with a field that stands twice.
+                if faults.is_empty() {
+                    faults.add("lads.contract", format!("cannot be read: {error}"));
+                }
+                repaired
+            }
+        };
+        if let Some(contract) = &contract {
+            check::check(contract, &mut faults);
+        }
+        Ok((contract, faults))
     }
 
     /// Returns the channel with this name.
@@ -276,7 +305,7 @@ impl Contract {
             .map_or((&[], ""), |found| (&found.sub_tasks, &found.split))
     }
 
-    fn with(&self, role: Role) -> impl Iterator<Item = &Channel> {
+    pub(crate) fn with(&self, role: Role) -> impl Iterator<Item = &Channel> {
         self.channels
             .iter()
             .filter(move |channel| channel.role == role)
@@ -298,200 +327,4 @@ impl Contract {
         // Always there: a contract is checked when it is parsed.
         self.with(role).next().unwrap_or(&NONE)
     }
-
-    fn check(&self) -> Result<(), String> {
-        let period = self.control_period_s;
-        if !(period.is_finite() && period > 0.0) {
-            return Err(format!(
-                "field `control_period_s` is {period}, it must be positive"
-            ));
-        }
-        self.check_channels()?;
-        for (i, state) in self.states.iter().enumerate() {
-            self.check_state(state, &format!("states[{i}]"))?;
-        }
-        let names = self.states.iter().map(|state| state.name.as_str());
-        let channels = self.channels.iter().map(|channel| channel.name.as_str());
-        distinct("states", "name", names.clone())?;
-        distinct("channels and states", "name", channels.chain(names))?;
-        // Before the context, whose length is a multiple of the family's period.
-        self.family.check(self)?;
-        self.check_context()?;
-        self.check_instructions()
-    }
-
-    fn check_channels(&self) -> Result<(), String> {
-        for (i, channel) in self.channels.iter().enumerate() {
-            channel.check(&format!("channels[{i}]"))?;
-        }
-        distinct(
-            "channels",
-            "name",
-            self.channels.iter().map(|c| c.name.as_str()),
-        )?;
-        let count = |role| self.with(role).count();
-        let observations = count(Role::Observation);
-        if !(1..=lads_core::MAX_OBSERVATIONS).contains(&observations) {
-            return Err(format!(
-                "field `channels` has {observations} observations, it must have 1 to {}",
-                lads_core::MAX_OBSERVATIONS
-            ));
-        }
-        if count(Role::Action) != 1 {
-            return Err(format!(
-                "field `channels` has {} actions, it must have one",
-                count(Role::Action)
-            ));
-        }
-        if count(Role::Instruction) > 1 {
-            return Err("field `channels` has more than one instruction".into());
-        }
-        let seen = self.observations().map(|channel| &channel.name);
-        let named = seen.chain(self.states.iter().map(|state| &state.name));
-        if let Some(name) = named
-            .into_iter()
-            .find(|name| RESERVED.contains(&name.as_str()))
-        {
-            return Err(format!(
-                "an observation or a state is called \"{name}\", which means something else to a graph; give it another name"
-            ));
-        }
-        for channel in &self.channels {
-            let floats = channel.role == Role::Observation || channel.dtype == DType::F32;
-            let words = channel.role != Role::Instruction || channel.shape.len() == 2;
-            if !floats || !words {
-                return Err(format!(
-                    "channel {}: only observations may have elements other than f32, and an instruction has two axes",
-                    channel.name
-                ));
-            }
-        }
-        Ok(())
-    }
-
-    fn check_state(&self, state: &State, at: &str) -> Result<(), String> {
-        match state.kind {
-            StateKind::Plain => {
-                let len = state.shape.iter().product::<usize>();
-                if state.shape.is_empty() || !(1..=MAX_LEN).contains(&len) {
-                    return Err(format!(
-                        "field `{at}.shape` is {:?}, it must have 1 to {MAX_LEN} elements",
-                        state.shape
-                    ));
-                }
-                if state.source.is_some() {
-                    return Err(format!("field `{at}.source`: only a ring has a source"));
-                }
-            }
-            StateKind::Ring => {
-                if !(1..=MAX_LEN).contains(&state.rows) {
-                    return Err(format!(
-                        "field `{at}.rows` is {}, it must be 1 to {MAX_LEN}",
-                        state.rows
-                    ));
-                }
-                let source = state.source.as_deref().unwrap_or("");
-                if !self.observations().any(|channel| channel.name == source) {
-                    return Err(format!(
-                        "field `{at}.source` is \"{source}\", it must name an observation channel"
-                    ));
-                }
-            }
-        }
-        Ok(())
-    }
-
-    fn check_context(&self) -> Result<(), String> {
-        let Some(context) = &self.context else {
-            return Ok(());
-        };
-        for (field, len) in [
-            ("context.words", context.words),
-            ("context.steps", context.steps),
-        ] {
-            if !(1..=MAX_LEN).contains(&len) {
-                return Err(format!(
-                    "field `{field}` is {len}, it must be 1 to {MAX_LEN}"
-                ));
-            }
-        }
-        if let Some(period) = self.period()
-            && !context.steps.is_multiple_of(period)
-        {
-            return Err(format!(
-                "field `context.steps` is {}, it must be a multiple of the period of {period} control steps: a context that starts again would decide between",
-                context.steps
-            ));
-        }
-        Ok(())
-    }
-
-    fn check_instructions(&self) -> Result<(), String> {
-        let Some([words, dim]) = self.words() else {
-            if !self.instructions.is_empty() {
-                return Err("field `instructions`: no channel takes an instruction".into());
-            }
-            return Ok(());
-        };
-        if !(1..=MAX_LEN).contains(&self.instructions.len()) {
-            return Err(format!(
-                "field `instructions` has {}, it must have 1 to {MAX_LEN}",
-                self.instructions.len()
-            ));
-        }
-        let language = self.language.as_ref().ok_or("missing field `language`")?;
-        if language.dim != dim {
-            return Err(format!(
-                "field `language.dim` is {}, the instruction channel's words have {dim} elements",
-                language.dim
-            ));
-        }
-        if self.context.is_some_and(|context| context.words != words) {
-            return Err(format!(
-                "field `context.words` is not the instruction channel's {words} words"
-            ));
-        }
-        if let Some(acceptance) = &language.acceptance {
-            acceptance.check()?;
-        }
-        for (i, known) in self.instructions.iter().enumerate() {
-            if known.text.trim().is_empty() {
-                return Err(format!("field `instructions[{i}].text` is empty"));
-            }
-        }
-        let evaluated = self.evaluation.instructions.len();
-        if evaluated != 0 && evaluated != self.instructions.len() {
-            return Err(format!(
-                "field `evaluation.instructions` has {evaluated}, there are {} instructions",
-                self.instructions.len()
-            ));
-        }
-        for (i, known) in self.evaluation.instructions.iter().enumerate() {
-            if known.split.trim().is_empty() {
-                return Err(format!(
-                    "field `evaluation.instructions[{i}].split` is empty"
-                ));
-            }
-        }
-        // Texts may repeat: benchmarks ask for the same in other words, and for the same words by other measures.
-        let ids = self.instructions.iter().map(|known| known.id.as_str());
-        distinct("instructions", "id", ids)
-    }
-}
-
-fn distinct<'a>(
-    field: &str,
-    part: &str,
-    names: impl Iterator<Item = &'a str>,
-) -> Result<(), String> {
-    let mut seen = HashSet::new();
-    for (i, name) in names.enumerate() {
-        if name.trim().is_empty() {
-            return Err(format!("field `{field}[{i}].{part}` is empty"));
-        }
-        if !seen.insert(name) {
-            return Err(format!("field `{field}[{i}].{part}` repeats \"{name}\""));
-        }
-    }
-    Ok(())
 }

@@ -5,10 +5,10 @@
 //! bindings. What can fail: a graph or a value is missing, unknown, or declared with another type
 //! or shape; [`signatures`] reports it together with the field of the contract.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use crate::contract::{Contract, DType};
-use crate::error::BundleError;
+use crate::error::{BundleError, Line};
 use crate::family::{Blueprint, Bound, Entry, Keep};
 use crate::graph::{Dim, Type, show};
 use crate::onnx::{GraphProto, NodeProto, TensorTypeProto, ValueInfoProto, data_type};
@@ -16,6 +16,10 @@ use crate::onnx::{GraphProto, NodeProto, TensorTypeProto, ValueInfoProto, data_t
 /// Name of the graph that holds the table of known instructions: evaluated when a bundle is
 /// compiled.
 pub(crate) const LOOKUP_INSTRUCTION: &str = "instruction/lookup";
+
+/// Name of the graph that encodes a piece of a demonstration. A bundle of any family may hold it, for
+/// others to use.
+const ENCODE_TRAJECTORY: &str = "trajectory_encoder/encode";
 
 /// An input or output of a graph.
 #[derive(Debug, Clone)]
@@ -54,11 +58,9 @@ pub(crate) fn signatures(
     contract: &Contract,
     blueprint: &Blueprint,
 ) -> Result<Vec<Signature>, BundleError> {
-    let refused = |problem: String| BundleError::Entry {
-        problem: problem.into(),
-    };
+    let mut problems: Vec<String> = vec![];
     if !graph.sparse_initializer.is_empty() {
-        return Err(refused("the graph has sparse initializers".into()));
+        problems.push("the graph has sparse initializers".into());
     }
     let mut checker = Checker {
         contract,
@@ -67,43 +69,25 @@ pub(crate) fn signatures(
     };
     let mut all: Vec<Signature> = vec![];
     if let Some(words) = contract.words() {
-        all.push(lookup(graph, words).map_err(refused)?);
+        all.push(lookup(graph, words, &mut problems));
     }
     for entry in &blueprint.entries {
-        let Some(name) = entry.graph() else { continue };
-        let prefix = format!("{name}/");
-        let mut values = |declared: &[ValueInfoProto], input: bool| -> Result<Vec<Value>, String> {
-            declared
-                .iter()
-                .filter(|value| value.name.starts_with(&prefix))
-                // An output that this project does not use may be anything.
-                .filter(|value| input || is_used(entry, &value.name[prefix.len()..]))
-                .map(|value| checker.value(name, &entry.name, value, input))
-                .collect()
-        };
-        let outputs = values(&graph.output, false).map_err(refused)?;
-        if outputs.is_empty() && entry.optional {
-            continue;
-        }
-        let inputs = values(&graph.input, true).map_err(refused)?;
-        for wanted in &entry.outputs {
-            if !outputs.iter().any(|value| value.name == *wanted) {
-                return Err(refused(format!("output {name}/{wanted} is missing")));
-            }
-        }
-        checker
-            .cache(entry.cache.as_deref(), name, &inputs, &outputs)
-            .map_err(refused)?;
-        if !all.iter().any(|known| known.entry == name) {
-            all.push(Signature {
-                entry: name.into(),
-                inputs,
-                outputs,
-            });
+        if let Some(signature) = checker.entry(graph, entry, &mut problems)
+            && !all.iter().any(|known| known.entry == signature.entry)
+        {
+            all.push(signature);
         }
     }
-    unknown(graph, contract, &all).map_err(refused)?;
-    Ok(all)
+    unknown(graph, contract, &all, &mut problems);
+    if problems.is_empty() {
+        return Ok(all);
+    }
+    // Entries may share a graph.
+    let mut seen = HashSet::new();
+    problems.retain(|problem| seen.insert(problem.clone()));
+    Err(BundleError::Entry {
+        problems: problems.into_iter().map(Line::from).collect(),
+    })
 }
 
 /// Returns whether an output is kept, or part of the KV cache.
@@ -111,9 +95,13 @@ fn is_used(entry: &Entry, output: &str) -> bool {
     output.starts_with("present.") || entry.outputs.iter().any(|kept| kept == output)
 }
 
-/// Checks that every value belongs to a graph of the family. (A bundle of any family may hold a
-/// trajectory encoder, to be used elsewhere.)
-fn unknown(graph: &GraphProto, contract: &Contract, known: &[Signature]) -> Result<(), String> {
+/// Checks that every value belongs to a graph of the family, or to a trajectory encoder.
+fn unknown(
+    graph: &GraphProto,
+    contract: &Contract,
+    known: &[Signature],
+    problems: &mut Vec<String>,
+) {
     for declared in graph.input.iter().chain(&graph.output) {
         let initialized = graph
             .initializer
@@ -121,16 +109,15 @@ fn unknown(graph: &GraphProto, contract: &Contract, known: &[Signature]) -> Resu
             .any(|tensor| tensor.name == declared.name);
         let entry = entry_of(&declared.name).unwrap_or("");
         let found = known.iter().any(|signature| signature.entry == entry)
-            || entry == "trajectory_encoder/encode";
+            || entry == ENCODE_TRAJECTORY;
         if !initialized && !found {
-            return Err(format!(
+            problems.push(format!(
                 "value {} belongs to no entry of a policy of kind `{}`",
                 declared.name,
                 contract.family.name()
             ));
         }
     }
-    Ok(())
 }
 
 /// Checker of declared values, with the widths found so far.
@@ -143,6 +130,57 @@ struct Checker<'c> {
 }
 
 impl Checker<'_> {
+    /// Returns the signature of an entry's graph; `None` for an entry without one.
+    fn entry(
+        &mut self,
+        graph: &GraphProto,
+        entry: &Entry,
+        problems: &mut Vec<String>,
+    ) -> Option<Signature> {
+        let name = entry.graph()?;
+        let prefix = format!("{name}/");
+        let before = problems.len();
+        let mut values = |declared: &[ValueInfoProto], input: bool| -> Vec<Value> {
+            let own = declared
+                .iter()
+                .filter(|value| value.name.starts_with(&prefix))
+                // An output that this project does not use may be anything.
+                .filter(|value| input || is_used(entry, &value.name[prefix.len()..]));
+            own.filter_map(|value| {
+                let read = self.value(name, &entry.name, value, input);
+                read.map_err(|problem| problems.push(problem)).ok()
+            })
+            .collect()
+        };
+        let outputs = values(&graph.output, false);
+        let declares = |name: &str| graph.output.iter().any(|value| value.name == name);
+        if entry.optional
+            && !graph
+                .output
+                .iter()
+                .any(|value| value.name.starts_with(&prefix))
+        {
+            return None;
+        }
+        let inputs = values(&graph.input, true);
+        for wanted in &entry.outputs {
+            let wanted = format!("{prefix}{wanted}");
+            if !declares(&wanted) {
+                problems.push(format!("output {wanted} is missing"));
+            }
+        }
+        // What is bound to the cache is known only of values that can be read.
+        if problems.len() == before {
+            let checked = self.cache(entry.cache.as_deref(), name, &inputs, &outputs);
+            problems.extend(checked.err());
+        }
+        Some(Signature {
+            entry: name.into(),
+            inputs,
+            outputs,
+        })
+    }
+
     /// Returns a declared value, if it matches the contract.
     fn value(
         &mut self,
@@ -306,7 +344,7 @@ impl Checker<'_> {
 }
 
 /// Checks the table of instructions.
-fn lookup(graph: &GraphProto, [words, dim]: [usize; 2]) -> Result<Signature, String> {
+fn lookup(graph: &GraphProto, [words, dim]: [usize; 2], problems: &mut Vec<String>) -> Signature {
     let wanted = |name: &str, ty, shape: &[usize]| Value {
         name: name.into(),
         ty,
@@ -327,15 +365,20 @@ fn lookup(graph: &GraphProto, [words, dim]: [usize; 2]) -> Result<Signature, Str
     ] {
         for value in values {
             let name = format!("{LOOKUP_INSTRUCTION}/{}", value.name);
-            let found = declared.iter().find(|other| other.name == name);
-            let found = found.ok_or_else(|| format!("{what} {name} is missing"))?;
-            let (ty, shape) = declaration(found)?;
-            if ty != value.ty || shape != value.shape {
-                return Err(differs(&name, &shape, &show(&value.shape), &value.fields));
+            match declared.iter().find(|other| other.name == name) {
+                None => problems.push(format!("{what} {name} is missing")),
+                Some(found) => match declaration(found) {
+                    Ok((ty, shape)) if ty == value.ty && shape == value.shape => {}
+                    Ok((_, shape)) => {
+                        let wanted = show(&value.shape);
+                        problems.push(differs(&name, &shape, &wanted, &value.fields));
+                    }
+                    Err(problem) => problems.push(problem),
+                },
             }
         }
     }
-    Ok(signature)
+    signature
 }
 
 fn differs(name: &str, found: &[Dim], wanted: &str, fields: &str) -> String {

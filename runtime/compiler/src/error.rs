@@ -5,6 +5,8 @@ use std::path::PathBuf;
 
 use lads_core::{Policy, PolicyError, SelfTestError};
 
+use crate::contract::Fault;
+
 /// Text of one line: control characters, which names in a hostile file may hold, are escaped.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Line(String);
@@ -32,6 +34,20 @@ impl fmt::Display for Line {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         f.write_str(&self.0)
     }
+}
+
+/// Largest number of faults that an error's text has; `lads inspect` lists them all.
+const MOST_SHOWN: usize = 20;
+
+/// Joins faults to one text.
+fn all<T: fmt::Display>(faults: &[T]) -> String {
+    let shown: Vec<String> = faults.iter().take(MOST_SHOWN).map(T::to_string).collect();
+    let more = faults.len() - shown.len();
+    let shown = shown.join("; ");
+    if more == 0 {
+        return shown;
+    }
+    format!("{shown}; and {more} more, which `lads inspect` lists")
 }
 
 /// Reason why a file cannot be used as a bundle.
@@ -76,22 +92,22 @@ pub enum BundleError {
     )]
     ContractV1,
     /// The contract misses something or contradicts itself.
-    #[error("contract: {problem}; export the bundle again")]
+    #[error("contract: {}; export the bundle again", all(faults))]
     Contract {
-        /// Name of the field, and its fault.
-        problem: Line,
+        /// All faults that the contract has.
+        faults: Vec<Fault>,
     },
-    /// A graph contradicts the contract, or misses an entry.
-    #[error("{problem}; export the bundle again")]
+    /// Graphs contradict the contract, or miss an entry.
+    #[error("{}; export the bundle again", all(problems))]
     Entry {
-        /// Name of the value, and the field of the contract.
-        problem: Line,
+        /// Names of values, each with its fault and the field of the contract.
+        problems: Vec<Line>,
     },
     /// The recorded episode is invalid.
-    #[error("`lads.golden`: {problem}; export the bundle again")]
+    #[error("`lads.golden`: {}; export the bundle again", all(problems))]
     Golden {
-        /// Fault of the episode.
-        problem: Line,
+        /// Faults of the episode.
+        problems: Vec<Line>,
     },
     /// The record of how an image's numbers are stored is invalid.
     #[error("`lads.storage`: {problem}; tune the bundle again: `lads-run tune`")]

@@ -20,7 +20,7 @@ pub mod vae;
 use lads_image::records::{NoiseRule, SelectionRule};
 use serde::Deserialize;
 
-use crate::contract::{Contract, MAX_LEN, Network};
+use crate::contract::{Contract, Faults, MAX_LEN, Network, Role};
 
 pub use blueprint::RESERVED;
 pub(crate) use blueprint::{Blueprint, Bound, Call, Entry, Keep, Origin, Times};
@@ -44,7 +44,7 @@ pub(crate) trait Kind {
     }
 
     /// Checks the family's own fields against the rest of the contract.
-    fn check(&self, contract: &Contract) -> Result<(), String>;
+    fn check(&self, contract: &Contract, faults: &mut Faults);
 
     /// Returns the parts of a policy of this family.
     fn blueprint(&self, contract: &Contract) -> Blueprint;
@@ -52,16 +52,25 @@ pub(crate) trait Kind {
 
 /// Defines the enum of all families, and the dispatch to them.
 macro_rules! families {
-    ($($(#[$meta:meta])* $name:ident($kind:ty) = $tag:literal,)*) => {
+    ($($(#[$meta:meta])* $name:ident($module:ident::$kind:ident) = $tag:literal,)*) => {
         /// Family of a policy, with the family's fields of the contract.
         #[derive(Debug, Clone, PartialEq, Deserialize)]
         #[serde(tag = "kind")]
-        pub enum Family { $($(#[$meta])* #[serde(rename = $tag)] $name($kind),)* }
+        pub enum Family { $($(#[$meta])* #[serde(rename = $tag)] $name($module::$kind),)* }
 
         impl Family {
             /// Returns the name of the family in a contract.
             pub fn name(&self) -> &'static str {
                 match self { $(Self::$name(_) => $tag,)* }
+            }
+
+            /// Names of all families.
+            #[cfg(test)]
+            pub(crate) const NAMES: &[&str] = &[$($tag),*];
+
+            /// Returns the fields of a family as JSON, with every field that it may have.
+            pub(crate) fn example(name: &str) -> Option<&'static str> {
+                match name { $($tag => Some($module::EXAMPLE),)* _ => None }
             }
 
             pub(crate) fn kind(&self) -> &dyn Kind {
@@ -99,8 +108,8 @@ impl Family {
         self.kind().period()
     }
 
-    pub(crate) fn check(&self, contract: &Contract) -> Result<(), String> {
-        self.kind().check(contract)
+    pub(crate) fn check(&self, contract: &Contract, faults: &mut Faults) {
+        self.kind().check(contract, faults);
     }
 }
 
@@ -141,14 +150,14 @@ fn one() -> f32 {
 }
 
 impl Decision {
-    fn check(self) -> Result<(), String> {
+    fn check(self, faults: &mut Faults) {
         let temperature = self.temperature;
-        if temperature.is_finite() && temperature > 0.0 {
-            return Ok(());
+        if !(temperature.is_finite() && temperature > 0.0) {
+            faults.add(
+                "family.decision.temperature",
+                format!("is {temperature}, it must be positive"),
+            );
         }
-        Err(format!(
-            "field `family.decision.temperature` is {temperature}, it must be positive"
-        ))
     }
 
     fn selection(self) -> Selection {
@@ -236,63 +245,63 @@ impl Default for Noise {
     }
 }
 
-/// Refuses a length of zero, or beyond [`MAX_LEN`](crate::contract::MAX_LEN).
-fn lengths<const N: usize>(fields: [(&str, usize); N]) -> Result<(), String> {
+/// Checks lengths of the family's own fields: neither zero nor beyond
+/// [`MAX_LEN`](crate::contract::MAX_LEN).
+fn lengths<const N: usize>(fields: [(&str, usize); N], faults: &mut Faults) {
     for (field, len) in fields {
-        if !(1..=MAX_LEN).contains(&len) {
-            return Err(format!(
-                "field `family.{field}` is {len}, it must be 1 to {MAX_LEN}"
-            ));
-        }
+        length(&format!("family.{field}"), len, faults);
     }
-    Ok(())
 }
 
-/// Returns the sizes of a transformer that the family requires.
-fn network(network: Option<Network>, field: &str) -> Result<Network, String> {
-    let sizes = network.ok_or_else(|| format!("missing field `{field}`"))?;
+fn length(field: &str, len: usize, faults: &mut Faults) {
+    if !(1..=MAX_LEN).contains(&len) {
+        faults.add(field, format!("is {len}, it must be 1 to {MAX_LEN}"));
+    }
+}
+
+/// Checks the sizes of a transformer that the family requires.
+fn network(network: Option<Network>, field: &str, faults: &mut Faults) {
+    let Some(sizes) = network else {
+        return faults.add(
+            field,
+            "is missing: `layers`, `heads` and `head_dim` of the transformer",
+        );
+    };
     for (part, len) in [
         ("layers", sizes.layers),
         ("heads", sizes.heads),
         ("head_dim", sizes.head_dim),
     ] {
-        if !(1..=MAX_LEN).contains(&len) {
-            return Err(format!(
-                "field `{field}.{part}` is {len}, it must be 1 to {MAX_LEN}"
-            ));
-        }
+        length(&format!("{field}.{part}"), len, faults);
     }
-    Ok(sizes)
 }
 
 /// Checks the fields that every family with a transformer over words needs: an instruction channel,
 /// a context and the transformer's sizes.
-fn instructed(contract: &Contract) -> Result<(), String> {
+fn instructed(contract: &Contract, faults: &mut Faults) {
     if contract.words().is_none() {
-        return Err(format!(
-            "field `channels` has no instruction, which family {} takes",
-            contract.family.name()
-        ));
+        let family = contract.family.name();
+        faults.add(
+            "channels",
+            format!("has no instruction, which family {family} takes"),
+        );
     }
     if contract.context.is_none() {
-        return Err("missing field `context`".into());
+        faults.add(
+            "context",
+            "is missing: `words`, `steps`, and what is done beyond",
+        );
     }
-    network(contract.network, "network")?;
-    Ok(())
+    network(contract.network, "network", faults);
 }
 
 /// Checks that there is exactly one noise channel.
-fn one_noise(contract: &Contract) -> Result<(), String> {
-    let role = crate::contract::Role::Noise;
-    let count = contract
-        .channels
-        .iter()
-        .filter(|channel| channel.role == role)
-        .count();
-    if count == 1 {
-        return Ok(());
+fn one_noise(contract: &Contract, faults: &mut Faults) {
+    let count = contract.with(Role::Noise).count();
+    if count != 1 {
+        faults.add(
+            "channels",
+            format!("has {count} noise channels, it must have one"),
+        );
     }
-    Err(format!(
-        "field `channels` has {count} noise channels, it must have one"
-    ))
 }

@@ -8,7 +8,7 @@ use base64::Engine as _;
 use safetensors::{Dtype, SafeTensors};
 
 use crate::contract::{Channel, Contract, DType};
-use crate::error::BundleError;
+use crate::error::{BundleError, Line};
 
 /// One recorded episode.
 #[derive(Debug, Clone, PartialEq)]
@@ -43,8 +43,8 @@ pub enum Recorded {
 impl Golden {
     /// Decodes the episode from the metadata's value.
     pub fn parse(base64: &str, contract: &Contract) -> Result<Self, BundleError> {
-        Self::read(base64, contract).map_err(|problem| BundleError::Golden {
-            problem: problem.into(),
+        Self::read(base64, contract).map_err(|problems| BundleError::Golden {
+            problems: problems.into_iter().map(Line::from).collect(),
         })
     }
 
@@ -58,85 +58,104 @@ impl Golden {
         self.noise.len() / self.steps.max(1)
     }
 
-    fn read(base64: &str, contract: &Contract) -> Result<Self, String> {
+    fn read(base64: &str, contract: &Contract) -> Result<Self, Vec<String>> {
         let blob = base64::engine::general_purpose::STANDARD
             .decode(base64.trim())
-            .map_err(|error| format!("is not base64: {error}"))?;
-        let tensors = SafeTensors::deserialize(&blob)
-            .map_err(|error| format!("is not a safetensors file: {error}"))?;
-        let (_, metadata) = SafeTensors::read_metadata(&blob)
-            .map_err(|error| format!("is not a safetensors file: {error}"))?;
-        let tolerance = metadata
-            .metadata()
-            .as_ref()
-            .and_then(|pairs| pairs.get("tolerance"))
-            .ok_or("its metadata has no `tolerance`")?;
-        let tolerance: f32 = tolerance
-            .parse()
-            .map_err(|_| format!("its `tolerance` \"{tolerance}\" is not a number"))?;
-        if !(tolerance.is_finite() && tolerance > 0.0) {
-            return Err(format!("its `tolerance` {tolerance} is not positive"));
-        }
-        let has = |name: &str| tensors.tensor(name).is_ok();
-        let steps = tensors
-            .tensor("actions")
-            .map_err(|_| "it has no tensor `actions`".to_owned())?
-            .shape()
-            .first()
-            .copied()
-            .unwrap_or(0);
-        if steps == 0 {
-            return Err("it has no steps".into());
-        }
-        let instruction = if contract.words().is_some() {
-            Some(instruction(&tensors, contract)?)
-        } else {
-            None
+            .map_err(|error| vec![format!("is not base64: {error}")])?;
+        let damaged = |error| vec![format!("is not a safetensors file: {error}")];
+        let tensors = SafeTensors::deserialize(&blob).map_err(damaged)?;
+        let (_, metadata) = SafeTensors::read_metadata(&blob).map_err(damaged)?;
+        let metadata = metadata.metadata().as_ref();
+        let tolerance = tolerance(metadata.and_then(|pairs| pairs.get("tolerance")));
+        let steps = steps(&tensors);
+        let mut problems = vec![];
+        let tolerance = tolerance.map_err(|problem| problems.push(problem)).ok();
+        let steps = steps.map_err(|problem| problems.push(problem)).ok();
+        let instruction = (contract.words())
+            .map(|_| instruction(&tensors, contract))
+            .transpose()
+            .map_err(|problem| problems.push(problem))
+            .ok();
+        // Without a number of steps, nothing else has a shape that it must have.
+        let Some(steps) = steps else {
+            return Err(problems);
         };
-        let observations = contract
-            .observations()
-            .map(|channel| recorded(&tensors, channel, steps))
-            .collect::<Result<Vec<_>, _>>()?;
-        let selected = if has("selected") {
-            let selected = integers(&tensors, "selected")?;
-            if selected.len() != steps {
-                return Err(format!(
-                    "`selected` has {} steps, not {steps}",
-                    selected.len()
-                ));
+        let mut observations = vec![];
+        for channel in contract.observations() {
+            match recorded(&tensors, channel, steps) {
+                Ok(values) => observations.push(values),
+                Err(problem) => problems.push(problem),
             }
-            selected
-                .iter()
-                .map(|&index| u32::try_from(index))
-                .collect::<Result<_, _>>()
-                .map_err(|_| "`selected` has an index below zero".to_owned())?
-        } else {
-            vec![]
+        }
+        let mut or_report = |read: Result<Vec<f32>, String>| -> Vec<f32> {
+            read.unwrap_or_else(|problem| {
+                problems.push(problem);
+                vec![]
+            })
         };
-        let noise = if has("noise") {
-            let shape = tensors
-                .tensor("noise")
-                .map(|tensor| tensor.shape().to_vec());
-            let width = shape
-                .ok()
-                .and_then(|shape| shape.get(1).copied())
-                .unwrap_or(0);
-            floats(&tensors, "noise", &[steps, width])?
-        } else {
-            vec![]
-        };
+        let noise = or_report(noise(&tensors, steps));
         let action = [&[steps][..], &contract.action().shape].concat();
-        let actions = floats(&tensors, "actions", &action)?;
-        Ok(Self {
-            instruction,
-            observations,
-            selected,
-            noise,
-            actions,
-            tolerance,
-            steps,
-        })
+        let actions = or_report(floats(&tensors, "actions", &action));
+        let selected = selected(&tensors, steps).unwrap_or_else(|problem| {
+            problems.push(problem);
+            vec![]
+        });
+        match (tolerance, instruction) {
+            (Some(tolerance), Some(instruction)) if problems.is_empty() => Ok(Self {
+                instruction,
+                observations,
+                selected,
+                noise,
+                actions,
+                tolerance,
+                steps,
+            }),
+            _ => Err(problems),
+        }
     }
+}
+
+fn tolerance(text: Option<&String>) -> Result<f32, String> {
+    let text = text.ok_or("its metadata has no `tolerance`")?;
+    let tolerance: f32 = text
+        .parse()
+        .map_err(|_| format!("its `tolerance` \"{text}\" is not a number"))?;
+    if !(tolerance.is_finite() && tolerance > 0.0) {
+        return Err(format!("its `tolerance` {tolerance} is not positive"));
+    }
+    Ok(tolerance)
+}
+
+/// Returns the number of control steps, which the actions tell.
+fn steps(tensors: &SafeTensors) -> Result<usize, String> {
+    let actions = tensors.tensor("actions");
+    let actions = actions.map_err(|_| "it has no tensor `actions`".to_owned())?;
+    let steps = actions.shape().first().copied();
+    steps
+        .filter(|&steps| steps > 0)
+        .ok_or_else(|| "it has no steps".into())
+}
+
+fn selected(tensors: &SafeTensors, steps: usize) -> Result<Vec<u32>, String> {
+    if tensors.tensor("selected").is_err() {
+        return Ok(vec![]);
+    }
+    let selected = integers(tensors, "selected")?;
+    if selected.len() != steps {
+        let found = selected.len();
+        return Err(format!("`selected` has {found} steps, not {steps}"));
+    }
+    let selected = selected.iter().map(|&index| u32::try_from(index));
+    let selected: Result<_, _> = selected.collect();
+    selected.map_err(|_| "`selected` has an index below zero".to_owned())
+}
+
+fn noise(tensors: &SafeTensors, steps: usize) -> Result<Vec<f32>, String> {
+    let Ok(noise) = tensors.tensor("noise") else {
+        return Ok(vec![]);
+    };
+    let width = noise.shape().get(1).copied().unwrap_or(0);
+    floats(tensors, "noise", &[steps, width])
 }
 
 fn instruction(tensors: &SafeTensors, contract: &Contract) -> Result<usize, String> {

@@ -10,35 +10,13 @@ use std::collections::HashMap;
 use bytes::Bytes;
 use prost::Message;
 
-use crate::contract::Contract;
+use crate::contract::{Contract, REQUIRED};
 use crate::entries;
 use crate::error::{BundleError, Line};
 use crate::golden::Golden;
 use crate::graph::{Dim, Type, show};
 use crate::import::{Declared, Model, Refused, trial};
 use crate::onnx::{self, GraphProto, ModelProto, TensorTypeProto, ValueInfoProto, data_type};
-
-/// Top-level fields that every contract requires.
-const FIELDS: [(&str, &str); 6] = [
-    ("version", "the version of the contract's form, 2"),
-    (
-        "family",
-        "the family of policies and its own fields; {\"kind\": \"plain\"} for one graph from observations to an action",
-    ),
-    (
-        "environment",
-        "`id` and `version` of the environment that it was made for",
-    ),
-    (
-        "control_period_s",
-        "the time from one control step to the next, in seconds",
-    ),
-    (
-        "channels",
-        "every observation and the action, with names, units and limits",
-    ),
-    ("provenance", "how the policy was trained: anything, or {}"),
-];
 
 /// Content of a file, and what it lacks to become a policy.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -284,38 +262,35 @@ fn of_bundle(
     json: &str,
     missing: &mut Missing,
 ) -> Result<(), BundleError> {
-    let before = missing.contract.len();
-    if let Ok(serde_json::Value::Object(fields)) = serde_json::from_str(json) {
-        for (name, needed) in FIELDS {
-            if !fields.contains_key(name) {
-                missing.field(name, needed);
-            }
-        }
-    }
-    let contract = match Contract::parse(json) {
-        Ok(contract) => Some(contract),
-        Err(error @ (BundleError::ContractV1 | BundleError::ContractVersion { .. })) => {
-            return Err(error);
-        }
-        Err(BundleError::Contract { problem }) if missing.contract.len() == before => {
-            missing.field("lads.contract", problem.to_string());
-            None
-        }
-        Err(_) => None,
-    };
+    let (contract, faults) = Contract::read(json)?;
     let golden = property(model, "lads.golden");
     if golden.is_none() {
         missing.field("lads.golden", GOLDEN);
     }
-    let Some(contract) = contract else {
-        return Ok(());
+    let list = |missing: &mut Missing, field: &str, found: Result<(), BundleError>| match found {
+        Err(BundleError::Golden { problems } | BundleError::Entry { problems }) => {
+            for problem in problems {
+                missing.field(field, problem.to_string());
+            }
+        }
+        Err(error) => missing.field(field, error.to_string()),
+        Ok(()) => {}
     };
-    if let Some(Err(error)) = golden.map(|golden| Golden::parse(golden, &contract)) {
-        missing.field("lads.golden", error.to_string());
+    if let Some(contract) = contract {
+        if let Some(golden) = golden
+            && faults.spare(&["channels", "instructions"])
+        {
+            let read = Golden::parse(golden, &contract).map(drop);
+            list(missing, "lads.golden", read);
+        }
+        if faults.spare(&["channels", "states", "family", "context", "network"]) {
+            let blueprint = contract.family.kind().blueprint(&contract);
+            let found = entries::signatures(graph, &contract, &blueprint).map(drop);
+            list(missing, "entries", found);
+        }
     }
-    let blueprint = contract.family.kind().blueprint(&contract);
-    if let Err(error) = entries::signatures(graph, &contract, &blueprint) {
-        missing.field("entries", error.to_string());
+    for fault in faults.into_vec() {
+        missing.field(fault.field.to_string(), fault.problem.to_string());
     }
     Ok(())
 }
@@ -327,7 +302,7 @@ const MOST_FED: usize = 8;
 
 /// Lists the fields that a person has to state for a graph without a contract.
 fn of_stranger(inputs: &[&ValueInfoProto], graph: &GraphProto, missing: &mut Missing) {
-    for (name, needed) in FIELDS {
+    for (name, needed) in REQUIRED {
         if name != "channels" {
             missing.field(name, needed);
         }

@@ -11,7 +11,7 @@ type Broken = (&'static str, &'static str, &'static [&'static str]);
 
 const BROKEN: &[Broken] = &[
     ("/family/kind", r#""lasd""#, &["lasd"]),
-    ("/family/horizon", "", &["`horizon`"]),
+    ("/family/horizon", "", &["`family.horizon` is missing"]),
     ("/family/horizon", "0", &["`family.horizon` is 0"]),
     ("/family/codebook/dim", "0", &["`family.codebook.dim` is 0"]),
     (

@@ -2,7 +2,8 @@
 
 use serde::Deserialize;
 
-use super::distinct;
+use super::Faults;
+use super::check::distinct;
 
 /// Largest number of elements of a channel.
 const MAX_CHANNEL_LEN: usize = 1 << 26;
@@ -87,39 +88,53 @@ impl Channel {
         (self.min.unwrap_or(min), self.max.unwrap_or(max))
     }
 
-    pub(super) fn check(&self, at: &str) -> Result<(), String> {
+    pub(super) fn check(&self, at: &str, faults: &mut Faults) {
         let len = self.shape.iter().try_fold(1_usize, |len, &dim| {
             len.checked_mul(dim)
                 .filter(|&len| (1..=MAX_CHANNEL_LEN).contains(&len))
         });
         if !(1..=4).contains(&self.shape.len()) || len.is_none() {
-            return Err(format!(
-                "field `{at}.shape` is {:?}, it must have one to four axes and 1 to {MAX_CHANNEL_LEN} elements",
-                self.shape
-            ));
-        }
-        let described = matches!(self.role, Role::Observation | Role::Action);
-        let vector = self.dtype == DType::F32 && self.shape.len() == 1;
-        if described && vector && self.elements.len() != self.len() {
-            return Err(format!(
-                "field `{at}.elements` has {} elements, its shape {:?} says {}",
-                self.elements.len(),
-                self.shape,
-                self.len()
-            ));
-        }
-        if !self.elements.is_empty() && (!vector || self.elements.len() != self.len()) {
-            return Err(format!(
-                "field `{at}.elements`: only vectors of f32 have elements, one for each of their length"
-            ));
+            faults.add(
+                &format!("{at}.shape"),
+                format!(
+                    "is {:?}, it must have one to four axes and 1 to {MAX_CHANNEL_LEN} elements",
+                    self.shape
+                ),
+            );
+        } else {
+            self.check_elements(&format!("{at}.elements"), faults);
         }
         let (min, max) = self.limits();
         if !(min.is_finite() && max.is_finite() && min < max) {
-            return Err(format!(
-                "field `{at}` has limits {min} to {max}, which is no range"
-            ));
+            faults.add(at, format!("has limits {min} to {max}, which is no range"));
         }
-        elements(&format!("{at}.elements"), &self.elements)
+    }
+
+    /// Checks the elements of a channel whose shape is sound.
+    fn check_elements(&self, at: &str, faults: &mut Faults) {
+        let described = matches!(self.role, Role::Observation | Role::Action);
+        let vector = self.dtype == DType::F32 && self.shape.len() == 1;
+        if described && vector && self.elements.len() != self.len() {
+            faults.add(
+                at,
+                format!(
+                    "has {} elements, its shape {:?} says {}",
+                    self.elements.len(),
+                    self.shape,
+                    self.len()
+                ),
+            );
+        } else if !self.elements.is_empty() && (!vector || self.elements.len() != self.len()) {
+            faults.add(
+                at,
+                "must be empty: only vectors of f32 have elements, one for each of their length",
+            );
+        }
+        for (i, element) in self.elements.iter().enumerate() {
+            element.check(&format!("{at}[{i}]"), faults);
+        }
+        let names = self.elements.iter().map(|element| element.name.as_str());
+        distinct(at, "name", names, faults);
     }
 }
 
@@ -161,6 +176,31 @@ fn one() -> f32 {
     1.0
 }
 
+impl Element {
+    fn check(&self, at: &str, faults: &mut Faults) {
+        let Self {
+            name,
+            min,
+            max,
+            scale,
+            offset,
+            ..
+        } = self;
+        if !(scale.is_finite() && offset.is_finite()) {
+            faults.add(
+                at,
+                format!("({name}) has scale {scale} and offset {offset}, which are not numbers"),
+            );
+        }
+        if !(min.is_finite() && max.is_finite() && min < max) {
+            faults.add(
+                at,
+                format!("({name}) has limits {min} to {max}, which is no range"),
+            );
+        }
+    }
+}
+
 /// Order of the components of quaternions in a channel.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -172,32 +212,4 @@ pub enum QuaternionOrder {
     Wxyz,
     /// Quaternions with the scalar last.
     Xyzw,
-}
-
-fn elements(field: &str, elements: &[Element]) -> Result<(), String> {
-    for (i, element) in elements.iter().enumerate() {
-        let Element {
-            name,
-            min,
-            max,
-            scale,
-            offset,
-            ..
-        } = element;
-        if !(scale.is_finite() && offset.is_finite()) {
-            return Err(format!(
-                "field `{field}[{i}]` ({name}) has scale {scale} and offset {offset}, which are not numbers"
-            ));
-        }
-        if !(min.is_finite() && max.is_finite() && min < max) {
-            return Err(format!(
-                "field `{field}[{i}]` ({name}) has limits {min} to {max}, which is no range"
-            ));
-        }
-    }
-    distinct(
-        field,
-        "name",
-        elements.iter().map(|element| element.name.as_str()),
-    )
 }

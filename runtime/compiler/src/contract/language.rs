@@ -2,6 +2,8 @@
 
 use serde::Deserialize;
 
+use super::Faults;
+
 /// Pooling of the words of an instruction.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -57,18 +59,18 @@ pub struct Language {
 }
 
 impl Acceptance {
-    pub(super) fn check(&self) -> Result<(), String> {
+    pub(super) fn check(&self, faults: &mut Faults) {
         for (part, value, least) in [
             ("threshold", self.threshold, -1.0),
             ("accepted_known", self.accepted_known, 0.0),
             ("accepted_other", self.accepted_other, 0.0),
         ] {
             if !(least..=1.0).contains(&value) {
-                return Err(format!(
-                    "field `language.acceptance.{part}` is {value}, it must be {least} to 1"
-                ));
+                faults.add(
+                    &format!("language.acceptance.{part}"),
+                    format!("is {value}, it must be {least} to 1"),
+                );
             }
         }
-        Ok(())
     }
 }

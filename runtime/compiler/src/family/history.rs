@@ -10,7 +10,11 @@ use serde::Deserialize;
 
 use super::recall::Recall;
 use super::{Blueprint, Call, Codebook, Decision, Entry, Kind, Selection, instructed, lengths};
-use crate::contract::Contract;
+use crate::contract::{Contract, Faults};
+
+/// Every field of this family in a contract.
+pub(crate) const EXAMPLE: &str = r#"{"kind": "history", "horizon": 1, "codebook": {"size": 1, "dim": 1}, "decision": {"rule": "argmax", "temperature": 1, "seed": 0},
+    "window": 1, "memory": {"dim": 1}, "low_level": {"layers": 1, "heads": 1, "head_dim": 1}, "features": 1, "actions": false}"#;
 
 /// Contract fields of the family with a history.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -42,16 +46,19 @@ impl Kind for History {
         self.decision.selection()
     }
 
-    fn check(&self, contract: &Contract) -> Result<(), String> {
-        lengths([
-            ("horizon", self.horizon),
-            ("codebook.size", self.codebook.size),
-            ("codebook.dim", self.codebook.dim),
-            ("features", self.features.unwrap_or(1)),
-        ])?;
-        self.recall.check("")?;
-        self.decision.check()?;
-        instructed(contract)
+    fn check(&self, contract: &Contract, faults: &mut Faults) {
+        lengths(
+            [
+                ("horizon", self.horizon),
+                ("codebook.size", self.codebook.size),
+                ("codebook.dim", self.codebook.dim),
+                ("features", self.features.unwrap_or(1)),
+            ],
+            faults,
+        );
+        self.recall.check("", faults);
+        self.decision.check(faults);
+        instructed(contract, faults);
     }
 
     fn blueprint(&self, contract: &Contract) -> Blueprint {

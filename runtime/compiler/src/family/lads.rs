@@ -15,7 +15,10 @@ use lads_image::records::Event;
 use serde::Deserialize;
 
 use super::{Blueprint, Call, Codebook, Decision, Entry, Kind, Selection, instructed, lengths};
-use crate::contract::Contract;
+use crate::contract::{Contract, Faults};
+
+/// Every field of this family in a contract.
+pub(crate) const EXAMPLE: &str = r#"{"kind": "lads", "horizon": 1, "codebook": {"size": 1, "dim": 1}, "decision": {"rule": "argmax", "temperature": 1, "seed": 0}, "features": 1}"#;
 
 /// Contract fields of LADS.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -41,15 +44,18 @@ impl Kind for Lads {
         self.decision.selection()
     }
 
-    fn check(&self, contract: &Contract) -> Result<(), String> {
-        lengths([
-            ("horizon", self.horizon),
-            ("codebook.size", self.codebook.size),
-            ("codebook.dim", self.codebook.dim),
-        ])?;
-        lengths([("features", self.features.unwrap_or(1))])?;
-        self.decision.check()?;
-        instructed(contract)
+    fn check(&self, contract: &Contract, faults: &mut Faults) {
+        lengths(
+            [
+                ("horizon", self.horizon),
+                ("codebook.size", self.codebook.size),
+                ("codebook.dim", self.codebook.dim),
+            ],
+            faults,
+        );
+        lengths([("features", self.features.unwrap_or(1))], faults);
+        self.decision.check(faults);
+        instructed(contract, faults);
     }
 
     fn blueprint(&self, contract: &Contract) -> Blueprint {

@@ -7,7 +7,10 @@ use lads_image::records::Event;
 use serde::Deserialize;
 
 use super::{Blueprint, Call, Entry, Kind, instructed, lengths};
-use crate::contract::Contract;
+use crate::contract::{Contract, Faults};
+
+/// Every field of this family in a contract.
+pub(crate) const EXAMPLE: &str = r#"{"kind": "lang_dt", "features": 1}"#;
 
 /// Contract fields of Lang DT.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -19,9 +22,9 @@ pub struct LangDt {
 }
 
 impl Kind for LangDt {
-    fn check(&self, contract: &Contract) -> Result<(), String> {
-        lengths([("features", self.features.unwrap_or(1))])?;
-        instructed(contract)
+    fn check(&self, contract: &Contract, faults: &mut Faults) {
+        lengths([("features", self.features.unwrap_or(1))], faults);
+        instructed(contract, faults);
     }
 
     fn blueprint(&self, contract: &Contract) -> Blueprint {

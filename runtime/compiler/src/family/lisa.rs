@@ -14,7 +14,11 @@ use serde::Deserialize;
 use super::{
     Blueprint, Call, Codebook, Decision, Entry, Kind, Selection, instructed, lengths, network,
 };
-use crate::contract::{Contract, Network};
+use crate::contract::{Contract, Faults, Network};
+
+/// Every field of this family in a contract.
+pub(crate) const EXAMPLE: &str = r#"{"kind": "lisa", "horizon": 1, "codebook": {"size": 1, "dim": 1}, "decision": {"rule": "argmax", "temperature": 1, "seed": 0},
+    "low_level": {"layers": 1, "heads": 1, "head_dim": 1}, "features": 1}"#;
 
 /// Contract fields of LISA.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -42,16 +46,19 @@ impl Kind for Lisa {
         self.decision.selection()
     }
 
-    fn check(&self, contract: &Contract) -> Result<(), String> {
-        lengths([
-            ("horizon", self.horizon),
-            ("codebook.size", self.codebook.size),
-            ("codebook.dim", self.codebook.dim),
-            ("features", self.features.unwrap_or(1)),
-        ])?;
-        network(Some(self.low_level), "family.low_level")?;
-        self.decision.check()?;
-        instructed(contract)
+    fn check(&self, contract: &Contract, faults: &mut Faults) {
+        lengths(
+            [
+                ("horizon", self.horizon),
+                ("codebook.size", self.codebook.size),
+                ("codebook.dim", self.codebook.dim),
+                ("features", self.features.unwrap_or(1)),
+            ],
+            faults,
+        );
+        network(Some(self.low_level), "family.low_level", faults);
+        self.decision.check(faults);
+        instructed(contract, faults);
     }
 
     fn blueprint(&self, contract: &Contract) -> Blueprint {

@@ -8,21 +8,26 @@ use lads_image::records::{self, Scope};
 use serde::Deserialize;
 
 use super::{Blueprint, Call, Entry, Keep, Kind, Origin};
-use crate::contract::{Channel, ClearedBy, Contract, Fill, StateKind};
+use crate::contract::{Channel, ClearedBy, Contract, Faults, Fill, StateKind};
 
 /// Name of the only graph.
 const ACT: &str = "policy/act";
+
+/// Every field of this family in a contract.
+pub(crate) const EXAMPLE: &str = r#"{"kind": "plain"}"#;
 
 /// Contract fields of a plain policy, which has none of its own.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Plain {}
 
 impl Kind for Plain {
-    fn check(&self, contract: &Contract) -> Result<(), String> {
+    fn check(&self, contract: &Contract, faults: &mut Faults) {
         if contract.words().is_some() {
-            return Err("field `channels`: family plain takes no instruction".into());
+            faults.add(
+                "channels",
+                "has an instruction, and family plain takes none",
+            );
         }
-        Ok(())
     }
 
     fn blueprint(&self, contract: &Contract) -> Blueprint {

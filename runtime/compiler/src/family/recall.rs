@@ -7,7 +7,7 @@ use lads_image::records::{Fill, Scope};
 use serde::Deserialize;
 
 use super::{Blueprint, Call, Entry, Keep, lengths, network};
-use crate::contract::Network;
+use crate::contract::{Faults, Network};
 
 /// Sizes of a row of the window.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
@@ -29,12 +29,11 @@ pub struct Recall {
 
 impl Recall {
     /// Checks the sizes, which the contract has `within` the family: nothing, or a field with a point behind it.
-    pub(crate) fn check(self, within: &str) -> Result<(), String> {
-        lengths([
-            (format!("{within}window").as_str(), self.window),
-            (format!("{within}memory.dim").as_str(), self.memory.dim),
-        ])?;
-        network(Some(self.low_level), &format!("family.{within}low_level")).map(drop)
+    pub(crate) fn check(self, within: &str, faults: &mut Faults) {
+        let (window, memory) = (format!("{within}window"), format!("{within}memory.dim"));
+        lengths([(&window, self.window), (&memory, self.memory.dim)], faults);
+        let low_level = format!("family.{within}low_level");
+        network(Some(self.low_level), &low_level, faults);
     }
 
     /// Adds the transformer's cache and the window.

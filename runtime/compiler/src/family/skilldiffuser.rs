@@ -7,7 +7,11 @@ use super::{
     Blueprint, Call, Codebook, Decision, Denoise, Entry, Kind, Noise, NoiseSource, Selection,
     instructed, lengths, one_noise,
 };
-use crate::contract::Contract;
+use crate::contract::{Contract, Faults};
+
+/// Every field of this family in a contract.
+pub(crate) const EXAMPLE: &str = r#"{"kind": "skilldiffuser", "horizon": 1, "codebook": {"size": 1, "dim": 1}, "decision": {"rule": "argmax", "temperature": 1, "seed": 0},
+    "denoise": {"steps": 1}, "noise": {"rule": "zero", "seed": 0}}"#;
 
 /// Contract fields of `SkillDiffuser`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -37,16 +41,19 @@ impl Kind for SkillDiffuser {
         self.noise.noise()
     }
 
-    fn check(&self, contract: &Contract) -> Result<(), String> {
-        lengths([
-            ("horizon", self.horizon),
-            ("codebook.size", self.codebook.size),
-            ("codebook.dim", self.codebook.dim),
-            ("denoise.steps", self.denoise.steps),
-        ])?;
-        self.decision.check()?;
-        one_noise(contract)?;
-        instructed(contract)
+    fn check(&self, contract: &Contract, faults: &mut Faults) {
+        lengths(
+            [
+                ("horizon", self.horizon),
+                ("codebook.size", self.codebook.size),
+                ("codebook.dim", self.codebook.dim),
+                ("denoise.steps", self.denoise.steps),
+            ],
+            faults,
+        );
+        self.decision.check(faults);
+        one_noise(contract, faults);
+        instructed(contract, faults);
     }
 
     fn blueprint(&self, contract: &Contract) -> Blueprint {

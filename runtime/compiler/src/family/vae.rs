@@ -9,7 +9,7 @@ use serde::Deserialize;
 
 use super::recall::Recall;
 use super::{Blueprint, Call, Entry, Kind, Noise, instructed, lengths, one_noise};
-use crate::contract::Contract;
+use crate::contract::{Contract, Faults};
 
 /// Sizes of a plan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
@@ -37,6 +37,10 @@ pub struct VaeDecision {
     #[serde(default)]
     pub seed: u64,
 }
+
+/// Every field of this family in a contract.
+pub(crate) const EXAMPLE: &str = r#"{"kind": "vae", "horizon": 1, "plan": {"dim": 1}, "decision": {"rule": "mean", "seed": 0}, "features": 1,
+    "history": {"window": 1, "memory": {"dim": 1}, "low_level": {"layers": 1, "heads": 1, "head_dim": 1}}}"#;
 
 /// Contract fields of the VAE family.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -71,17 +75,20 @@ impl Kind for Vae {
         }
     }
 
-    fn check(&self, contract: &Contract) -> Result<(), String> {
-        lengths([
-            ("horizon", self.horizon),
-            ("plan.dim", self.plan.dim),
-            ("features", self.features.unwrap_or(1)),
-        ])?;
+    fn check(&self, contract: &Contract, faults: &mut Faults) {
+        lengths(
+            [
+                ("horizon", self.horizon),
+                ("plan.dim", self.plan.dim),
+                ("features", self.features.unwrap_or(1)),
+            ],
+            faults,
+        );
         if let Some(recall) = self.history {
-            recall.check("history.")?;
+            recall.check("history.", faults);
         }
-        one_noise(contract)?;
-        instructed(contract)
+        one_noise(contract, faults);
+        instructed(contract, faults);
     }
 
     fn blueprint(&self, contract: &Contract) -> Blueprint {

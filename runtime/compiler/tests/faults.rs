@@ -1,0 +1,194 @@
+//! Tests that a file with several faults is told all of them at once.
+
+use std::collections::BTreeSet;
+
+use lads_compiler::contract::Fault;
+use lads_compiler::{BundleError, Contract, survey};
+use serde_json::{Value, json};
+
+const TINY: &[u8] = include_bytes!("data/tiny.onnx");
+
+/// Returns the small bundle's contract.
+fn contract() -> Value {
+    let start = br#"{"version""#;
+    let at = TINY.windows(start.len()).position(|part| part == start);
+    let json = &TINY[at.expect("the contract")..];
+    let mut values = serde_json::Deserializer::from_slice(json).into_iter();
+    values.next().unwrap().unwrap()
+}
+
+fn faults(contract: &Value) -> Vec<Fault> {
+    match Contract::parse(&contract.to_string()) {
+        Err(BundleError::Contract { faults }) => faults,
+        other => panic!("{other:?}"),
+    }
+}
+
+/// Returns the names of the faulty fields, in their order.
+fn fields(contract: &Value) -> Vec<String> {
+    let faults = faults(contract);
+    faults.iter().map(|fault| fault.field.to_string()).collect()
+}
+
+/// Makes something that no field takes of every scalar, and names it.
+fn spoil(value: &mut Value, at: &str, spoilt: &mut BTreeSet<String>) {
+    match value {
+        Value::Object(fields) => {
+            for (key, value) in fields {
+                let point = if at.is_empty() { "" } else { "." };
+                spoil(value, &format!("{at}{point}{key}"), spoilt);
+            }
+        }
+        Value::Array(elements) => {
+            for (i, element) in elements.iter_mut().enumerate() {
+                spoil(element, &format!("{at}[{i}]"), spoilt);
+            }
+        }
+        scalar => {
+            spoilt.insert(at.to_owned());
+            *scalar = json!([[{}]]);
+        }
+    }
+}
+
+#[test]
+fn every_wrong_type_is_named() {
+    let mut broken = contract();
+    let mut spoilt = BTreeSet::new();
+    for (part, value) in broken.as_object_mut().unwrap() {
+        // Anything may stand in the provenance; another version is another program's.
+        if part != "provenance" && part != "version" {
+            spoil(value, part, &mut spoilt);
+        }
+    }
+    // The family's own fields are known by its kind.
+    broken["family"]["kind"] = json!("lads");
+    spoilt.remove("family.kind");
+    let found: BTreeSet<String> = fields(&broken).into_iter().collect();
+    assert!(spoilt.len() > 50, "{spoilt:?}");
+    assert_eq!(found, spoilt);
+}
+
+#[test]
+fn every_missing_field_is_named() {
+    let mut broken = contract();
+    for field in ["environment", "provenance", "control_period_s"] {
+        broken.as_object_mut().unwrap().remove(field);
+    }
+    for (place, field) in [
+        ("/family", "horizon"),
+        ("/family/codebook", "dim"),
+        ("/channels/0", "role"),
+        ("/channels/0/elements/1", "unit"),
+        ("/channels/0/elements/1", "min"),
+        ("/language", "encoder"),
+        ("/language", "sha256"),
+        ("/instructions/2", "text"),
+    ] {
+        let part = broken.pointer_mut(place).unwrap();
+        assert!(part.as_object_mut().unwrap().remove(field).is_some());
+    }
+    let found = fields(&broken);
+    let expected = [
+        "channels[0].elements[1].min",
+        "channels[0].elements[1].unit",
+        "channels[0].role",
+        "control_period_s",
+        "environment",
+        "family.codebook.dim",
+        "family.horizon",
+        "instructions[2].text",
+        "language.encoder",
+        "language.sha256",
+        "provenance",
+    ];
+    assert_eq!(found, expected);
+}
+
+/// A fault of the form hides no fault of the meaning elsewhere, and makes none.
+#[test]
+fn faults_of_form_and_meaning_are_told_together() {
+    let mut broken = contract();
+    broken["provenance"] = Value::Null;
+    broken.as_object_mut().unwrap().remove("environment");
+    broken["control_period_s"] = json!(-1);
+    broken["channels"][0]["elements"][2]["min"] = json!(7);
+    broken["channels"][4]["elements"][0]["name"] = json!("");
+    broken["channels"][4]["elements"][1]["unit"] = json!(3);
+    broken["instructions"][1]["text"] = json!(" ");
+    broken["context"]["steps"] = json!(22);
+    broken["network"]["layers"] = json!(0);
+    let found = fields(&broken);
+    let expected = [
+        "channels[4].elements[1].unit",
+        "environment",
+        "control_period_s",
+        "channels[0].elements[2]",
+        "context.steps",
+    ];
+    assert_eq!(found, expected);
+    // With sound channels the rest can be judged.
+    broken["channels"] = contract()["channels"].clone();
+    let expected = [
+        "environment",
+        "control_period_s",
+        "network.layers",
+        "context.steps",
+        "instructions[1].text",
+    ];
+    assert_eq!(fields(&broken), expected);
+}
+
+#[test]
+fn a_report_of_very_many_faults_says_how_many() {
+    let mut broken = contract();
+    let element = json!({"name": 1, "unit": 2});
+    broken["channels"][0]["elements"] = Value::Array(vec![element; 2000]);
+    let faults = faults(&broken);
+    assert!((1000..1010).contains(&faults.len()), "{}", faults.len());
+    let error = BundleError::Contract { faults };
+    let text = error.to_string();
+    assert!(text.len() < 3000 && !text.contains('\n'), "{text}");
+    assert!(text.contains("more, which `lads inspect` lists"), "{text}");
+}
+
+/// Replaces every such text by another of the same length.
+fn edit(bytes: &mut [u8], from: &str, to: &str) {
+    assert_eq!(from.len(), to.len());
+    let places: Vec<usize> = (0..=bytes.len() - from.len())
+        .filter(|&i| bytes[i..].starts_with(from.as_bytes()))
+        .collect();
+    assert!(!places.is_empty(), "{from} is not there");
+    for at in places {
+        bytes[at..at + to.len()].copy_from_slice(to.as_bytes());
+    }
+}
+
+#[test]
+fn contract_graphs_and_episode_are_told_together() {
+    let mut bytes = TINY.to_vec();
+    assert!(survey(&bytes).unwrap().missing.is_empty());
+    edit(&mut bytes, "low_level/act/plan", "low_level/act/palm");
+    edit(&mut bytes, "low_level/act/action", "low_level/act/acting");
+    edit(&mut bytes, "codebook/lookup/plan", "codebook/lookup/plot");
+    edit(&mut bytes, r#""control_period_s""#, r#""control_Period_s""#);
+    edit(&mut bytes, r#""provenance""#, r#""Provenance""#);
+    let missing = survey(&bytes).unwrap().missing;
+    assert_eq!(missing.operators, []);
+    let told: Vec<String> = (missing.contract.iter())
+        .map(|field| format!("{}: {}", field.field, field.needed))
+        .collect();
+    for part in [
+        "low_level/act/palm is bound to nothing",
+        "low_level/act/action is missing",
+        "codebook/lookup/plan is missing",
+        "control_period_s: is missing",
+        "provenance: is missing",
+    ] {
+        assert!(
+            told.iter().any(|line| line.contains(part)),
+            "{part}: {told:#?}"
+        );
+    }
+    assert_eq!(told.len(), 5, "{told:#?}");
+}
