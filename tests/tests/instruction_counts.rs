@@ -2,7 +2,8 @@
 //! observations at the same place in the schedule. Skipped where `valgrind` is missing.
 //!
 //! The kitchen's policy: an ordinary step and one that decides or draws its plan, with 32-bit weights and with integers. Random policies
-//! of every family, where the parity tests have made them: every step from the start of a context to the second selection and beyond.
+//! of every family, where the parity tests have made them: every step from the start of a context to the second selection and beyond, and
+//! over the restart of a context that is full.
 //!
 //! The tests run their own binary once more under `callgrind`, which counts what [`one_control_step`] executes and writes one file
 //! for each call. Valgrind knows no AVX-512, so what is counted are the AVX2 kernels, or on older processors the portable ones.
@@ -48,9 +49,15 @@ const CASES: [(Option<WeightFormat>, Decision, usize); 7] = [
 /// Number of observations whose steps are counted.
 const OBSERVATIONS: usize = 100;
 
-/// Number of episodes of a random policy, and of steps of each; no random policy selects more seldom than in every tenth step.
+/// Number of episodes of a random policy.
 const EPISODES: usize = 4;
-const STEPS: usize = 22;
+
+/// Returns the number of steps of an episode: two selections, as no random policy selects more seldom than in every tenth step, and all
+/// of a context with the first steps of the next.
+fn episode_len(policy: &Policy<'_>) -> usize {
+    let context = policy.contract().context_steps();
+    context.map_or(0, |steps| steps + 2).max(22)
+}
 
 /// Function whose instructions are counted, with a name that the tool can be told.
 #[inline(never)]
@@ -173,11 +180,12 @@ fn episodes(policy: &Policy<'_>) {
     let (mut random, mut observed) = (Random(1), Observed::new(policy));
     for _ in 0..EPISODES {
         controller.reset();
-        for step in 0..STEPS {
+        for step in 0..episode_len(policy) {
             observed.draw(&mut random);
             let report = one_control_step(&mut controller, &observed.inputs(), &mut action);
-            let context = policy.contract().context_steps().unwrap_or(STEPS);
-            assert_eq!(report.timestep as usize, step % context);
+            let context = policy.contract().context_steps();
+            let timestep = context.map_or(step, |steps| step % steps);
+            assert_eq!(report.timestep as usize, timestep);
         }
     }
 }
@@ -223,13 +231,14 @@ fn every_place_in_the_schedule_of_every_family_takes_one_number_of_instructions(
             println!("skipped: valgrind is not installed");
             return;
         };
-        assert_eq!(counts.len(), EPISODES * STEPS, "{kind}");
-        for step in 0..STEPS {
-            let here = counts.iter().skip(step).step_by(STEPS);
+        let steps = episode_len(&Policy::new_checked(image.as_bytes()).unwrap());
+        assert_eq!(counts.len(), EPISODES * steps, "{kind}");
+        for step in 0..steps {
+            let here = counts.iter().skip(step).step_by(steps);
             let different: BTreeSet<u64> = here.copied().collect();
             assert_eq!(different.len(), 1, "{kind}, step {step}: {different:?}");
         }
-        println!("instructions of {kind}'s steps: {:?}", &counts[..STEPS]);
+        println!("instructions of {kind}'s steps: {:?}", &counts[..steps]);
     }
 }
 

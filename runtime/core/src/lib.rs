@@ -62,7 +62,8 @@ pub use guard::{
     Intervention, Limits, SwapError, Tick,
 };
 pub use inputs::{Data, MAX_OBSERVATIONS};
-pub use lads_image::ExecError;
+pub use lads_image::tables::TablesError;
+pub use lads_image::{ExecError, ProgramError};
 pub use lads_kernels::Isa;
 pub use lookup::instructions_called;
 pub use policy::{Policy, PolicyError};
