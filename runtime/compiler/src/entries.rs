@@ -108,8 +108,8 @@ fn unknown(
             .iter()
             .any(|tensor| tensor.name == declared.name);
         let entry = entry_of(&declared.name).unwrap_or("");
-        let found = known.iter().any(|signature| signature.entry == entry)
-            || entry == ENCODE_TRAJECTORY;
+        let found =
+            known.iter().any(|signature| signature.entry == entry) || entry == ENCODE_TRAJECTORY;
         if !initialized && !found {
             problems.push(format!(
                 "value {} belongs to no entry of a policy of kind `{}`",

@@ -626,6 +626,10 @@ typedef struct lads_element {
      * say.
      */
     struct lads_text interface;
+    /**
+     * Unit of the physical value; empty where the bundle does not say.
+     */
+    struct lads_text physical_unit;
 } lads_element;
 
 /**

@@ -163,6 +163,7 @@ fn element_json(element: Element<'_>) -> Value {
         "interface": element.interface,
         "scale": decimal(element.scale),
         "offset": decimal(element.offset),
+        "physical_unit": element.physical_unit,
         "min": decimal(element.limits.min),
         "max": decimal(element.limits.max),
     })

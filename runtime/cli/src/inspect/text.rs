@@ -284,6 +284,9 @@ fn write_channel(channel: &Channel<'_>, f: &mut Formatter<'_>) -> fmt::Result {
         if (element.scale, element.offset) != (1.0, 0.0) {
             write!(f, " = {} + {} * value", element.offset, element.scale)?;
         }
+        if !element.physical_unit.is_empty() {
+            write!(f, " in {}", element.physical_unit)?;
+        }
         writeln!(f)?;
     }
     Ok(())

@@ -373,6 +373,8 @@ pub struct LadsElement {
     /// Quantity of the joint: "position", "velocity", "effort"; empty where the bundle does not
     /// say.
     pub interface: LadsText,
+    /// Unit of the physical value; empty where the bundle does not say.
+    pub physical_unit: LadsText,
 }
 
 impl Default for LadsElement {
@@ -387,6 +389,7 @@ impl Default for LadsElement {
             unit: LadsText::new("1"),
             joint: LadsText::default(),
             interface: LadsText::default(),
+            physical_unit: LadsText::default(),
         }
     }
 }
@@ -403,6 +406,7 @@ impl LadsElement {
             unit: LadsText::new(element.unit),
             joint: LadsText::new(element.joint),
             interface: LadsText::new(element.interface),
+            physical_unit: LadsText::new(element.physical_unit),
         }
     }
 

@@ -120,8 +120,21 @@ fn the_contract_is_the_policys() {
             for (i, element) in expected.elements().enumerate() {
                 let got = written(|to| lads_channel_element(policy, number, i, to));
                 let got = got.expect("it is there");
-                let texts = [got.name, got.unit, got.joint, got.interface].map(|t| t.as_str());
-                let theirs = [element.name, element.unit, element.joint, element.interface];
+                let texts = [
+                    got.name,
+                    got.unit,
+                    got.joint,
+                    got.interface,
+                    got.physical_unit,
+                ];
+                let texts = texts.map(|t| t.as_str());
+                let theirs = [
+                    element.name,
+                    element.unit,
+                    element.joint,
+                    element.interface,
+                    element.physical_unit,
+                ];
                 assert_eq!(texts, theirs);
                 assert_eq!([got.min, got.max], [element.limits.min, element.limits.max]);
                 assert_eq!([got.scale, got.offset], [element.scale, element.offset]);

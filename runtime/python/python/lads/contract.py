@@ -25,6 +25,8 @@ class Element:
     """Quantity of the joint: position, velocity, effort; empty where the bundle does not say."""
     scale: float
     offset: float
+    physical_unit: str
+    """Unit of the physical value; empty where the bundle does not say."""
 
 
 @dataclass(frozen=True)
