@@ -180,6 +180,7 @@ macro_rules! ops {
             }
 
             /// Reads an op; `None` for words that [`encode`](Self::encode) does not write.
+            #[inline(never)]
             pub fn decode(words: &[u32; OP_WORDS]) -> Option<Self> {
                 let mut from = Reader::new(words);
                 let op = Self::take(&mut from)?;

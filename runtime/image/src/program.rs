@@ -130,9 +130,7 @@ impl<'a> Program<'a> {
     #[inline]
     pub fn ops(&self) -> impl Iterator<Item = Op> + 'a {
         // Decoded once already, with the zeros after each op.
-        self.ops
-            .iter()
-            .filter_map(|words| Op::take(&mut Reader::new(words)))
+        self.ops.iter().filter_map(Op::decode)
     }
 
     /// Returns the cost of a run at the largest context.

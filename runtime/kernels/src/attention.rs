@@ -117,25 +117,7 @@ impl Attention<'_> {
                 blocks,
                 p,
             });
-            let heads = self.heads;
-            let scaled = |scales: Option<&[f32]>, p: &mut [Block]| {
-                if let Some(scales) = scales {
-                    isa.run(Scaled {
-                        heads,
-                        scales,
-                        blocks,
-                        p,
-                    });
-                }
-            };
-            scaled(scales.map(|[of_keys, _]| of_keys), p);
-            isa.run(Probabilities {
-                heads,
-                visible,
-                blocks,
-                p,
-            });
-            scaled(scales.map(|[_, of_values]| of_values), p);
+            self.weights(isa, scales, visible, blocks, p);
             let sums = Sums::<C> {
                 op: self,
                 values: values.get(..rows * width).unwrap_or(&[]),
@@ -152,6 +134,41 @@ impl Attention<'_> {
             }
             visible += queries;
         }
+    }
+}
+
+impl Attention<'_> {
+    /// Makes scores into the weights of the values. Out of line, so that caches of all formats share
+    /// one compiled body.
+    #[inline(never)]
+    fn weights(
+        &self,
+        isa: Isa,
+        scales: Option<[&[f32]; 2]>,
+        visible: usize,
+        blocks: usize,
+        p: &mut [Block],
+    ) {
+        let heads = self.heads;
+        let [of_keys, of_values] = scales.unwrap_or_default();
+        isa.run(Scaled {
+            heads,
+            scales: of_keys,
+            blocks,
+            p,
+        });
+        isa.run(Probabilities {
+            heads,
+            visible,
+            blocks,
+            p,
+        });
+        isa.run(Scaled {
+            heads,
+            scales: of_values,
+            blocks,
+            p,
+        });
     }
 }
 
@@ -229,8 +246,8 @@ impl Kernel for Probabilities<'_> {
     }
 }
 
-/// Multiplies scores or probabilities by the scales of the rows that they are of; what lies beyond
-/// the visible rows becomes anything, and is not read.
+/// Multiplies scores or probabilities by the scales of the rows that they are of, if there are any; what
+/// lies beyond the visible rows becomes anything, and is not read.
 struct Scaled<'a> {
     heads: usize,
     /// Scales, `[heads][capacity / 16][16]`.

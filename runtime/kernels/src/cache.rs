@@ -315,6 +315,9 @@ struct Quantised<'a, 'c> {
 }
 
 impl Kernel for Quantised<'_, '_> {
+    // A row or two in a step.
+    const BRIEF: bool = true;
+
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Append {
@@ -391,6 +394,9 @@ struct Rounded<'a> {
 }
 
 impl Kernel for Rounded<'_> {
+    // A row or two in a step.
+    const BRIEF: bool = true;
+
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         self.append.round(simd, self.keys, self.values);

@@ -104,13 +104,16 @@ impl Isa {
 
     /// Runs a kernel with this instruction set.
     #[inline(always)]
-    pub(crate) fn run(self, kernel: impl Kernel) {
+    pub(crate) fn run<K: Kernel>(self, kernel: K) {
         match self.0 {
             Level::Portable => kernel.run(Portable),
             #[cfg(target_arch = "x86_64")]
             // SAFETY: `Isa`'s constructors make this level only where `x86_64::widest` found AVX2 and F16C in CPU
             // and operating system.
             Level::Avx2 => unsafe { x86_64::avx2(kernel) },
+            #[cfg(target_arch = "x86_64")]
+            // SAFETY: as below; AVX2 and F16C are a part of that level.
+            Level::Avx512 if K::BRIEF => unsafe { x86_64::avx2(kernel) },
             #[cfg(target_arch = "x86_64")]
             // SAFETY: `Isa`'s constructors make this level only where `x86_64::widest` found AVX2, F16C and all five
             // parts of AVX-512 in CPU and operating system.
@@ -139,6 +142,14 @@ pub(crate) trait Kernel {
         allow(dead_code, reason = "only AVX-512 asks")
     )]
     const NARROW: bool = false;
+
+    /// True if AVX-512 runs the body that AVX2 has, because the kernel takes too little of a step to
+    /// pay for code of its own.
+    #[cfg_attr(
+        not(target_arch = "x86_64"),
+        allow(dead_code, reason = "only AVX-512 asks")
+    )]
+    const BRIEF: bool = false;
 
     /// Runs the kernel with the vectors of `simd`. Every implementation, and every function that it
     /// calls, is `#[inline(always)]`, so that each instruction set gets a body of its own.
