@@ -327,6 +327,35 @@ fn a_log_ends_before_what_is_refused_and_is_refused_itself_where_it_cannot_be() 
 
 #[cfg(unix)]
 #[test]
+fn a_log_that_may_not_grow_ends_alone() {
+    const STEPS: usize = 400;
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("flight.mcap");
+    let model = tiny().to_str().unwrap().to_owned();
+    // Blocks of 512 bytes.
+    let mut child = Command::new("sh")
+        .args(["-c", "ulimit -f 8; exec \"$@\"", "sh"])
+        .arg(env!("CARGO_BIN_EXE_lads"))
+        .args(act(&model, &["--log", path.to_str().unwrap()]))
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut stdin = child.stdin.take().unwrap();
+    let asks = std::thread::spawn(move || stdin.write_all("0,0,0,0,0\n".repeat(STEPS).as_bytes()));
+    let output = child.wait_with_output().unwrap();
+    asks.join().unwrap().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{said}");
+    assert!(said.contains("goes on without it"), "{said}");
+    let answers = String::from_utf8_lossy(&output.stdout);
+    assert_eq!(answers.lines().count(), STEPS);
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+}
+
+#[cfg(unix)]
+#[test]
 fn a_log_is_neither_what_is_read_nor_what_is_answered() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("file");

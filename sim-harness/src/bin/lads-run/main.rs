@@ -28,7 +28,7 @@ mod viewer;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
 use arguments::{Arguments, Job, MOVED};
 use end::{End, refused};
@@ -36,6 +36,8 @@ use indicatif::ProgressBar;
 use lads_sim::evaluate::EvaluationError;
 use lads_sim::{command, output};
 use rollouts::Extra;
+use signal_hook::consts::SIGINT;
+use signal_hook::flag;
 
 /// Exit code after an interrupt, as shells have it: 128 and the signal's number.
 const INTERRUPTED: u8 = 130;
@@ -104,17 +106,18 @@ fn run(arguments: &Arguments) -> Result<ExitCode, End> {
 /// Returns a flag that an interrupt raises; a second interrupt ends the program at once.
 fn stop_on_interrupt() -> Result<Arc<AtomicBool>, End> {
     let stop = Arc::new(AtomicBool::new(false));
-    let raised = Arc::clone(&stop);
-    let handler = move || {
-        if raised.swap(true, Ordering::Relaxed) {
-            std::process::exit(i32::from(INTERRUPTED));
-        }
-    };
-    ctrlc::set_handler(handler).map_err(|error| {
+    let refuse = |error| {
         refused(format!(
             "interrupts cannot be handled ({error}); run it in another shell"
         ))
-    })?;
+    };
+    // In the order of the calls: at the first interrupt the flag is not raised yet.
+    let code = i32::from(INTERRUPTED);
+    flag::register_conditional_shutdown(SIGINT, code, Arc::clone(&stop)).map_err(refuse)?;
+    flag::register(SIGINT, Arc::clone(&stop)).map_err(refuse)?;
+    // With a handler, a file that may not grow (`ulimit -f`) is an error of the write, and not the end of the run.
+    #[cfg(unix)]
+    flag::register(signal_hook::consts::SIGXFSZ, Arc::default()).map_err(refuse)?;
     Ok(stop)
 }
 
