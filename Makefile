@@ -306,7 +306,7 @@ $(VENV)/bench-stamp: $(VENV)/stamp
 install:
 	runtime/ffi/install.sh "$(PREFIX)"
 
-## bench: everything measured, beside what one would use instead, into benches/RESULTS.md; on a quiet machine, ten minutes after the build
+## bench: everything measured, beside what one would use instead, into benches/RESULTS.md; on a quiet machine, twelve minutes after the build
 bench: setup $(VENV)/bench-stamp
 	$(PYTHON) benches/setup.py
 	# What an earlier run has left is not of this one.

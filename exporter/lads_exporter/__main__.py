@@ -179,6 +179,8 @@ def _reference(arguments):
 def _upgrade(arguments):
     from . import upgrade
 
+    if arguments.output:
+        output.check_apart([arguments.environment], [arguments.output])
     print(upgrade.write(arguments.model, arguments.output, arguments.environment))
 
 

@@ -54,6 +54,8 @@ struct Arguments {
 enum Command {
     /// Prints channels, schedule, programs, states and memory of a policy; of another ONNX file,
     /// everything that it lacks to be a policy
+    ///
+    /// Exit code 0 means that the file could be told about, sound or not; of a sound policy, `missing` in the JSON is empty.
     Inspect {
         /// Bundle (.onnx), compiled image (.lads), or any ONNX file
         model: PathBuf,
@@ -192,7 +194,7 @@ fn inspect(path: &Path, json: bool, observations: bool) -> Result<(), Refusal> {
     let model = match Model::open(path) {
         Ok(model) => model,
         Err(refusal) => {
-            let foreign = Foreign::look(path).filter(|_| !observations);
+            let foreign = Foreign::look(path, &refusal).filter(|_| !observations);
             return match foreign.ok_or(refusal)? {
                 foreign if json => print(&format!("{:#}\n", foreign.json())),
                 foreign => print(&foreign.to_string()),

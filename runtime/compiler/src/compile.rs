@@ -161,6 +161,13 @@ pub fn compile_with(bundle: &Bundle, options: &Options) -> Result<Image, Compile
     let draft = image::write(bundle, &parts, report(0))?;
     parts.work = match Policy::new_within(draft.as_bytes(), u64::MAX) {
         Err(PolicyError::Schedule(ScheduleError::Work { counted, .. })) => counted,
+        // Numbers of draws follow from the schedule, so the image is the first to know them.
+        Err(PolicyError::Golden) => {
+            let problem = "its `noise` has another number of draws in a step than the policy";
+            return Err(CompileError::Bundle(BundleError::Golden {
+                problems: vec![problem.into()],
+            }));
+        }
         Err(error) => return Err(CompileError::Image(error)),
         Ok(_) => 0,
     };

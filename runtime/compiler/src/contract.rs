@@ -17,6 +17,7 @@ use serde::Deserialize;
 use crate::error::BundleError;
 use crate::family::Family;
 
+pub(crate) use check::{all_sound, roles_are_known};
 pub(crate) use faults::Faults;
 pub(crate) use form::REQUIRED;
 
@@ -212,12 +213,16 @@ impl Contract {
                 return Ok((None, faults));
             }
         };
+        if !value.is_object() {
+            faults.add("lads.contract", "is no JSON object");
+            return Ok((None, faults));
+        }
         match value
             .get("version")
-            .map(|version| (version, version.as_u64()))
+            .map(|version| (version, version.as_f64()))
         {
-            Some((_, Some(1))) => return Err(BundleError::ContractV1),
-            Some((version, found)) if found != Some(u64::from(CONTRACT_VERSION)) => {
+            Some((_, Some(1.0))) => return Err(BundleError::ContractV1),
+            Some((version, found)) if found != Some(f64::from(CONTRACT_VERSION)) => {
                 return Err(BundleError::ContractVersion {
                     found: version.to_string().into(),
                     supported: CONTRACT_VERSION,
@@ -236,6 +241,7 @@ impl Contract {
                 repaired
             }
         };
+        faults.form_is_read();
         if let Some(contract) = &contract {
             check::check(contract, &mut faults);
         }
@@ -267,7 +273,10 @@ impl Contract {
     /// for a policy that takes none.
     pub fn words(&self) -> Option<[usize; 2]> {
         let channel = self.with(Role::Instruction).next()?;
-        Some([channel.shape[0], channel.shape[1]])
+        match channel.shape[..] {
+            [words, dim] => Some([words, dim]),
+            _ => None,
+        }
     }
 
     /// Returns the number of control steps from one selection to the next; `None` for a policy that

@@ -7,7 +7,7 @@
 
 use std::collections::{HashMap, HashSet};
 
-use crate::contract::{Contract, DType};
+use crate::contract::{Contract, DType, Faults, all_sound, roles_are_known};
 use crate::error::{BundleError, Line};
 use crate::family::{Blueprint, Bound, Entry, Keep};
 use crate::graph::{Dim, Type, show};
@@ -58,6 +58,17 @@ pub(crate) fn signatures(
     contract: &Contract,
     blueprint: &Blueprint,
 ) -> Result<Vec<Signature>, BundleError> {
+    compared(graph, contract, blueprint, &Faults::default())
+}
+
+/// Returns the signatures of all graphs of a contract that has faults: what they touch is not
+/// compared.
+pub(crate) fn compared(
+    graph: &GraphProto,
+    contract: &Contract,
+    blueprint: &Blueprint,
+    faults: &Faults,
+) -> Result<Vec<Signature>, BundleError> {
     let mut problems: Vec<String> = vec![];
     if !graph.sparse_initializer.is_empty() {
         problems.push("the graph has sparse initializers".into());
@@ -65,11 +76,15 @@ pub(crate) fn signatures(
     let mut checker = Checker {
         contract,
         blueprint,
+        faults,
         widths: HashMap::new(),
     };
     let mut all: Vec<Signature> = vec![];
+    let known = (0..contract.channels.len()).all(|i| checker.shape_is_free(i));
     if let Some(words) = contract.words() {
-        all.push(lookup(graph, words, &mut problems));
+        let mut found = vec![];
+        all.push(lookup(graph, words, &mut found));
+        problems.extend(found.into_iter().filter(|_| known));
     }
     for entry in &blueprint.entries {
         if let Some(signature) = checker.entry(graph, entry, &mut problems)
@@ -124,12 +139,29 @@ fn unknown(
 struct Checker<'c> {
     contract: &'c Contract,
     blueprint: &'c Blueprint,
+    faults: &'c Faults,
     /// Number of elements of the states whose width no field states, by the first value that was
     /// bound to each.
     widths: HashMap<usize, (usize, String)>,
 }
 
 impl Checker<'_> {
+    /// Returns whether a channel's shape, and for what it is there, are the contract's own.
+    fn shape_is_free(&self, channel: usize) -> bool {
+        let fields = ["name", "role", "dtype", "shape"];
+        let fields = fields.map(|field| format!("channels[{channel}].{field}"));
+        self.faults.free(&fields.each_ref().map(String::as_str))
+    }
+
+    /// Returns whether every name that a value may be bound by is the contract's own.
+    fn names_are_free(&self) -> bool {
+        let channels = self.contract.channels.len();
+        let states = self.contract.states.len();
+        all_sound("channels", channels, "name", self.faults)
+            && all_sound("states", states, "name", self.faults)
+            && roles_are_known(self.contract, self.faults)
+    }
+
     /// Returns the signature of an entry's graph; `None` for an entry without one.
     fn entry(
         &mut self,
@@ -140,6 +172,7 @@ impl Checker<'_> {
         let name = entry.graph()?;
         let prefix = format!("{name}/");
         let before = problems.len();
+        let named = self.names_are_free();
         let mut values = |declared: &[ValueInfoProto], input: bool| -> Vec<Value> {
             let own = declared
                 .iter()
@@ -147,6 +180,11 @@ impl Checker<'_> {
                 // An output that this project does not use may be anything.
                 .filter(|value| input || is_used(entry, &value.name[prefix.len()..]));
             own.filter_map(|value| {
+                let own = &value.name[prefix.len()..];
+                let bound = self.blueprint.bind(self.contract, &entry.name, own, input);
+                if bound.is_none() && !named {
+                    return None;
+                }
                 let read = self.value(name, &entry.name, value, input);
                 read.map_err(|problem| problems.push(problem)).ok()
             })
@@ -170,7 +208,7 @@ impl Checker<'_> {
             }
         }
         // What is bound to the cache is known only of values that can be read.
-        if problems.len() == before {
+        if problems.len() == before && named && self.faults.free(&["network", "family"]) {
             let checked = self.cache(entry.cache.as_deref(), name, &inputs, &outputs);
             problems.extend(checked.err());
         }
@@ -213,7 +251,7 @@ impl Checker<'_> {
                 let found = squeezed(&mut shape.iter().map(|dim| dim.fixed));
                 let wanted = squeezed(&mut channel.shape.iter().copied());
                 let fields = format!("channel `{}`", channel.name);
-                if len.is_none() || found != wanted {
+                if self.shape_is_free(index) && (len.is_none() || found != wanted) {
                     let wanted = format!("{:?}", channel.shape);
                     return Err(differs(&declared.name, &shape, &wanted, &fields));
                 }
@@ -221,6 +259,7 @@ impl Checker<'_> {
                 ty = match (channel.dtype, ty) {
                     (DType::I32, Type::I64) if channel.len() == 1 && input => Type::I64,
                     (DType::I32 | DType::U8, _) | (DType::F32, Type::F32) => Type::F32,
+                    (DType::F32, Type::I64) if !self.shape_is_free(index) => ty,
                     (DType::F32, Type::I64) => {
                         return Err(format!(
                             "{} has elements of I64, by the contract's {fields} they are F32",
@@ -237,7 +276,7 @@ impl Checker<'_> {
                     _ => 1,
                 };
                 let len = len.filter(|len| len.is_multiple_of(rows) && ty == Type::F32);
-                let width = len.map(|len| len / rows).ok_or_else(|| {
+                let width = len.and_then(|len| len.checked_div(rows)).ok_or_else(|| {
                     format!(
                         "{} is {ty:?} {}, state `{}` has {rows} rows of F32",
                         declared.name,
@@ -252,7 +291,7 @@ impl Checker<'_> {
                         .clone()
                 });
                 let fields = format!("`{}`", known.1);
-                if known.0 != width {
+                if known.0 != width && self.faults.free(&[&known.1]) {
                     let wanted = format!("[{rows}, {}]", known.0);
                     return Err(differs(&declared.name, &shape, &wanted, &fields));
                 }

@@ -20,7 +20,7 @@ pub mod vae;
 use lads_image::records::{NoiseRule, SelectionRule};
 use serde::Deserialize;
 
-use crate::contract::{Contract, Faults, MAX_LEN, Network, Role};
+use crate::contract::{Contract, Faults, MAX_LEN, Network, Role, roles_are_known};
 
 pub use blueprint::RESERVED;
 pub(crate) use blueprint::{Blueprint, Bound, Call, Entry, Keep, Origin, Times};
@@ -152,11 +152,9 @@ fn one() -> f32 {
 impl Decision {
     fn check(self, faults: &mut Faults) {
         let temperature = self.temperature;
-        if !(temperature.is_finite() && temperature > 0.0) {
-            faults.add(
-                "family.decision.temperature",
-                format!("is {temperature}, it must be positive"),
-            );
+        let field = "family.decision.temperature";
+        if faults.sound(&[field]) && !(temperature.is_finite() && temperature > 0.0) {
+            faults.add(field, format!("is {temperature}, it must be positive"));
         }
     }
 
@@ -254,7 +252,7 @@ fn lengths<const N: usize>(fields: [(&str, usize); N], faults: &mut Faults) {
 }
 
 fn length(field: &str, len: usize, faults: &mut Faults) {
-    if !(1..=MAX_LEN).contains(&len) {
+    if faults.sound(&[field]) && !(1..=MAX_LEN).contains(&len) {
         faults.add(field, format!("is {len}, it must be 1 to {MAX_LEN}"));
     }
 }
@@ -262,6 +260,9 @@ fn length(field: &str, len: usize, faults: &mut Faults) {
 /// Checks the sizes of a transformer that the family requires.
 fn network(network: Option<Network>, field: &str, faults: &mut Faults) {
     let Some(sizes) = network else {
+        if !faults.sound(&[field]) {
+            return;
+        }
         return faults.add(
             field,
             "is missing: `layers`, `heads` and `head_dim` of the transformer",
@@ -279,14 +280,15 @@ fn network(network: Option<Network>, field: &str, faults: &mut Faults) {
 /// Checks the fields that every family with a transformer over words needs: an instruction channel,
 /// a context and the transformer's sizes.
 fn instructed(contract: &Contract, faults: &mut Faults) {
-    if contract.words().is_none() {
+    let known = roles_are_known(contract, faults);
+    if known && contract.with(Role::Instruction).next().is_none() {
         let family = contract.family.name();
         faults.add(
             "channels",
             format!("has no instruction, which family {family} takes"),
         );
     }
-    if contract.context.is_none() {
+    if contract.context.is_none() && faults.sound(&["context"]) {
         faults.add(
             "context",
             "is missing: `words`, `steps`, and what is done beyond",
@@ -298,7 +300,7 @@ fn instructed(contract: &Contract, faults: &mut Faults) {
 /// Checks that there is exactly one noise channel.
 fn one_noise(contract: &Contract, faults: &mut Faults) {
     let count = contract.with(Role::Noise).count();
-    if count != 1 {
+    if count != 1 && roles_are_known(contract, faults) {
         faults.add(
             "channels",
             format!("has {count} noise channels, it must have one"),

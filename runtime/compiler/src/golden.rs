@@ -7,7 +7,7 @@
 use base64::Engine as _;
 use safetensors::{Dtype, SafeTensors};
 
-use crate::contract::{Channel, Contract, DType};
+use crate::contract::{Channel, Contract, DType, Faults, Role, roles_are_known};
 use crate::error::{BundleError, Line};
 
 /// One recorded episode.
@@ -43,7 +43,16 @@ pub enum Recorded {
 impl Golden {
     /// Decodes the episode from the metadata's value.
     pub fn parse(base64: &str, contract: &Contract) -> Result<Self, BundleError> {
-        Self::read(base64, contract).map_err(|problems| BundleError::Golden {
+        Self::read(base64, contract, &Faults::default())
+    }
+
+    /// Decodes the episode of a contract that has faults: what they touch is not compared.
+    pub(crate) fn read(
+        base64: &str,
+        contract: &Contract,
+        faults: &Faults,
+    ) -> Result<Self, BundleError> {
+        Self::compared(base64, contract, faults).map_err(|problems| BundleError::Golden {
             problems: problems.into_iter().map(Line::from).collect(),
         })
     }
@@ -58,7 +67,7 @@ impl Golden {
         self.noise.len() / self.steps.max(1)
     }
 
-    fn read(base64: &str, contract: &Contract) -> Result<Self, Vec<String>> {
+    fn compared(base64: &str, contract: &Contract, faults: &Faults) -> Result<Self, Vec<String>> {
         let blob = base64::engine::general_purpose::STANDARD
             .decode(base64.trim())
             .map_err(|error| vec![format!("is not base64: {error}")])?;
@@ -71,7 +80,8 @@ impl Golden {
         let mut problems = vec![];
         let tolerance = tolerance.map_err(|problem| problems.push(problem)).ok();
         let steps = steps.map_err(|problem| problems.push(problem)).ok();
-        let instruction = (contract.words())
+        let known = roles_are_known(contract, faults) && faults.counted("instructions");
+        let instruction = (contract.words().filter(|_| known))
             .map(|_| instruction(&tensors, contract))
             .transpose()
             .map_err(|problem| problems.push(problem))
@@ -80,9 +90,18 @@ impl Golden {
         let Some(steps) = steps else {
             return Err(problems);
         };
+        let own = |channel: &Channel| contract.channels.iter().position(|other| other == channel);
+        let free = |channel: &Channel| {
+            let at = format!("channels[{}]", own(channel).unwrap_or(0));
+            let fields = ["name", "role", "dtype", "shape"].map(|field| format!("{at}.{field}"));
+            faults.free(&fields.each_ref().map(String::as_str))
+        };
         let mut observations = vec![];
-        for channel in contract.observations() {
-            match recorded(&tensors, channel, steps) {
+        for channel in contract.observations().filter(|channel| free(channel)) {
+            let at = format!("channels[{}]", own(channel).unwrap_or(0));
+            let limits = ["elements", "min", "max"].map(|field| format!("{at}.{field}"));
+            let limited = faults.free(&limits.each_ref().map(String::as_str));
+            match recorded(&tensors, channel, steps, limited) {
                 Ok(values) => observations.push(values),
                 Err(problem) => problems.push(problem),
             }
@@ -93,10 +112,20 @@ impl Golden {
                 vec![]
             })
         };
-        let noise = or_report(noise(&tensors, steps));
+        let drawn = contract.with(Role::Noise).next().filter(|_| known);
+        let noise = or_report(noise(&tensors, steps, drawn.filter(|drawn| free(drawn))));
         let action = [&[steps][..], &contract.action().shape].concat();
-        let actions = or_report(floats(&tensors, "actions", &action));
-        let selected = selected(&tensors, steps).unwrap_or_else(|problem| {
+        let actions = if free(contract.action()) {
+            or_report(floats(&tensors, "actions", &action))
+        } else {
+            vec![]
+        };
+        let selected = if faults.free(&["family"]) {
+            selected(&tensors, steps, choices(contract))
+        } else {
+            Ok(vec![])
+        };
+        let selected = selected.unwrap_or_else(|problem| {
             problems.push(problem);
             vec![]
         });
@@ -136,25 +165,63 @@ fn steps(tensors: &SafeTensors) -> Result<usize, String> {
         .ok_or_else(|| "it has no steps".into())
 }
 
-fn selected(tensors: &SafeTensors, steps: usize) -> Result<Vec<u32>, String> {
-    if tensors.tensor("selected").is_err() {
+/// Returns the number of indices that the policy selects from; `None` for one that selects none.
+fn choices(contract: &Contract) -> Option<usize> {
+    let blueprint = contract.family.kind().blueprint(contract);
+    let scores = blueprint
+        .calls
+        .iter()
+        .find_map(|call| call.select.as_ref())?;
+    let mut states = blueprint.states.iter();
+    let scores = states.find(|state| state.name == *scores)?;
+    scores.width.as_ref().map(|(width, _)| *width)
+}
+
+fn selected(
+    tensors: &SafeTensors,
+    steps: usize,
+    choices: Option<usize>,
+) -> Result<Vec<u32>, String> {
+    let there = tensors.tensor("selected").is_ok();
+    let Some(choices) = choices else {
+        if there {
+            return Err("it has a tensor `selected`, and the policy selects no index".into());
+        }
         return Ok(vec![]);
-    }
+    };
     let selected = integers(tensors, "selected")?;
     if selected.len() != steps {
         let found = selected.len();
         return Err(format!("`selected` has {found} steps, not {steps}"));
     }
-    let selected = selected.iter().map(|&index| u32::try_from(index));
-    let selected: Result<_, _> = selected.collect();
-    selected.map_err(|_| "`selected` has an index below zero".to_owned())
+    let inside = |&index: &i64| {
+        let index = u32::try_from(index).ok();
+        index.filter(|&index| (index as usize) < choices)
+    };
+    if let Some(index) = selected.iter().find(|index| inside(index).is_none()) {
+        return Err(format!(
+            "`selected` has the index {index}, the policy selects from {choices}"
+        ));
+    }
+    Ok(selected.iter().filter_map(inside).collect())
 }
 
-fn noise(tensors: &SafeTensors, steps: usize) -> Result<Vec<f32>, String> {
+fn noise(tensors: &SafeTensors, steps: usize, drawn: Option<&Channel>) -> Result<Vec<f32>, String> {
     let Ok(noise) = tensors.tensor("noise") else {
-        return Ok(vec![]);
+        return match drawn {
+            Some(_) => Err("it has no tensor `noise`, and the policy draws noise".into()),
+            None => Ok(vec![]),
+        };
     };
     let width = noise.shape().get(1).copied().unwrap_or(0);
+    if let Some(drawn) = drawn
+        && (width == 0 || !width.is_multiple_of(drawn.len().max(1)))
+    {
+        return Err(format!(
+            "`noise` has rows of {width}, which are no whole draws of {} elements",
+            drawn.len()
+        ));
+    }
     floats(tensors, "noise", &[steps, width])
 }
 
@@ -173,7 +240,13 @@ fn instruction(tensors: &SafeTensors, contract: &Contract) -> Result<usize, Stri
     })
 }
 
-fn recorded(tensors: &SafeTensors, channel: &Channel, steps: usize) -> Result<Recorded, String> {
+/// Reads the values of a channel, which lie inside the contract's limits if it is `limited`.
+fn recorded(
+    tensors: &SafeTensors,
+    channel: &Channel,
+    steps: usize,
+    limited: bool,
+) -> Result<Recorded, String> {
     let name = format!("channel.{}", channel.name);
     let shape = [&[steps][..], &channel.shape].concat();
     let bytes = |dtype: Dtype| -> Result<Vec<u8>, String> {
@@ -189,7 +262,7 @@ fn recorded(tensors: &SafeTensors, channel: &Channel, steps: usize) -> Result<Re
         }
         Ok(tensor.data().to_vec())
     };
-    Ok(match channel.dtype {
+    let recorded = match channel.dtype {
         DType::F32 => Recorded::F32(floats(tensors, &name, &shape)?),
         DType::U8 => Recorded::U8(bytes(Dtype::U8)?),
         DType::I32 => {
@@ -197,6 +270,32 @@ fn recorded(tensors: &SafeTensors, channel: &Channel, steps: usize) -> Result<Re
             let words = bytes.as_chunks().0.iter();
             Recorded::I32(words.map(|&word| i32::from_le_bytes(word)).collect())
         }
+    };
+    let refused = match &recorded {
+        Recorded::F32(values) => outside(channel, values.iter().copied()),
+        Recorded::I32(values) => outside(channel, values.iter().map(|&value| value as f32)),
+        Recorded::U8(values) => outside(channel, values.iter().map(|&value| f32::from(value))),
+    };
+    match refused.filter(|_| limited) {
+        Some((i, value)) => Err(format!(
+            "`{name}` has {value} at step {}, element {}, outside the contract's limits",
+            i / channel.len().max(1),
+            i % channel.len().max(1)
+        )),
+        None => Ok(recorded),
+    }
+}
+
+/// Finds the first value that a controller would refuse.
+fn outside(channel: &Channel, values: impl Iterator<Item = f32>) -> Option<(usize, f32)> {
+    let all = channel.limits();
+    let limits = |i: usize| {
+        let element = channel.elements.get(i % channel.len().max(1));
+        element.map_or(all, |element| (element.min, element.max))
+    };
+    values.enumerate().find(|&(i, value)| {
+        let (min, max) = limits(i);
+        !(min..=max).contains(&value)
     })
 }
 

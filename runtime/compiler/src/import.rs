@@ -191,8 +191,12 @@ fn node_name(node: &NodeProto) -> &str {
 
 /// Returns the fault of a node of another domain than ONNX' own.
 fn foreign(node: &NodeProto) -> Option<String> {
-    (!node.domain.is_empty() && node.domain != "ai.onnx")
-        .then(|| format!("of domain {} is not supported", node.domain))
+    (!node.domain.is_empty() && node.domain != "ai.onnx").then(|| {
+        format!(
+            "of domain {} is not supported; export the graph with ONNX' own operators",
+            node.domain
+        )
+    })
 }
 
 /// Values of an entry that were built so far.
@@ -208,10 +212,11 @@ impl Builder<'_, '_> {
         if let Some(&id) = self.values.get(name) {
             return Ok(id);
         }
-        let tensor = self
-            .model
-            .initializer(name)?
-            .ok_or_else(|| format!("value {name} is not computed by this entry"))?;
+        let tensor = self.model.initializer(name)?.ok_or_else(|| {
+            format!(
+                "reads {name}, which no node of this entry computes and no weights are stored for"
+            )
+        })?;
         let id = self.graph.add_const(tensor);
         self.values.insert(name.into(), id);
         Ok(id)

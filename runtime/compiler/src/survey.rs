@@ -5,7 +5,7 @@
 //! state: nothing is guessed. What can fail: the bytes are not an ONNX model, or a bundle of
 //! another version.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use bytes::Bytes;
 use prost::Message;
@@ -17,6 +17,7 @@ use crate::golden::Golden;
 use crate::graph::{Dim, Type, show};
 use crate::import::{Declared, Model, Refused, trial};
 use crate::onnx::{self, GraphProto, ModelProto, TensorTypeProto, ValueInfoProto, data_type};
+use crate::storage::Tuned;
 
 /// Content of a file, and what it lacks to become a policy.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -177,6 +178,7 @@ pub fn survey(bytes: &[u8]) -> Result<Survey, BundleError> {
             problem: line(&node.problem),
         }
     }));
+    uncomputed(graph, &mut missing);
     match property(&model, "lads.contract") {
         Some(json) => of_bundle(&model, graph, json, &mut missing)?,
         None => of_stranger(&inputs, graph, &mut missing),
@@ -254,6 +256,26 @@ fn value(value: &ValueInfoProto) -> Value {
     }
 }
 
+/// Lists the outputs that no node computes.
+fn uncomputed(graph: &GraphProto, missing: &mut Missing) {
+    let computed: HashSet<&str> = (graph.node.iter().flat_map(|node| &node.output))
+        .chain(graph.input.iter().map(|value| &value.name))
+        .chain(graph.initializer.iter().map(|tensor| &tensor.name))
+        .map(String::as_str)
+        .collect();
+    for output in &graph.output {
+        if !computed.contains(output.name.as_str()) {
+            missing.field(
+                format!("outputs[{}]", output.name),
+                "a node that computes it: export the graph again",
+            );
+        }
+    }
+    if graph.output.is_empty() {
+        missing.field("outputs", "an action: the graph has no output");
+    }
+}
+
 /// Lists the faults of a bundle's contract. A contract of another version is refused: its remedy is
 /// another program.
 fn of_bundle(
@@ -267,6 +289,12 @@ fn of_bundle(
     if golden.is_none() {
         missing.field("lads.golden", GOLDEN);
     }
+    if let Err(problem) = Tuned::find(|key| property(model, key)) {
+        missing.field(
+            "lads.storage",
+            format!("{problem}; tune the bundle again: `lads-run tune`"),
+        );
+    }
     let list = |missing: &mut Missing, field: &str, found: Result<(), BundleError>| match found {
         Err(BundleError::Golden { problems } | BundleError::Entry { problems }) => {
             for problem in problems {
@@ -277,15 +305,13 @@ fn of_bundle(
         Ok(()) => {}
     };
     if let Some(contract) = contract {
-        if let Some(golden) = golden
-            && faults.spare(&["channels", "instructions"])
-        {
-            let read = Golden::parse(golden, &contract).map(drop);
+        if let Some(golden) = golden {
+            let read = Golden::read(golden, &contract, &faults).map(drop);
             list(missing, "lads.golden", read);
         }
-        if faults.spare(&["channels", "states", "family", "context", "network"]) {
+        if faults.sound(&["family.kind"]) {
             let blueprint = contract.family.kind().blueprint(&contract);
-            let found = entries::signatures(graph, &contract, &blueprint).map(drop);
+            let found = entries::compared(graph, &contract, &blueprint, &faults).map(drop);
             list(missing, "entries", found);
         }
     }

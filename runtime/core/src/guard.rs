@@ -53,8 +53,9 @@ pub struct GuardConfig<'c> {
     pub coast: u32,
     /// Largest step from the last timestamp to the next, in its unit; 0 for any, so that one
     /// damaged timestamp makes all later ones stale until a reset. A timestamp further ahead is
-    /// refused, and does not become the last one. Of the first two of an episode either may be the
-    /// damaged one: the next timestamp is measured from the second.
+    /// refused, and does not become the last one, until the next one follows on it within the bound:
+    /// then the time has really passed. Of the first two of an episode either may be the damaged
+    /// one: the next timestamp is measured from the second.
     pub max_jump: u64,
     /// Number of interventions in a row after which the guard stops; 0 for never.
     pub stop_after: u32,

@@ -695,8 +695,9 @@ typedef struct lads_options {
      * Largest step from the last timestamp to the next, in its unit, such as ten control periods;
      * 0 for any, so that one corrupt timestamp makes all later ones stale until `lads_reset`. A
      * timestamp further ahead is considered corrupt: it is refused, and does not become the last
-     * one. Of the first two of an episode either may be the corrupt one: the next timestamp is
-     * measured from the second.
+     * one, until the next one follows on it within the bound: then the time has really passed. Of
+     * the first two of an episode either may be the corrupt one: the next timestamp is measured
+     * from the second.
      */
     uint64_t max_jump;
     /**

@@ -1,10 +1,12 @@
-//! Report on an ONNX file that is not a policy: its content, and everything that it lacks.
+//! Report on an ONNX file that is not a policy, or a bundle with faults: its content, and everything that it lacks.
 
 use std::fmt::{self, Display, Formatter};
 use std::path::Path;
 
-use lads_compiler::{Missing, Operand, Operator, Survey, Value as Edge};
+use lads_compiler::{Field, Missing, Operand, Operator, Survey, Value as Edge};
 use serde_json::{Value, json};
+
+use crate::refusal::Refusal;
 
 /// Content and gaps of a file that is not a policy.
 pub struct Foreign<'p> {
@@ -13,11 +15,23 @@ pub struct Foreign<'p> {
 }
 
 impl<'p> Foreign<'p> {
-    /// Surveys the file, if it is an ONNX model that is not a complete policy.
-    pub fn look(path: &'p Path) -> Option<Self> {
+    /// Surveys a file that was refused, if it is an ONNX model.
+    pub fn look(path: &'p Path, refusal: &Refusal) -> Option<Self> {
         let bytes = lads_host::input::read(path).ok()?;
-        let survey = lads_compiler::survey(&bytes).ok()?;
-        (!survey.missing.is_empty()).then_some(Self { path, survey })
+        let mut survey = lads_compiler::survey(&bytes).ok()?;
+        if survey.missing.is_empty() {
+            // What only a compilation finds, such as too large a workspace.
+            survey.missing.contract.push(Field {
+                field: "policy".into(),
+                needed: refusal.to_string(),
+            });
+        }
+        Some(Self { path, survey })
+    }
+
+    fn is_bundle(&self) -> bool {
+        let mut keys = self.survey.metadata.iter();
+        keys.any(|key| key == "lads.contract")
     }
 
     /// Formats everything as one JSON object.
@@ -68,9 +82,22 @@ impl Display for Foreign<'_> {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let survey = &self.survey;
         let opset = survey.opset.map(|set| format!(", operator set {set}"));
+        let (what, of_operators, of_contract) = if self.is_bundle() {
+            (
+                "a bundle that is no sound policy",
+                "operators that do not compile",
+                "faults of its contract, graphs and episode",
+            )
+        } else {
+            (
+                "an ONNX model that is not a policy yet",
+                "operators that are missing",
+                "what a contract has to say and nothing here does",
+            )
+        };
         writeln!(
             f,
-            "{}: an ONNX model that is not a policy yet{}, {} nodes",
+            "{}: {what}{}, {} nodes",
             self.path.display(),
             opset.unwrap_or_default(),
             survey.nodes
@@ -84,7 +111,7 @@ impl Display for Foreign<'_> {
             operators,
             contract,
         } = &survey.missing;
-        writeln!(f, "\noperators that are missing ({})", operators.len())?;
+        writeln!(f, "\n{of_operators} ({})", operators.len())?;
         for Operator {
             operator,
             node,
@@ -98,13 +125,12 @@ impl Display for Foreign<'_> {
                 .collect();
             writeln!(f, "  {operator} `{node}` of {}: {problem}", read.join(", "))?;
         }
-        writeln!(
-            f,
-            "\nwhat a contract has to say and nothing here does ({})",
-            contract.len()
-        )?;
+        writeln!(f, "\n{of_contract} ({})", contract.len())?;
         for field in contract {
             writeln!(f, "  {}: {}", field.field, field.needed)?;
+        }
+        if self.is_bundle() {
+            return writeln!(f, "\nMend what made the bundle, and export it again.");
         }
         writeln!(
             f,

@@ -74,7 +74,8 @@ impl Channel {
         reason = "a checked channel has an element at least"
     )]
     pub fn len(&self) -> usize {
-        self.shape.iter().product()
+        let product = |len: usize, &dim| len.saturating_mul(dim);
+        self.shape.iter().fold(1, product)
     }
 
     /// Returns the limits of a channel without elements of its own: those stated, or the whole
@@ -93,25 +94,35 @@ impl Channel {
             len.checked_mul(dim)
                 .filter(|&len| (1..=MAX_CHANNEL_LEN).contains(&len))
         });
-        if !(1..=4).contains(&self.shape.len()) || len.is_none() {
+        let [shape, elements, min_field, max_field, dtype, role] =
+            ["shape", "elements", "min", "max", "dtype", "role"]
+                .map(|field| format!("{at}.{field}"));
+        if faults.sound(&[&shape]) && (!(1..=4).contains(&self.shape.len()) || len.is_none()) {
             faults.add(
-                &format!("{at}.shape"),
+                &shape,
                 format!(
                     "is {:?}, it must have one to four axes and 1 to {MAX_CHANNEL_LEN} elements",
                     self.shape
                 ),
             );
-        } else {
-            self.check_elements(&format!("{at}.elements"), faults);
+        } else if faults.sound(&[&shape, &dtype, &role]) && faults.counted(&elements) {
+            self.count_elements(&elements, faults);
         }
+        for (i, element) in self.elements.iter().enumerate() {
+            element.check(&format!("{elements}[{i}]"), faults);
+        }
+        let names = self.elements.iter().map(|element| element.name.as_str());
+        distinct(&elements, "name", names, faults);
         let (min, max) = self.limits();
-        if !(min.is_finite() && max.is_finite() && min < max) {
+        if faults.sound(&[&min_field, &max_field, &dtype])
+            && !(min.is_finite() && max.is_finite() && min < max)
+        {
             faults.add(at, format!("has limits {min} to {max}, which is no range"));
         }
     }
 
-    /// Checks the elements of a channel whose shape is sound.
-    fn check_elements(&self, at: &str, faults: &mut Faults) {
+    /// Checks the number of elements of a channel whose shape is sound.
+    fn count_elements(&self, at: &str, faults: &mut Faults) {
         let described = matches!(self.role, Role::Observation | Role::Action);
         let vector = self.dtype == DType::F32 && self.shape.len() == 1;
         if described && vector && self.elements.len() != self.len() {
@@ -130,11 +141,6 @@ impl Channel {
                 "must be empty: only vectors of f32 have elements, one for each of their length",
             );
         }
-        for (i, element) in self.elements.iter().enumerate() {
-            element.check(&format!("{at}[{i}]"), faults);
-        }
-        let names = self.elements.iter().map(|element| element.name.as_str());
-        distinct(at, "name", names, faults);
     }
 }
 
@@ -186,13 +192,17 @@ impl Element {
             offset,
             ..
         } = self;
-        if !(scale.is_finite() && offset.is_finite()) {
+        let sound = |fields: [&str; 2], faults: &Faults| {
+            let [first, second] = fields.map(|field| format!("{at}.{field}"));
+            faults.sound(&[&first, &second])
+        };
+        if sound(["scale", "offset"], faults) && !(scale.is_finite() && offset.is_finite()) {
             faults.add(
                 at,
                 format!("({name}) has scale {scale} and offset {offset}, which are not numbers"),
             );
         }
-        if !(min.is_finite() && max.is_finite() && min < max) {
+        if sound(["min", "max"], faults) && !(min.is_finite() && max.is_finite() && min < max) {
             faults.add(
                 at,
                 format!("({name}) has limits {min} to {max}, which is no range"),

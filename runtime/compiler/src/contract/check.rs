@@ -1,56 +1,56 @@
 //! Meaning of a contract's fields: every number in its range, no name twice, and no field that
 //! contradicts another.
 //!
-//! A check is left out where a field that it reads has a fault already.
+//! A check is left out where a field that it reads could not be read ([`Faults::sound`]).
 
 use std::collections::HashSet;
 
-use super::{Contract, DType, Faults, MAX_LEN, Role, State, StateKind};
+use super::{Channel, Contract, DType, Faults, MAX_LEN, Role, State, StateKind};
 use crate::family::RESERVED;
 
 /// Adds all faults of a contract whose form is sound where `faults` does not say otherwise.
 pub(super) fn check(contract: &Contract, faults: &mut Faults) {
     let period = contract.control_period_s;
-    if !(period.is_finite() && period > 0.0) {
+    if faults.sound(&["control_period_s"]) && !(period.is_finite() && period > 0.0) {
         faults.add(
             "control_period_s",
             format!("is {period}, it must be positive"),
         );
     }
     channels(contract, faults);
-    if faults.spare(&["channels", "states"]) {
-        states(contract, faults);
-    }
+    states(contract, faults);
     // Before the context, whose length is a multiple of the family's period.
-    if faults.spare(&["channels", "family", "context", "network"]) {
+    if faults.sound(&["family.kind"]) {
         contract.family.check(contract, faults);
     }
-    if faults.spare(&["context", "family"]) {
-        context(contract, faults);
-    }
-    if faults.spare(&["channels", "instructions"]) {
-        instructions(contract, faults);
-    }
-    if faults.spare(&["channels", "instructions", "language", "context"]) {
-        language(contract, faults);
-    }
-    if faults.spare(&["instructions", "evaluation"]) {
-        evaluation(contract, faults);
-    }
+    context(contract, faults);
+    instructions(contract, faults);
+    language(contract, faults);
+    evaluation(contract, faults);
+}
+
+/// Returns whether a field of every element of a list is the contract's own.
+pub(crate) fn all_sound(list: &str, len: usize, field: &str, faults: &Faults) -> bool {
+    let mut each = (0..len).map(|i| format!("{list}[{i}].{field}"));
+    faults.counted(list) && each.all(|field| faults.sound(&[&field]))
+}
+
+/// Returns whether it is known which role every channel has.
+pub(crate) fn roles_are_known(contract: &Contract, faults: &Faults) -> bool {
+    all_sound("channels", contract.channels.len(), "role", faults)
 }
 
 fn channels(contract: &Contract, faults: &mut Faults) {
     for (i, channel) in contract.channels.iter().enumerate() {
         let at = format!("channels[{i}]");
-        if faults.spare(&[&at]) {
-            channel.check(&at, faults);
-        }
-    }
-    if !faults.spare(&["channels"]) {
-        return;
+        channel.check(&at, faults);
+        in_its_role(channel, &at, faults);
     }
     let names = contract.channels.iter().map(|c| c.name.as_str());
     distinct("channels", "name", names, faults);
+    if !roles_are_known(contract, faults) {
+        return;
+    }
     let count = |role| contract.with(role).count();
     let observations = count(Role::Observation);
     if !(1..=lads_core::MAX_OBSERVATIONS).contains(&observations) {
@@ -72,46 +72,58 @@ fn channels(contract: &Contract, faults: &mut Faults) {
     if count(Role::Instruction) > 1 {
         faults.add("channels", "has more than one instruction");
     }
-    for (i, channel) in contract.channels.iter().enumerate() {
-        let at = format!("channels[{i}]");
-        if channel.role == Role::Observation {
-            reserved(&at, &channel.name, faults);
-        } else if channel.dtype != DType::F32 {
-            faults.add(
-                &format!("{at}.dtype"),
-                "must be f32: only observations may have other elements",
-            );
-        }
-        if channel.role == Role::Instruction && channel.shape.len() != 2 {
-            faults.add(
-                &format!("{at}.shape"),
-                format!(
-                    "is {:?}, an instruction has two axes: words and elements",
-                    channel.shape
-                ),
-            );
-        }
+}
+
+fn in_its_role(channel: &Channel, at: &str, faults: &mut Faults) {
+    let [role, name, dtype, shape] =
+        ["role", "name", "dtype", "shape"].map(|field| format!("{at}.{field}"));
+    if channel.role == Role::Observation && faults.sound(&[&role, &name]) {
+        reserved(&name, &channel.name, faults);
+    }
+    if channel.role != Role::Observation
+        && channel.dtype != DType::F32
+        && faults.sound(&[&role, &dtype])
+    {
+        faults.add(
+            &dtype,
+            "must be f32: only observations may have other elements",
+        );
+    }
+    if channel.role == Role::Instruction
+        && channel.shape.len() != 2
+        && faults.sound(&[&role, &shape])
+    {
+        let found = &channel.shape;
+        faults.add(
+            &shape,
+            format!("is {found:?}, an instruction has two axes: words and elements"),
+        );
     }
 }
 
-fn reserved(at: &str, name: &str, faults: &mut Faults) {
+fn reserved(field: &str, name: &str, faults: &mut Faults) {
     if RESERVED.contains(&name) {
         faults.add(
-            &format!("{at}.name"),
+            field,
             format!("is \"{name}\", which means something else to a graph; give it another name"),
         );
     }
 }
 
 fn states(contract: &Contract, faults: &mut Faults) {
+    let channels = contract.channels.len();
+    let named = all_sound("channels", channels, "name", faults);
     for (i, state) in contract.states.iter().enumerate() {
         let at = format!("states[{i}]");
-        reserved(&at, &state.name, faults);
-        if contract.channel(&state.name).is_some() {
-            faults.add(
-                &format!("{at}.name"),
-                format!("repeats \"{}\", the name of a channel", state.name),
-            );
+        let name = format!("{at}.name");
+        if faults.sound(&[&name]) {
+            reserved(&name, &state.name, faults);
+            if named && contract.channel(&state.name).is_some() {
+                faults.add(
+                    &name,
+                    format!("repeats \"{}\", the name of a channel", state.name),
+                );
+            }
         }
         check_state(contract, state, &at, faults);
     }
@@ -120,37 +132,45 @@ fn states(contract: &Contract, faults: &mut Faults) {
 }
 
 fn check_state(contract: &Contract, state: &State, at: &str, faults: &mut Faults) {
+    let [kind, shape, rows, source] =
+        ["kind", "shape", "rows", "source"].map(|field| format!("{at}.{field}"));
+    if !faults.sound(&[&kind]) {
+        return;
+    }
     match state.kind {
         StateKind::Plain => {
             let product = |len: usize, &dim| len.checked_mul(dim);
             let len = state.shape.iter().try_fold(1, product);
-            let sound = len.is_some_and(|len| (1..=MAX_LEN).contains(&len));
-            if state.shape.is_empty() || !sound {
+            let fits = len.is_some_and(|len| (1..=MAX_LEN).contains(&len));
+            if faults.sound(&[&shape]) && (state.shape.is_empty() || !fits) {
                 faults.add(
-                    &format!("{at}.shape"),
+                    &shape,
                     format!("is {:?}, it must have 1 to {MAX_LEN} elements", state.shape),
                 );
             }
-            if state.source.is_some() {
-                faults.add(
-                    &format!("{at}.source"),
-                    "is not of a plain state: only a ring has a source",
-                );
+            if faults.sound(&[&source]) && state.source.is_some() {
+                faults.add(&source, "is not of a plain state: only a ring has a source");
             }
         }
         StateKind::Ring => {
-            if !(1..=MAX_LEN).contains(&state.rows) {
+            if faults.sound(&[&rows]) && !(1..=MAX_LEN).contains(&state.rows) {
                 faults.add(
-                    &format!("{at}.rows"),
+                    &rows,
                     format!("is {}, it must be 1 to {MAX_LEN}", state.rows),
                 );
             }
-            let source = state.source.as_deref().unwrap_or("");
+            let channels = contract.channels.len();
+            let known = all_sound("channels", channels, "name", faults)
+                && roles_are_known(contract, faults);
+            let named = state.source.as_deref().unwrap_or("");
             let mut observations = contract.observations();
-            if !observations.any(|channel| channel.name == source) {
+            if known
+                && faults.sound(&[&source])
+                && !observations.any(|channel| channel.name == named)
+            {
                 faults.add(
-                    &format!("{at}.source"),
-                    format!("is \"{source}\", it must name an observation channel"),
+                    &source,
+                    format!("is \"{named}\", it must name an observation channel"),
                 );
             }
         }
@@ -165,11 +185,13 @@ fn context(contract: &Contract, faults: &mut Faults) {
         ("context.words", context.words),
         ("context.steps", context.steps),
     ] {
-        if !(1..=MAX_LEN).contains(&len) {
+        if faults.sound(&[field]) && !(1..=MAX_LEN).contains(&len) {
             faults.add(field, format!("is {len}, it must be 1 to {MAX_LEN}"));
         }
     }
     if let Some(period) = contract.period()
+        && faults.sound(&["context.steps"])
+        && faults.free(&["family.kind", "family.horizon"])
         && !context.steps.is_multiple_of(period)
     {
         faults.add(
@@ -183,54 +205,63 @@ fn context(contract: &Contract, faults: &mut Faults) {
 }
 
 fn instructions(contract: &Contract, faults: &mut Faults) {
-    if contract.words().is_none() {
-        if !contract.instructions.is_empty() {
-            faults.add(
-                "instructions",
-                "is not empty, and no channel takes an instruction",
-            );
-        }
-        return;
-    }
-    if !(1..=MAX_LEN).contains(&contract.instructions.len()) {
-        let len = contract.instructions.len();
-        faults.add(
-            "instructions",
-            format!("has {len}, it must have 1 to {MAX_LEN}"),
-        );
-    }
+    let known = contract.instructions.len();
     for (i, known) in contract.instructions.iter().enumerate() {
-        if known.text.trim().is_empty() {
-            faults.add(&format!("instructions[{i}].text"), "is empty");
+        let text = format!("instructions[{i}].text");
+        if faults.sound(&[&text]) && known.text.trim().is_empty() {
+            faults.add(&text, "is empty");
         }
     }
     // Texts may repeat: benchmarks ask for the same in other words, and for the same words by other measures.
     let ids = contract.instructions.iter().map(|known| known.id.as_str());
     distinct("instructions", "id", ids, faults);
+    if !(roles_are_known(contract, faults) && faults.counted("instructions")) {
+        return;
+    }
+    if contract.with(Role::Instruction).next().is_none() {
+        if known > 0 {
+            faults.add(
+                "instructions",
+                "is not empty, and no channel takes an instruction",
+            );
+        }
+    } else if !(1..=MAX_LEN).contains(&known) {
+        faults.add(
+            "instructions",
+            format!("has {known}, it must have 1 to {MAX_LEN}"),
+        );
+    }
 }
 
 fn language(contract: &Contract, faults: &mut Faults) {
-    let Some([words, dim]) = contract.words() else {
+    if let Some(acceptance) = contract.language.as_ref().and_then(|l| l.acceptance) {
+        acceptance.check(faults);
+    }
+    let mut channels = contract.channels.iter();
+    let taken = channels.position(|channel| channel.role == Role::Instruction);
+    let Some(index) = taken.filter(|_| roles_are_known(contract, faults)) else {
         return;
     };
-    match &contract.language {
-        None => faults.add("language", "is missing, and the policy takes instructions"),
-        Some(language) => {
-            if language.dim != dim {
-                let found = language.dim;
-                faults.add(
-                    "language.dim",
-                    format!("is {found}, the instruction channel's words have {dim} elements"),
-                );
-            }
-            if let Some(acceptance) = &language.acceptance {
-                acceptance.check(faults);
-            }
-        }
+    if contract.language.is_none() && faults.sound(&["language"]) {
+        faults.add("language", "is missing, and the policy takes instructions");
     }
-    if contract
-        .context
-        .is_some_and(|context| context.words != words)
+    let shape = format!("channels[{index}].shape");
+    let Some([words, dim]) = contract.words().filter(|_| faults.free(&[&shape])) else {
+        return;
+    };
+    if let Some(language) = &contract.language
+        && language.dim != dim
+        && faults.sound(&["language.dim"])
+    {
+        let found = language.dim;
+        faults.add(
+            "language.dim",
+            format!("is {found}, the instruction channel's words have {dim} elements"),
+        );
+    }
+    if let Some(context) = contract.context
+        && context.words != words
+        && faults.sound(&["context.words"])
     {
         faults.add(
             "context.words",
@@ -240,37 +271,44 @@ fn language(contract: &Contract, faults: &mut Faults) {
 }
 
 fn evaluation(contract: &Contract, faults: &mut Faults) {
+    let list = "evaluation.instructions";
     let evaluated = &contract.evaluation.instructions;
     let known = contract.instructions.len();
-    if contract.words().is_some() && !evaluated.is_empty() && evaluated.len() != known {
+    if faults.counted(list)
+        && faults.counted("instructions")
+        && !evaluated.is_empty()
+        && evaluated.len() != known
+    {
         faults.add(
-            "evaluation.instructions",
+            list,
             format!("has {}, there are {known} instructions", evaluated.len()),
         );
     }
     for (i, known) in evaluated.iter().enumerate() {
-        if known.split.trim().is_empty() {
-            faults.add(&format!("evaluation.instructions[{i}].split"), "is empty");
+        let split = format!("{list}[{i}].split");
+        if faults.sound(&[&split]) && known.split.trim().is_empty() {
+            faults.add(&split, "is empty");
         }
     }
 }
 
-/// Adds a fault for every name that is empty or stands twice.
+/// Adds a fault for every name of a list that is empty or stands twice.
 pub(super) fn distinct<'a>(
-    field: &str,
+    list: &str,
     part: &str,
     names: impl Iterator<Item = &'a str>,
     faults: &mut Faults,
 ) {
     let mut seen = HashSet::new();
     for (i, name) in names.enumerate() {
+        let field = format!("{list}[{i}].{part}");
+        if !faults.sound(&[&field]) {
+            continue;
+        }
         if name.trim().is_empty() {
-            faults.add(&format!("{field}[{i}].{part}"), "is empty");
+            faults.add(&field, "is empty");
         } else if !seen.insert(name) {
-            faults.add(
-                &format!("{field}[{i}].{part}"),
-                format!("repeats \"{name}\""),
-            );
+            faults.add(&field, format!("repeats \"{name}\""));
         }
     }
 }

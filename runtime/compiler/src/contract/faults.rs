@@ -19,10 +19,13 @@ impl fmt::Display for Fault {
     }
 }
 
-/// Faults found so far.
+/// Faults found so far: first those of the form, in whose place the contract has parts of an
+/// example, then those of the meaning.
 #[derive(Debug, Default)]
 pub(crate) struct Faults {
     found: Vec<(String, Fault)>,
+    of_form: usize,
+    cut: bool,
 }
 
 impl Faults {
@@ -35,16 +38,44 @@ impl Faults {
         self.found.push((field.to_owned(), fault));
     }
 
-    /// Returns whether none of these parts of the contract has a fault: what is judged by a faulty
-    /// field would be a fault that nobody made.
-    pub fn spare(&self, parts: &[&str]) -> bool {
-        let within = |field: &str, part: &str| {
-            field.strip_prefix(part).is_some_and(|rest| {
-                rest.is_empty() || rest.starts_with('.') || rest.starts_with('[')
+    /// Gives up on what follows a field: no part counts as the contract's own from here on.
+    pub fn cut(&mut self, field: &str) {
+        if !self.cut {
+            self.cut = true;
+            self.add(
+                field,
+                "and what follows it are not looked at: there are too many faults",
+            );
+        }
+    }
+
+    /// Ends the faults of the form.
+    pub fn form_is_read(&mut self) {
+        self.of_form = self.found.len();
+    }
+
+    /// Returns whether the contract has its own values in all these parts, as a check needs that
+    /// reads them: an example's would be faults that nobody made.
+    pub fn sound(&self, parts: &[&str]) -> bool {
+        let mut form = self.found.iter().take(self.of_form);
+        !self.cut
+            && !form.any(|(field, _)| {
+                let touches = |part: &&str| within(field, part) || within(part, field);
+                parts.iter().any(touches)
             })
-        };
+    }
+
+    /// Returns whether a list has as many elements as the contract says.
+    pub fn counted(&self, list: &str) -> bool {
+        let mut form = self.found.iter().take(self.of_form);
+        !self.cut && !form.any(|(field, _)| within(list, field))
+    }
+
+    /// Returns whether these parts are sound and nothing else is wrong with them.
+    pub fn free(&self, parts: &[&str]) -> bool {
+        let mut meant = self.found.iter().skip(self.of_form);
         let hit = |field: &str| parts.iter().any(|part| within(field, part));
-        !self.found.iter().any(|(field, _)| hit(field))
+        self.sound(parts) && !meant.any(|(field, _)| hit(field))
     }
 
     /// Returns whether there is none.
@@ -60,5 +91,30 @@ impl Faults {
     /// Returns the faults, in the order in which they were found.
     pub fn into_vec(self) -> Vec<Fault> {
         self.found.into_iter().map(|(_, fault)| fault).collect()
+    }
+}
+
+/// Returns whether a field is a part or lies in it.
+fn within(field: &str, part: &str) -> bool {
+    let rest = field.strip_prefix(part);
+    rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('.') || rest.starts_with('['))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_part_is_sound_where_neither_it_nor_what_it_lies_in_was_replaced() {
+        let mut faults = Faults::default();
+        faults.add("channels[1].elements[0].min", "");
+        faults.add("language", "");
+        faults.form_is_read();
+        faults.add("channels[0].shape", "");
+        assert!(!faults.sound(&["channels[1]"]) && !faults.sound(&["channels[1].elements"]));
+        assert!(!faults.sound(&["context", "language.dim"]));
+        assert!(faults.sound(&["channels[1].elements[0].max", "channels[10]", "channels[0]"]));
+        assert!(faults.counted("channels[1].elements") && !faults.counted("language.dim"));
+        assert!(!faults.free(&["channels[0]"]) && faults.free(&["channels[0].dtype"]));
     }
 }

@@ -110,6 +110,7 @@ impl Place {
             return found.clone();
         };
         if faults.len() >= MOST_FAULTS {
+            faults.cut(&self.field);
             return sound.clone();
         }
         match (found, sound) {

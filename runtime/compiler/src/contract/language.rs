@@ -65,11 +65,9 @@ impl Acceptance {
             ("accepted_known", self.accepted_known, 0.0),
             ("accepted_other", self.accepted_other, 0.0),
         ] {
-            if !(least..=1.0).contains(&value) {
-                faults.add(
-                    &format!("language.acceptance.{part}"),
-                    format!("is {value}, it must be {least} to 1"),
-                );
+            let field = format!("language.acceptance.{part}");
+            if faults.sound(&[&field]) && !(least..=1.0).contains(&value) {
+                faults.add(&field, format!("is {value}, it must be {least} to 1"));
             }
         }
     }

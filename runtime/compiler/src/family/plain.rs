@@ -8,7 +8,9 @@ use lads_image::records::{self, Scope};
 use serde::Deserialize;
 
 use super::{Blueprint, Call, Entry, Keep, Kind, Origin};
-use crate::contract::{Channel, ClearedBy, Contract, Faults, Fill, StateKind};
+use crate::contract::{
+    Channel, ClearedBy, Contract, Faults, Fill, Role, StateKind, roles_are_known,
+};
 
 /// Name of the only graph.
 const ACT: &str = "policy/act";
@@ -22,7 +24,7 @@ pub struct Plain {}
 
 impl Kind for Plain {
     fn check(&self, contract: &Contract, faults: &mut Faults) {
-        if contract.words().is_some() {
+        if contract.with(Role::Instruction).next().is_some() && roles_are_known(contract, faults) {
             faults.add(
                 "channels",
                 "has an instruction, and family plain takes none",
@@ -56,7 +58,10 @@ impl Kind for Plain {
                     contract.channel(channel).map_or(0, Channel::len),
                     "channels",
                 ),
-                None => (state.shape.iter().product(), "states"),
+                None => {
+                    let product = |len: usize, &dim| len.saturating_mul(dim);
+                    (state.shape.iter().fold(1, product), "states")
+                }
             };
             blueprint = blueprint.state(&state.name, keep, scope).wide(width, field);
             if let Some(channel) = &state.source {

@@ -45,6 +45,8 @@ pub struct GuardedController<'a, 'm> {
     timestamp: Option<u64>,
     /// Whether a second timestamp has followed on that one: before, either of two that do not fit may be the damaged one.
     confirmed: bool,
+    /// The last timestamp, if it jumped: the next may follow on it.
+    strayed: Option<u64>,
     counters: Counters,
 }
 
@@ -79,6 +81,7 @@ impl<'a, 'm> GuardedController<'a, 'm> {
             coasted: 0,
             timestamp: None,
             confirmed: false,
+            strayed: None,
             counters: Counters::default(),
         })
     }
@@ -145,7 +148,7 @@ impl<'a, 'm> GuardedController<'a, 'm> {
     /// stop.
     pub fn reset(&mut self) {
         self.controller.reset();
-        (self.timestamp, self.confirmed) = (None, false);
+        (self.timestamp, self.confirmed, self.strayed) = (None, false, None);
         self.coasted = 0;
     }
 
@@ -188,6 +191,7 @@ impl<'a, 'm> GuardedController<'a, 'm> {
         self.in_a_row = running.in_a_row;
         self.coasted = running.coasted;
         (self.timestamp, self.confirmed) = (running.timestamp, running.confirmed);
+        self.strayed = running.strayed;
         self.counters = running.counters;
         Ok(())
     }
@@ -276,7 +280,16 @@ impl<'a, 'm> GuardedController<'a, 'm> {
                 tick.timestamp.abs_diff(last)
             }
         });
-        let jumps = self.max_jump > 0 && between.is_some_and(|between| between > self.max_jump);
+        let far = self.max_jump > 0 && between.is_some_and(|between| between > self.max_jump);
+        // Two in a row that fit each other: the time has really passed.
+        let follows = tick.zip(self.strayed).is_some_and(|(tick, strayed)| {
+            let after = tick.timestamp.checked_sub(strayed);
+            after.is_some_and(|after| (1..=self.max_jump).contains(&after))
+        });
+        let jumps = far && !follows;
+        if let Some(tick) = tick {
+            self.strayed = jumps.then_some(tick.timestamp);
+        }
         let stale = tick
             .zip(last)
             .is_some_and(|(tick, last)| tick.timestamp <= last);

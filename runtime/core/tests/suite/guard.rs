@@ -280,6 +280,40 @@ fn an_action_of_the_wrong_length_is_refused_untouched() {
 }
 
 #[test]
+fn a_gap_that_two_timestamps_agree_on_has_really_passed() {
+    let config = GuardConfig {
+        fallback: Fallback::Hold,
+        max_jump: 200,
+        ..GuardConfig::default()
+    };
+    let jump = Some(Intervention::Jump);
+    for (timestamps, expected) in [
+        // The process stood still for a while.
+        ([100, 180, 1000, 1080, 1160], [None, None, jump, None, None]),
+        ([100, 180, 1000, 1500, 1580], [None, None, jump, jump, None]),
+        // Two damaged ones do not follow on each other, nor does one that comes twice.
+        ([100, 180, 1000, 1000, 260], [None, None, jump, jump, None]),
+        ([100, 180, 1000, 900, 260], [None, None, jump, jump, None]),
+        // One that fitted again ends the search.
+        ([100, 180, 1000, 260, 1080], [None, None, jump, None, jump]),
+    ] {
+        let seen = ready(&config, |guarded| {
+            timestamps.map(|timestamp| {
+                let tick = Tick {
+                    timestamp,
+                    missed: 0,
+                };
+                let report = guarded.step(&[0.0; 3], Some(tick), &mut [0.0; 2]);
+                // A period without an observation says nothing about the time.
+                guarded.step_blind(&mut [0.0; 2]).expect("two elements");
+                report.expect("the action has two elements").intervention
+            })
+        });
+        assert_eq!(seen, expected, "{timestamps:?}");
+    }
+}
+
+#[test]
 fn one_damaged_timestamp_is_refused_itself() {
     let tick = |timestamp| {
         Some(Tick {
