@@ -158,20 +158,7 @@ pub fn compile_with(bundle: &Bundle, options: &Options) -> Result<Image, Compile
         cache_len,
     };
     // What the worst step costs is for the core to count: it is asked with an image that says nothing, and told what it counted.
-    let draft = image::write(bundle, &parts, report(0))?;
-    parts.work = match Policy::new_within(draft.as_bytes(), u64::MAX) {
-        Err(PolicyError::Schedule(ScheduleError::Work { counted, .. })) => counted,
-        // Numbers of draws follow from the schedule, so the image is the first to know them.
-        Err(PolicyError::Golden) => {
-            let problem = "its `noise` has another number of draws in a step than the policy";
-            return Err(CompileError::Bundle(BundleError::Golden {
-                problems: vec![problem.into()],
-            }));
-        }
-        Err(error) => return Err(CompileError::Image(error)),
-        Ok(_) => 0,
-    };
-    drop(draft);
+    parts.work = counted_work(&image::write(bundle, &parts, report(0))?)?;
     let cache_len = image::rows_len(&parts);
     let image = image::write(bundle, &parts, report(cache_len))?;
     let policy = Policy::new_checked(image.as_bytes()).map_err(CompileError::Image)?;
@@ -179,6 +166,22 @@ pub fn compile_with(bundle: &Bundle, options: &Options) -> Result<Image, Compile
         gate(&policy, &storage, parts.tolerance)?;
     }
     Ok(image)
+}
+
+/// Returns the multiply-adds of the worst step of an image that states none.
+fn counted_work(draft: &Image) -> Result<u64, CompileError> {
+    match Policy::new_within(draft.as_bytes(), u64::MAX) {
+        Err(PolicyError::Schedule(ScheduleError::Work { counted, .. })) => Ok(counted),
+        // Numbers of draws follow from the schedule, so the image is the first to know them.
+        Err(PolicyError::Golden) => {
+            let problem = "its `noise` has another number of draws in a step than the policy";
+            Err(CompileError::Bundle(BundleError::Golden {
+                problems: vec![problem.into()],
+            }))
+        }
+        Err(error) => Err(CompileError::Image(error)),
+        Ok(_) => Ok(0),
+    }
 }
 
 /// Refuses exceptions for entries and layers that do not exist.

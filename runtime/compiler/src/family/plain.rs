@@ -53,15 +53,13 @@ impl Kind for Plain {
                     },
                 },
             };
+            let product = |len: usize, &dim| len.saturating_mul(dim);
             let (width, field) = match &state.source {
                 Some(channel) => (
                     contract.channel(channel).map_or(0, Channel::len),
                     "channels",
                 ),
-                None => {
-                    let product = |len: usize, &dim| len.saturating_mul(dim);
-                    (state.shape.iter().fold(1, product), "states")
-                }
+                None => (state.shape.iter().fold(1, product), "states"),
             };
             blueprint = blueprint.state(&state.name, keep, scope).wide(width, field);
             if let Some(channel) = &state.source {
