@@ -5,13 +5,18 @@
 //! bindings. What can fail: a graph or a value is missing, unknown, or declared with another type
 //! or shape; [`signatures`] reports it together with the field of the contract.
 
+mod declared;
+
 use std::collections::{HashMap, HashSet};
 
 use crate::contract::{Contract, DType, Faults, all_sound, roles_are_known};
 use crate::error::{BundleError, Line};
 use crate::family::{Blueprint, Bound, Entry, Keep};
 use crate::graph::{Dim, Type, show};
-use crate::onnx::{GraphProto, NodeProto, TensorTypeProto, ValueInfoProto, data_type};
+use crate::onnx::{GraphProto, NodeProto, ValueInfoProto};
+
+use declared::declaration;
+pub(crate) use declared::past;
 
 /// Name of the graph that holds the table of known instructions: evaluated when a bundle is
 /// compiled.
@@ -427,43 +432,6 @@ fn differs(name: &str, found: &[Dim], wanted: &str, fields: &str) -> String {
     )
 }
 
-/// Reads the type and shape that a value declares: symbolic axes must be called `P` or `P+n`.
-fn declaration(value: &ValueInfoProto) -> Result<(Type, Vec<Dim>), String> {
-    let name = &value.name;
-    let tensor = value.r#type.as_ref().and_then(|ty| ty.tensor_type.as_ref());
-    let tensor = tensor.ok_or_else(|| format!("{name} declares no tensor type"))?;
-    let ty = match tensor.elem_type {
-        // Bytes and small integers come as numbers: the graph casts them. So do floats of other widths and truth values.
-        data_type::FLOAT
-        | data_type::FLOAT16
-        | data_type::BFLOAT16
-        | data_type::DOUBLE
-        | data_type::BOOL
-        | data_type::UINT8 => Type::F32,
-        data_type::INT64 | data_type::INT32 => Type::I64,
-        other => {
-            return Err(format!(
-                "{name} has elements of {}, which no channel and no state has",
-                data_type::name(other)
-            ));
-        }
-    };
-    let shape = shape_of(tensor).ok_or_else(|| {
-        format!("{name} declares no shape that can be read (the only symbolic axis is `P`)")
-    })?;
-    Ok((ty, shape))
-}
-
-fn shape_of(tensor: &TensorTypeProto) -> Option<Vec<Dim>> {
-    let dims = tensor.shape.as_ref()?.dim.iter();
-    dims.map(|dim| match (&dim.dim_value, &dim.dim_param) {
-        (Some(len), _) => usize::try_from(*len).ok().map(Dim::of),
-        (None, Some(text)) => past(text),
-        (None, None) => None,
-    })
-    .collect()
-}
-
 /// Returns the entry that a value's name starts with: its first two parts.
 pub(crate) fn entry_of(name: &str) -> Option<&str> {
     let first = name.find('/')?;
@@ -498,14 +466,4 @@ pub(crate) fn needed<'g>(
         .zip(wanted)
         .filter_map(|(node, wanted)| wanted.then_some(node))
         .collect()
-}
-
-/// Returns the length that a symbolic axis stands for: `P`, the rows of the cache, or `P+n`.
-pub(crate) fn past(name: &str) -> Option<Dim> {
-    let rest = name.strip_prefix('P')?;
-    let added = rest
-        .trim()
-        .strip_prefix('+')
-        .map_or_else(|| rest.is_empty().then_some(0), |n| n.trim().parse().ok());
-    added.map(Dim::past)
 }
