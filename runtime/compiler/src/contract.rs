@@ -17,7 +17,7 @@ use serde::Deserialize;
 use crate::error::BundleError;
 use crate::family::Family;
 
-pub(crate) use check::{all_sound, roles_are_known};
+pub(crate) use check::{all_free, roles_are_known};
 pub(crate) use faults::Faults;
 pub(crate) use form::REQUIRED;
 
@@ -191,6 +191,9 @@ pub struct Contract {
 /// few lengths fit 64 bits.
 pub(crate) const MAX_LEN: usize = 1 << 20;
 
+/// Largest number of channels and of states that is looked at.
+const MOST_PARTS: usize = 1024;
+
 impl Contract {
     /// Reads and checks a contract.
     pub fn parse(json: &str) -> Result<Self, BundleError> {
@@ -216,6 +219,17 @@ impl Contract {
         if !value.is_object() {
             faults.add("lads.contract", "is no JSON object");
             return Ok((None, faults));
+        }
+        // Every channel is held against every other.
+        for list in ["channels", "states"] {
+            let found = value.get(list).and_then(serde_json::Value::as_array);
+            if let Some(len) = found.map(Vec::len).filter(|&len| len > MOST_PARTS) {
+                faults.add(
+                    list,
+                    format!("has {len}, it must have {MOST_PARTS} at most"),
+                );
+                return Ok((None, faults));
+            }
         }
         match value
             .get("version")

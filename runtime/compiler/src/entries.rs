@@ -9,7 +9,7 @@ mod declared;
 
 use std::collections::{HashMap, HashSet};
 
-use crate::contract::{Contract, DType, Faults, all_sound, roles_are_known};
+use crate::contract::{Contract, DType, Faults, all_free, roles_are_known};
 use crate::error::{BundleError, Line};
 use crate::family::{Blueprint, Bound, Entry, Keep};
 use crate::graph::{Dim, Type, show};
@@ -98,7 +98,9 @@ pub(crate) fn compared(
             all.push(signature);
         }
     }
-    unknown(graph, contract, &all, &mut problems);
+    let mut found = vec![];
+    unknown(graph, contract, &all, &mut found);
+    problems.extend(found.into_iter().filter(|_| known));
     if problems.is_empty() {
         return Ok(all);
     }
@@ -162,8 +164,8 @@ impl Checker<'_> {
     fn names_are_free(&self) -> bool {
         let channels = self.contract.channels.len();
         let states = self.contract.states.len();
-        all_sound("channels", channels, "name", self.faults)
-            && all_sound("states", states, "name", self.faults)
+        all_free("channels", channels, "name", self.faults)
+            && all_free("states", states, "name", self.faults)
             && roles_are_known(self.contract, self.faults)
     }
 
@@ -208,12 +210,15 @@ impl Checker<'_> {
         let inputs = values(&graph.input, true);
         for wanted in &entry.outputs {
             let wanted = format!("{prefix}{wanted}");
-            if !declares(&wanted) {
+            let of_state = wanted[prefix.len()..].starts_with("next_");
+            let judged = !of_state || self.faults.free(&["states"]);
+            if judged && !declares(&wanted) {
                 problems.push(format!("output {wanted} is missing"));
             }
         }
         // What is bound to the cache is known only of values that can be read.
-        if problems.len() == before && named && self.faults.free(&["network", "family"]) {
+        let shaped = (0..self.contract.channels.len()).all(|i| self.shape_is_free(i));
+        if problems.len() == before && named && shaped && self.faults.free(&["network", "family"]) {
             let checked = self.cache(entry.cache.as_deref(), name, &inputs, &outputs);
             problems.extend(checked.err());
         }
@@ -274,6 +279,7 @@ impl Checker<'_> {
                 };
                 fields
             }
+            Bound::State(_) | Bound::Row(_) if !self.faults.free(&["states"]) => String::new(),
             Bound::State(index) | Bound::Row(index) => {
                 let state = &self.blueprint.states[index];
                 let rows = match (state.keep, bound, input) {

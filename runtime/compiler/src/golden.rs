@@ -80,8 +80,9 @@ impl Golden {
         let mut problems = vec![];
         let tolerance = tolerance.map_err(|problem| problems.push(problem)).ok();
         let steps = steps.map_err(|problem| problems.push(problem)).ok();
-        let known = roles_are_known(contract, faults) && faults.counted("instructions");
-        let instruction = (contract.words().filter(|_| known))
+        let known = roles_are_known(contract, faults);
+        let listed = known && faults.counted("instructions") && !contract.instructions.is_empty();
+        let instruction = (contract.words().filter(|_| listed))
             .map(|_| instruction(&tensors, contract))
             .transpose()
             .map_err(|problem| problems.push(problem))
@@ -115,7 +116,8 @@ impl Golden {
         let drawn = contract.with(Role::Noise).next().filter(|_| known);
         let noise = or_report(noise(&tensors, steps, drawn.filter(|drawn| free(drawn))));
         let action = [&[steps][..], &contract.action().shape].concat();
-        let actions = if free(contract.action()) {
+        let acts = contract.with(Role::Action).next();
+        let actions = if acts.is_some_and(free) {
             or_report(floats(&tensors, "actions", &action))
         } else {
             vec![]

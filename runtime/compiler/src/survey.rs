@@ -146,10 +146,19 @@ pub fn survey(bytes: &[u8]) -> Result<Survey, BundleError> {
             problem: line(&error.to_string()),
         });
     }
-    let values = || (inputs.iter().copied()).chain(&graph.output).chain(&inner);
     let declared = |open| -> Declared {
-        let known = values().filter_map(|value| Some((value.name.as_str(), taken(value, open)?)));
-        known.collect()
+        // An integer of one element is an index, others are numbers, as in a bundle's entries.
+        let input = |value| -> Option<_> {
+            let (ty, shape) = taken(value, open)?;
+            let one = shape.iter().all(|dim| dim.is_one());
+            Some((if one { ty } else { Type::F32 }, shape))
+        };
+        let inputs = inputs.iter().map(|value| (*value, input(value)));
+        let others = graph.output.iter().chain(&inner);
+        let known = inputs.chain(others.map(|value| (value, taken(value, open))));
+        known
+            .filter_map(|(value, found)| Some((value.name.as_str(), found?)))
+            .collect()
     };
     let default = |domain: &str| domain.is_empty() || domain == "ai.onnx";
     let sets = &model.opset_import;

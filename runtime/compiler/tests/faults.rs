@@ -162,27 +162,50 @@ fn places(value: &Value, at: &str, see: &mut Vec<String>) {
 
 /// Writes a contract over the one in the small bundle, which is at least as long.
 fn with_contract(contract: &Value) -> Option<Vec<u8>> {
-    let original = self::contract().to_string();
-    let at = TINY
-        .windows(10)
-        .position(|part| part == br#"{"version""#)
-        .unwrap();
-    let end = at
-        + serde_json::Deserializer::from_slice(&TINY[at..])
-            .into_iter::<Value>()
-            .scan(0, |_, value| value.ok())
-            .map(|_| original.len())
-            .next()
-            .unwrap();
+    let start = br#"{"version""#;
+    let at = TINY.windows(start.len()).position(|part| part == start)?;
+    let mut values = serde_json::Deserializer::from_slice(&TINY[at..]).into_iter::<Value>();
+    values.next()?.ok()?;
+    let len = values.byte_offset();
     let json = contract.to_string();
     let mut bytes = TINY.to_vec();
-    let room = bytes.get_mut(at..end)?;
-    if json.len() > room.len() {
-        return None;
-    }
+    let room = &mut bytes[at..at + len];
     room.fill(b' ');
-    room[..json.len()].copy_from_slice(json.as_bytes());
+    room.get_mut(..json.len())?.copy_from_slice(json.as_bytes());
     Some(bytes)
+}
+
+/// A fault is told once, and nothing that only follows from it.
+#[test]
+fn what_follows_from_a_fault_is_not_told() {
+    let sound = contract();
+    for (place, value, told) in [
+        ("/control_period_s", json!(0), "control_period_s"),
+        ("/channels/1/role", json!("x"), "channels[1].role"),
+        ("/channels/1", json!(5), "channels[1]"),
+        ("/channels/1/shape", json!([6]), "channels[1].shape"),
+        ("/channels/0/name", json!(""), "channels[0].name"),
+        ("/channels/0/shape", json!([]), "channels[0].shape"),
+        (
+            "/channels/0/elements/1/max",
+            json!("x"),
+            "channels[0].elements[1].max",
+        ),
+        ("/channels", json!({}), "channels"),
+        ("/instructions", json!([]), "instructions"),
+        ("/family/codebook/size", json!(0), "family.codebook.size"),
+        ("/family/horizon", json!("four"), "family.horizon"),
+        ("/network/heads", json!(0), "network.heads"),
+        ("/context", json!("long"), "context"),
+        ("/language", json!([]), "language"),
+    ] {
+        let mut broken = sound.clone();
+        *broken.pointer_mut(place).unwrap() = value;
+        let bytes = with_contract(&broken).expect("it is no longer");
+        let found = survey(&bytes).unwrap().missing.contract;
+        let fields: Vec<&str> = found.iter().map(|field| field.field.as_str()).collect();
+        assert_eq!(fields, [told], "{place}: {found:#?}");
+    }
 }
 
 /// Whatever stands in one place of a contract, and in two at once, is told and nothing panics.

@@ -101,8 +101,13 @@ impl Channel {
             faults.add(
                 &shape,
                 format!(
-                    "is {:?}, it must have one to four axes and 1 to {MAX_CHANNEL_LEN} elements",
-                    self.shape
+                    "is {:?}{}, it must have one to four axes and 1 to {MAX_CHANNEL_LEN} elements",
+                    self.shape.iter().take(4).collect::<Vec<_>>(),
+                    if self.shape.len() > 4 {
+                        " and so on"
+                    } else {
+                        ""
+                    }
                 ),
             );
         } else if faults.sound(&[&shape, &dtype, &role]) && faults.counted(&elements) {
@@ -117,7 +122,10 @@ impl Channel {
         if faults.sound(&[&min_field, &max_field, &dtype])
             && !(min.is_finite() && max.is_finite() && min < max)
         {
-            faults.add(at, format!("has limits {min} to {max}, which is no range"));
+            faults.add(
+                &min_field,
+                format!("is {min} and `max` {max}, which is no range"),
+            );
         }
     }
 

@@ -35,6 +35,12 @@ pub(crate) fn all_sound(list: &str, len: usize, field: &str, faults: &Faults) ->
     faults.counted(list) && each.all(|field| faults.sound(&[&field]))
 }
 
+/// Returns whether nothing is wrong with a field of any element of a list.
+pub(crate) fn all_free(list: &str, len: usize, field: &str, faults: &Faults) -> bool {
+    let mut each = (0..len).map(|i| format!("{list}[{i}].{field}"));
+    faults.counted(list) && each.all(|field| faults.free(&[&field]))
+}
+
 /// Returns whether it is known which role every channel has.
 pub(crate) fn roles_are_known(contract: &Contract, faults: &Faults) -> bool {
     all_sound("channels", contract.channels.len(), "role", faults)
@@ -277,6 +283,7 @@ fn evaluation(contract: &Contract, faults: &mut Faults) {
     if faults.counted(list)
         && faults.counted("instructions")
         && !evaluated.is_empty()
+        && known > 0
         && evaluated.len() != known
     {
         faults.add(

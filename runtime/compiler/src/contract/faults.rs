@@ -19,6 +19,9 @@ impl fmt::Display for Fault {
     }
 }
 
+/// Number of faults after which no more are looked for: a person has enough to do.
+const MOST: usize = 1000;
+
 /// Faults found so far: first those of the form, in whose place the contract has parts of an
 /// example, then those of the meaning.
 #[derive(Debug, Default)]
@@ -31,22 +34,25 @@ pub(crate) struct Faults {
 impl Faults {
     /// Adds the fault of a field.
     pub fn add(&mut self, field: &str, problem: impl Into<Line>) {
+        if self.cut {
+            return;
+        }
+        self.cut = self.found.len() >= MOST;
+        let problem = if self.cut {
+            "and what follows it are not looked at: there are too many faults".into()
+        } else {
+            problem.into()
+        };
         let fault = Fault {
             field: field.into(),
-            problem: problem.into(),
+            problem,
         };
         self.found.push((field.to_owned(), fault));
     }
 
-    /// Gives up on what follows a field: no part counts as the contract's own from here on.
-    pub fn cut(&mut self, field: &str) {
-        if !self.cut {
-            self.cut = true;
-            self.add(
-                field,
-                "and what follows it are not looked at: there are too many faults",
-            );
-        }
+    /// Returns whether there are too many faults to go on; then no part counts as the contract's own.
+    pub fn is_cut(&self) -> bool {
+        self.cut
     }
 
     /// Ends the faults of the form.
@@ -81,11 +87,6 @@ impl Faults {
     /// Returns whether there is none.
     pub fn is_empty(&self) -> bool {
         self.found.is_empty()
-    }
-
-    /// Returns the number of faults.
-    pub fn len(&self) -> usize {
-        self.found.len()
     }
 
     /// Returns the faults, in the order in which they were found.

@@ -59,9 +59,6 @@ pub(crate) const REQUIRED: [(&str, &str); 6] = [
     ("provenance", "how the policy was trained: anything, or {}"),
 ];
 
-/// Number of faults after which no more are looked for: a person has enough to do.
-const MOST_FAULTS: usize = 1000;
-
 /// Adds all faults of a contract's form, and returns the contract with the example's parts in place
 /// of the faulty ones; `None` if it is no contract in any part.
 pub(super) fn read(found: &Value, faults: &mut Faults) -> Option<Contract> {
@@ -109,8 +106,7 @@ impl Place {
         let Err(error) = self.reads(found, example) else {
             return found.clone();
         };
-        if faults.len() >= MOST_FAULTS {
-            faults.cut(&self.field);
+        if faults.is_cut() {
             return sound.clone();
         }
         match (found, sound) {
