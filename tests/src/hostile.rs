@@ -9,7 +9,7 @@ mod import;
 use std::sync::OnceLock;
 
 use lads_compiler::{
-    Bundle, CacheFormat, Image, Options, Storage, WeightFormat, compile, compile_with,
+    Bundle, CacheFormat, Image, Options, Storage, WeightFormat, compile, compile_with, survey,
 };
 use lads_core::{
     ChannelId, DType, Data, GuardConfig, GuardedController, Instruction, Policy, Tick,
@@ -303,4 +303,9 @@ pub fn bundle(edits: &[u8]) {
         !refused.is_empty() && !refused.contains('\n'),
         "{refused:?}"
     );
+    // What `lads inspect` tells of it.
+    if let Ok(found) = survey(&bytes) {
+        let mut told = found.missing.contract.iter();
+        assert!(told.all(|fault| !fault.needed.contains('\n')));
+    }
 }
