@@ -16,7 +16,7 @@ use crate::graph::{Dim, Type, show};
 use crate::onnx::{GraphProto, NodeProto, ValueInfoProto};
 
 use declared::declaration;
-pub(crate) use declared::past;
+pub(crate) use declared::{elements, past};
 
 /// Name of the graph that holds the table of known instructions: evaluated when a bundle is
 /// compiled.
@@ -85,7 +85,7 @@ pub(crate) fn compared(
         widths: HashMap::new(),
     };
     let mut all: Vec<Signature> = vec![];
-    let known = (0..contract.channels.len()).all(|i| checker.shape_is_free(i));
+    let known = checker.shapes_are_free();
     if let Some(words) = contract.words() {
         let mut found = vec![];
         all.push(lookup(graph, words, &mut found));
@@ -160,6 +160,10 @@ impl Checker<'_> {
         self.faults.free(&fields.each_ref().map(String::as_str))
     }
 
+    fn shapes_are_free(&self) -> bool {
+        (0..self.contract.channels.len()).all(|channel| self.shape_is_free(channel))
+    }
+
     /// Returns whether every name that a value may be bound by is the contract's own.
     fn names_are_free(&self) -> bool {
         let channels = self.contract.channels.len();
@@ -188,11 +192,11 @@ impl Checker<'_> {
                 .filter(|value| input || is_used(entry, &value.name[prefix.len()..]));
             own.filter_map(|value| {
                 let own = &value.name[prefix.len()..];
-                let bound = self.blueprint.bind(self.contract, &entry.name, own, input);
-                if bound.is_none() && !named {
-                    return None;
-                }
-                let read = self.value(name, &entry.name, value, input);
+                let read = match self.blueprint.bind(self.contract, &entry.name, own, input) {
+                    Some(bound) => self.value(own, bound, value, input),
+                    None if named => Err(self.unbound(value)),
+                    None => return None,
+                };
                 read.map_err(|problem| problems.push(problem)).ok()
             })
             .collect()
@@ -217,8 +221,11 @@ impl Checker<'_> {
             }
         }
         // What is bound to the cache is known only of values that can be read.
-        let shaped = (0..self.contract.channels.len()).all(|i| self.shape_is_free(i));
-        if problems.len() == before && named && shaped && self.faults.free(&["network", "family"]) {
+        if problems.len() == before
+            && named
+            && self.shapes_are_free()
+            && self.faults.free(&["network", "family"])
+        {
             let checked = self.cache(entry.cache.as_deref(), name, &inputs, &outputs);
             problems.extend(checked.err());
         }
@@ -229,25 +236,22 @@ impl Checker<'_> {
         })
     }
 
-    /// Returns a declared value, if it matches the contract.
+    fn unbound(&self, declared: &ValueInfoProto) -> String {
+        format!(
+            "value {} is bound to nothing: it names no channel and no state of a policy of kind `{}`",
+            declared.name,
+            self.contract.family.name()
+        )
+    }
+
+    /// Returns a declared value, called `name` within its graph, if it matches the contract.
     fn value(
         &mut self,
-        graph: &str,
-        entry: &str,
+        name: &str,
+        bound: Bound,
         declared: &ValueInfoProto,
         input: bool,
     ) -> Result<Value, String> {
-        let name = declared.name[graph.len() + 1..].to_owned();
-        let bound = self
-            .blueprint
-            .bind(self.contract, entry, &name, input)
-            .ok_or_else(|| {
-                format!(
-                    "value {} is bound to nothing: it names no channel and no state of a policy of kind `{}`",
-                    declared.name,
-                    self.contract.family.name()
-                )
-            })?;
         let (mut ty, shape) = declaration(declared)?;
         let len = shape
             .iter()
@@ -321,7 +325,7 @@ impl Checker<'_> {
             Bound::Cache => "`network`".into(),
         };
         Ok(Value {
-            name,
+            name: name.to_owned(),
             ty,
             shape,
             fields,

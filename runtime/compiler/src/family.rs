@@ -122,6 +122,15 @@ pub struct Codebook {
     pub dim: usize,
 }
 
+impl Codebook {
+    fn check(self, faults: &mut Faults) {
+        lengths(
+            [("codebook.size", self.size), ("codebook.dim", self.dim)],
+            faults,
+        );
+    }
+}
+
 /// Rule by which an index is picked from scores.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]

@@ -91,17 +91,19 @@ impl Golden {
         let Some(steps) = steps else {
             return Err(problems);
         };
-        let own = |channel: &Channel| contract.channels.iter().position(|other| other == channel);
-        let free = |channel: &Channel| {
-            let at = format!("channels[{}]", own(channel).unwrap_or(0));
-            let fields = ["name", "role", "dtype", "shape"].map(|field| format!("{at}.{field}"));
-            faults.free(&fields.each_ref().map(String::as_str))
+        let free = |number: usize, fields: &[&str]| {
+            let at = format!("channels[{number}]");
+            let mut fields = fields.iter().map(|field| format!("{at}.{field}"));
+            fields.all(|field| faults.free(&[&field]))
+        };
+        let shaped = |number: usize| free(number, &["name", "role", "dtype", "shape"]);
+        let of = |role| {
+            let all = contract.channels.iter().enumerate();
+            all.filter(move |(number, channel)| channel.role == role && shaped(*number))
         };
         let mut observations = vec![];
-        for channel in contract.observations().filter(|channel| free(channel)) {
-            let at = format!("channels[{}]", own(channel).unwrap_or(0));
-            let limits = ["elements", "min", "max"].map(|field| format!("{at}.{field}"));
-            let limited = faults.free(&limits.each_ref().map(String::as_str));
+        for (number, channel) in of(Role::Observation) {
+            let limited = free(number, &["elements", "min", "max"]);
             match recorded(&tensors, channel, steps, limited) {
                 Ok(values) => observations.push(values),
                 Err(problem) => problems.push(problem),
@@ -113,15 +115,13 @@ impl Golden {
                 vec![]
             })
         };
-        let drawn = contract.with(Role::Noise).next().filter(|_| known);
-        let noise = or_report(noise(&tensors, steps, drawn.filter(|drawn| free(drawn))));
-        let action = [&[steps][..], &contract.action().shape].concat();
-        let acts = contract.with(Role::Action).next();
-        let actions = if acts.is_some_and(free) {
-            or_report(floats(&tensors, "actions", &action))
-        } else {
-            vec![]
-        };
+        let drawn = of(Role::Noise).next().filter(|_| known);
+        let noise = or_report(noise(&tensors, steps, drawn.map(|(_, channel)| channel)));
+        let actions = of(Role::Action).next().map(|(_, channel)| {
+            let shape = [&[steps][..], &channel.shape].concat();
+            floats(&tensors, "actions", &shape)
+        });
+        let actions = or_report(actions.unwrap_or(Ok(vec![])));
         let selected = if faults.free(&["family"]) {
             selected(&tensors, steps, choices(contract))
         } else {

@@ -221,16 +221,7 @@ const OPEN: usize = 256;
 /// context's length counts as `open`, the first one, of batches, as 1.
 fn taken(value: &ValueInfoProto, open: usize) -> Option<(Type, Vec<Dim>)> {
     let tensor = tensor(value)?;
-    let ty = match tensor.elem_type {
-        data_type::FLOAT
-        | data_type::FLOAT16
-        | data_type::BFLOAT16
-        | data_type::DOUBLE
-        | data_type::BOOL
-        | data_type::UINT8 => Type::F32,
-        data_type::INT64 | data_type::INT32 => Type::I64,
-        _ => return None,
-    };
+    let ty = entries::elements(tensor.elem_type)?;
     let dims = tensor.shape.as_ref()?.dim.iter();
     let dims = dims.enumerate().map(|(axis, dim)| {
         let open = Dim::of(if axis == 0 { 1 } else { open });

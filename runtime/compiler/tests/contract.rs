@@ -1,9 +1,9 @@
 //! Tests that contracts that miss something, or contradict themselves, are refused by the field.
 
+mod tiny;
+
 use lads_compiler::Contract;
 use serde_json::Value;
-
-const TINY: &[u8] = include_bytes!("data/tiny.onnx");
 
 /// A broken contract: the place of the change, the JSON written there (nothing: it is removed), and
 /// the expected parts of the error.
@@ -109,15 +109,6 @@ const BROKEN: &[Broken] = &[
     ("/provenance", "", &["`provenance`"]),
 ];
 
-/// Returns the small bundle's contract.
-fn contract() -> Value {
-    let start = br#"{"version""#;
-    let at = TINY.windows(start.len()).position(|part| part == start);
-    let json = &TINY[at.expect("the contract")..];
-    let mut values = serde_json::Deserializer::from_slice(json).into_iter();
-    values.next().unwrap().unwrap()
-}
-
 /// Writes a value, or removes the existing one.
 fn change(contract: &mut Value, pointer: &str, value: &str) {
     let (parent, last) = pointer.rsplit_once('/').expect("a pointer");
@@ -132,9 +123,9 @@ fn change(contract: &mut Value, pointer: &str, value: &str) {
 
 #[test]
 fn every_field_is_refused_by_its_name() {
-    Contract::parse(&contract().to_string()).expect("the contract itself is sound");
+    Contract::parse(&tiny::contract().0.to_string()).expect("the contract itself is sound");
     for (pointer, value, parts) in BROKEN {
-        let mut contract = contract();
+        let (mut contract, _) = tiny::contract();
         change(&mut contract, pointer, value);
         let Err(error) = Contract::parse(&contract.to_string()) else {
             panic!("{pointer} = {value} is read")

@@ -1,20 +1,16 @@
 //! Tests that a file with several faults is told all of them at once.
 
+mod tiny;
+
 use std::collections::BTreeSet;
 
 use lads_compiler::contract::Fault;
 use lads_compiler::{BundleError, Contract, survey};
 use serde_json::{Value, json};
+use tiny::TINY;
 
-const TINY: &[u8] = include_bytes!("data/tiny.onnx");
-
-/// Returns the small bundle's contract.
 fn contract() -> Value {
-    let start = br#"{"version""#;
-    let at = TINY.windows(start.len()).position(|part| part == start);
-    let json = &TINY[at.expect("the contract")..];
-    let mut values = serde_json::Deserializer::from_slice(json).into_iter();
-    values.next().unwrap().unwrap()
+    tiny::contract().0
 }
 
 fn faults(contract: &Value) -> Vec<Fault> {
@@ -162,14 +158,10 @@ fn places(value: &Value, at: &str, see: &mut Vec<String>) {
 
 /// Writes a contract over the one in the small bundle, which is at least as long.
 fn with_contract(contract: &Value) -> Option<Vec<u8>> {
-    let start = br#"{"version""#;
-    let at = TINY.windows(start.len()).position(|part| part == start)?;
-    let mut values = serde_json::Deserializer::from_slice(&TINY[at..]).into_iter::<Value>();
-    values.next()?.ok()?;
-    let len = values.byte_offset();
+    let (_, place) = tiny::contract();
     let json = contract.to_string();
     let mut bytes = TINY.to_vec();
-    let room = &mut bytes[at..at + len];
+    let room = &mut bytes[place];
     room.fill(b' ');
     room.get_mut(..json.len())?.copy_from_slice(json.as_bytes());
     Some(bytes)

@@ -30,7 +30,7 @@ pub(super) fn check(contract: &Contract, faults: &mut Faults) {
 }
 
 /// Returns whether a field of every element of a list is the contract's own.
-pub(crate) fn all_sound(list: &str, len: usize, field: &str, faults: &Faults) -> bool {
+fn all_sound(list: &str, len: usize, field: &str, faults: &Faults) -> bool {
     let mut each = (0..len).map(|i| format!("{list}[{i}].{field}"));
     faults.counted(list) && each.all(|field| faults.sound(&[&field]))
 }

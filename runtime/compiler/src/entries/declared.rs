@@ -8,26 +8,32 @@ pub(super) fn declaration(value: &ValueInfoProto) -> Result<(Type, Vec<Dim>), St
     let name = &value.name;
     let tensor = value.r#type.as_ref().and_then(|ty| ty.tensor_type.as_ref());
     let tensor = tensor.ok_or_else(|| format!("{name} declares no tensor type"))?;
-    let ty = match tensor.elem_type {
-        // Bytes and small integers come as numbers: the graph casts them. So do floats of other widths and truth values.
+    let ty = elements(tensor.elem_type).ok_or_else(|| {
+        format!(
+            "{name} has elements of {}, which no channel and no state has",
+            data_type::name(tensor.elem_type)
+        )
+    })?;
+    let shape = shape_of(tensor).ok_or_else(|| {
+        format!("{name} declares no shape that can be read (the only symbolic axis is `P`)")
+    })?;
+    Ok((ty, shape))
+}
+
+/// Returns the type in which the compiler reads elements of an ONNX type; `None` for one that it does
+/// not read. Bytes and small integers come as numbers, which the graph casts, and so do floats of
+/// other widths and truth values.
+pub(crate) fn elements(elem_type: i32) -> Option<Type> {
+    match elem_type {
         data_type::FLOAT
         | data_type::FLOAT16
         | data_type::BFLOAT16
         | data_type::DOUBLE
         | data_type::BOOL
-        | data_type::UINT8 => Type::F32,
-        data_type::INT64 | data_type::INT32 => Type::I64,
-        other => {
-            return Err(format!(
-                "{name} has elements of {}, which no channel and no state has",
-                data_type::name(other)
-            ));
-        }
-    };
-    let shape = shape_of(tensor).ok_or_else(|| {
-        format!("{name} declares no shape that can be read (the only symbolic axis is `P`)")
-    })?;
-    Ok((ty, shape))
+        | data_type::UINT8 => Some(Type::F32),
+        data_type::INT64 | data_type::INT32 => Some(Type::I64),
+        _ => None,
+    }
 }
 
 fn shape_of(tensor: &TensorTypeProto) -> Option<Vec<Dim>> {

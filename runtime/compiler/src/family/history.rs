@@ -50,13 +50,12 @@ impl Kind for History {
         lengths(
             [
                 ("horizon", self.horizon),
-                ("codebook.size", self.codebook.size),
-                ("codebook.dim", self.codebook.dim),
                 ("features", self.features.unwrap_or(1)),
             ],
             faults,
         );
         self.recall.check("", faults);
+        self.codebook.check(faults);
         self.decision.check(faults);
         instructed(contract, faults);
     }

@@ -45,15 +45,9 @@ impl Kind for Lads {
     }
 
     fn check(&self, contract: &Contract, faults: &mut Faults) {
-        lengths(
-            [
-                ("horizon", self.horizon),
-                ("codebook.size", self.codebook.size),
-                ("codebook.dim", self.codebook.dim),
-            ],
-            faults,
-        );
+        lengths([("horizon", self.horizon)], faults);
         lengths([("features", self.features.unwrap_or(1))], faults);
+        self.codebook.check(faults);
         self.decision.check(faults);
         instructed(contract, faults);
     }

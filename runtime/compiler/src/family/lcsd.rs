@@ -40,14 +40,8 @@ impl Kind for Lcsd {
     }
 
     fn check(&self, contract: &Contract, faults: &mut Faults) {
-        lengths(
-            [
-                ("codebook.size", self.codebook.size),
-                ("codebook.dim", self.codebook.dim),
-                ("denoise.steps", self.denoise.steps),
-            ],
-            faults,
-        );
+        lengths([("denoise.steps", self.denoise.steps)], faults);
+        self.codebook.check(faults);
         self.decision.check(faults);
         one_noise(contract, faults);
         instructed(contract, faults);

@@ -50,13 +50,12 @@ impl Kind for Lisa {
         lengths(
             [
                 ("horizon", self.horizon),
-                ("codebook.size", self.codebook.size),
-                ("codebook.dim", self.codebook.dim),
                 ("features", self.features.unwrap_or(1)),
             ],
             faults,
         );
         network(Some(self.low_level), "family.low_level", faults);
+        self.codebook.check(faults);
         self.decision.check(faults);
         instructed(contract, faults);
     }

@@ -45,12 +45,11 @@ impl Kind for SkillDiffuser {
         lengths(
             [
                 ("horizon", self.horizon),
-                ("codebook.size", self.codebook.size),
-                ("codebook.dim", self.codebook.dim),
                 ("denoise.steps", self.denoise.steps),
             ],
             faults,
         );
+        self.codebook.check(faults);
         self.decision.check(faults);
         one_noise(contract, faults);
         instructed(contract, faults);
