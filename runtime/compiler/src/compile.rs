@@ -2,7 +2,7 @@
 
 use std::collections::{HashMap, HashSet};
 
-use lads_core::{Controller, Policy, PolicyError, ScheduleError, Workspace};
+use lads_core::{Controller, Policy, PolicyError, ScheduleError, SelfTestError, Workspace};
 use lads_image::op::CacheFormat;
 
 use crate::bundle::Bundle;
@@ -163,7 +163,7 @@ pub fn compile_with(bundle: &Bundle, options: &Options) -> Result<Image, Compile
     let image = image::write(bundle, &parts, report(cache_len))?;
     let policy = Policy::new_checked(image.as_bytes()).map_err(CompileError::Image)?;
     if !storage.is_exact() && !options.force {
-        gate(&policy, &storage, parts.tolerance)?;
+        gate(bundle, &policy, &storage, parts.tolerance)?;
     }
     Ok(image)
 }
@@ -215,8 +215,31 @@ fn bounded(elements: usize) -> Result<(), CompileError> {
     Ok(())
 }
 
+/// Refuses an image that does not replay the golden episode, for its formats only if they are the
+/// reason.
+fn gate(
+    bundle: &Bundle,
+    policy: &Policy,
+    storage: &Storage,
+    tolerance: f32,
+) -> Result<(), CompileError> {
+    let Err(error) = replay(policy)? else {
+        return Ok(());
+    };
+    let exact = compile_with(bundle, &Options::exact())?;
+    let exact = Policy::new_checked(exact.as_bytes()).map_err(CompileError::Image)?;
+    if let Err(error) = replay(&exact)? {
+        return Err(CompileError::Unlike { error });
+    }
+    Err(CompileError::Gate {
+        stored: storage.to_string().into(),
+        error,
+        tolerance,
+    })
+}
+
 /// Replays the golden episode, in memory of its own.
-fn gate(policy: &Policy, storage: &Storage, tolerance: f32) -> Result<(), CompileError> {
+fn replay(policy: &Policy) -> Result<Result<(), SelfTestError>, CompileError> {
     bounded(policy.arena_len().saturating_add(policy.state_len()))?;
     let mut arena = vec![0.0; policy.arena_len()];
     let mut state = vec![0.0; policy.state_len()];
@@ -226,11 +249,7 @@ fn gate(policy: &Policy, storage: &Storage, tolerance: f32) -> Result<(), Compil
         }
     })?;
     let replayed = Controller::new(*policy, workspace).self_test();
-    replayed.map(|_| ()).map_err(|error| CompileError::Gate {
-        stored: storage.to_string().into(),
-        error,
-        tolerance,
-    })
+    Ok(replayed.map(|_| ()))
 }
 
 /// Sizes the KV caches for the rows that the longest context takes.

@@ -174,6 +174,15 @@ pub enum CompileError {
         /// Largest absolute difference of an action that counts as equal.
         tolerance: f32,
     },
+    /// Formats of fewer bits were asked for, and the policy does not replay its golden episode with
+    /// 32-bit floats either.
+    #[error(
+        "the golden episode does not replay with 32-bit floats either: {error}; the weights are not those that it was recorded with: export the bundle again"
+    )]
+    Unlike {
+        /// Difference from the recorded episode.
+        error: SelfTestError,
+    },
     /// Formats are given for parts that the bundle does not have.
     #[error(
         "the storage names {parts}, and the bundle has no entry and no layer of that name; tune the bundle again, or name others"

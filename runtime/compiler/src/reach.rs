@@ -77,7 +77,10 @@ impl Reach {
             let Some(chosen) = chooser(contract, blueprint, integers, bound) else {
                 continue;
             };
-            for (rows, shift) in tables(lowered, slot) {
+            // The table that ends first comes first: its remedy is one for the others too.
+            let mut tables: Vec<_> = tables(lowered, slot).collect();
+            tables.sort_by_key(|(rows, shift)| rows - shift);
+            for (rows, shift) in tables {
                 fits(contract, &chosen, rows, shift).map_err(|problem| CompileError::Entry {
                     entry: entry.name.as_str().into(),
                     problem: problem.into(),
@@ -168,13 +171,23 @@ fn fits(
         return Ok(());
     }
     let remedy = match steps {
-        Some(steps) if timestep => format!(
-            ": field `context.steps` is {steps}, for this table it may be {} at most",
-            steps as i64 - (last + 1 - rows)
-        ),
+        Some(steps) if timestep => remedy(contract, steps, steps as i64 - (last + 1 - rows)),
         _ => String::new(),
     };
     Err(format!(
         "a table of {rows} rows is read at row {last} when {what} is {to}{remedy}"
     ))
+}
+
+/// Names the longest context of whole periods within a number of steps.
+fn remedy(contract: &Contract, steps: usize, within: i64) -> String {
+    let period = contract.period().map_or(1, |period| period as i64).max(1);
+    let whole = within - within.rem_euclid(period);
+    if whole > 0 {
+        format!(": field `context.steps` is {steps}, for this table it may be {whole} at most")
+    } else {
+        format!(
+            ": field `context.steps` is {steps}, and the table is shorter than a period of {period} steps"
+        )
+    }
 }

@@ -337,6 +337,17 @@ fn more_steps_than_the_table_of_timesteps_has_rows_are_refused() {
     assert!(!message.contains('\n'), "{message}");
 }
 
+/// Tests a table of 24 rows, of which one is read at every fifth step.
+#[test]
+fn the_longest_context_that_is_named_is_one_of_whole_plans() {
+    let mut bytes = edited("\"steps\": 24", "\"steps\": 30");
+    let at = bytes.windows(12).position(|part| part == b"\"horizon\": 4");
+    bytes[at.expect("the horizon") + 11] = b'5';
+    let bundle = Bundle::from_bytes(&bytes).unwrap_or_else(|error| panic!("{error}"));
+    let message = compile(&bundle).unwrap_err().to_string();
+    assert!(message.contains("it may be 25 at most"), "{message}");
+}
+
 /// Parses the tiny bundle's contract with this `language.acceptance`.
 fn with_acceptance(acceptance: serde_json::Value) -> Result<Contract, BundleError> {
     let mut contract = contract();

@@ -158,6 +158,29 @@ fn what_changes_the_policy_is_refused_unless_forced() {
     assert!(self_test(&policy).is_err());
 }
 
+/// Alters a weight after the recording: more bits would not help.
+#[test]
+fn what_does_not_replay_at_all_is_not_told_as_too_few_bits() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/tiny.onnx");
+    let mut bytes = std::fs::read(path).unwrap();
+    // A tensor's name, and the head of its 12 bytes of values.
+    let head = b"low_level.layer.6.bias\x4a\x0c";
+    let at = bytes.windows(head.len()).position(|part| part == head);
+    let values = at.unwrap() + head.len();
+    bytes[values..values + 4].copy_from_slice(&0.5_f32.to_le_bytes());
+    let bundle = Bundle::from_bytes(&bytes).unwrap();
+    for (format, tolerance) in [(WeightFormat::Bf16, 1e-4), (WeightFormat::F16, 1e-9)] {
+        let refused = compile_with(&bundle, &options(format, tolerance)).unwrap_err();
+        assert!(
+            matches!(refused, CompileError::Unlike { .. }),
+            "{format:?}: {refused}"
+        );
+    }
+    // A tolerance that no format meets is not the bundle's fault.
+    let refused = compile_with(&tiny(), &options(WeightFormat::F16, 1e-9)).unwrap_err();
+    assert!(matches!(refused, CompileError::Gate { .. }), "{refused}");
+}
+
 /// Rounds weights that no action depends on, the cache and all but the low level's, which may only
 /// change the chosen plan.
 #[test]
