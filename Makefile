@@ -33,7 +33,7 @@ first-build = @ls target/release/deps/lib$(1)-*.rlib >/dev/null 2>&1 || echo "Th
 
 ## run: the shipped policy over the paper's seen and unseen instructions; another job of lads-run by JOB, such as JOB="replay flight.mcap"
 run: setup
-	$(call first-build,lads_sim,the simulator,2)
+	$(call first-build,lads_sim,the simulator,4)
 	cargo run --release -p lads-sim --features camera --bin lads-run -- $(JOB) --model $(MODEL) $(ARGS)
 
 ## report: the same with charts, as one HTML page
@@ -222,6 +222,7 @@ $(MATURIN)/stamp: runtime/python/pyproject.toml
 
 ## wheel: the Python package `lads` for this platform, into target/wheels
 wheel: $(MATURIN)/stamp
+	$(call first-build,pyo3,the package,2)
 	rm -f target/wheels/lads-*.whl
 	$(MATURIN)/bin/python -m maturin build --quiet --release --manifest-path runtime/python/Cargo.toml --out target/wheels
 
@@ -240,16 +241,19 @@ test-python: setup wheel $(VENV)/stamp
 ## collect: demonstrations into data/ENV.safetensors; ENV=kitchen (scripted, of the 22 seen instructions), lorel (random, labelled), or kitchen-image and
 ##         lorel-image (as many as are drawn)
 collect: setup
+	$(call first-build,lads_sim,the simulator,4)
 	cargo run --release -p lads-sim --bin lads-collect -- --env $(ENV:-image=) $(COLLECT_$(ENV)) -o data/$(ENV).safetensors
 
 ## frames: what the environment's camera sees in every state of $(DATA), for settings on images (ENV=lorel DATA=data/lorel.safetensors); about
 ##         20 ms each on one core, and the same command goes on where it was stopped. Then: make train ENV=lorel-image DATA=... FRAMES=...
 frames: setup
+	$(call first-build,lads_sim,the simulator,4)
 	cargo run --release -p lads-sim --features camera --bin lads-run -- frames $(DATA) -o $(DATA:.safetensors=.frames)
 
 ## features: what the frozen encoder of exporter/configs/$(ENV).toml (ENV=kitchen-image) makes of every state of $(DATA); 70 ms each on one core, and
 ##           the same command goes on where it was stopped. Then: make train ENV=kitchen-image DATA=... FEATURES=...
 features: setup $(VENV)/stamp
+	$(call first-build,lads_sim,the simulator,4)
 	cargo build --release -p lads-sim --features camera --bin lads-run
 	$(PY) -m lads_exporter features --config exporter/configs/$(ENV).toml --data $(DATA) -o $(DATA:.safetensors=.features)
 
@@ -266,6 +270,7 @@ export: $(VENV)/stamp
 ##        models/TABLES.md; hours, and the same command goes on where it was stopped. TABLE_ARGS="--jobs 2" trains two at a time, "--device cuda" on a
 ##        GPU, "--engine ray" on a cluster (docs/cluster.md)
 table: setup $(VENV)/stamp $(DATA) $(SEEN_$(ENV))
+	$(call first-build,lads_sim,the simulator,4)
 	cargo build --release -p lads-sim $(if $(filter %-image,$(ENV)),--features camera) --bin lads-run
 	$(PY) -m lads_exporter table exporter/tables/$(ENV).toml --data $(DATA) $(TABLE_ARGS)
 
@@ -286,15 +291,18 @@ reference: $(VENV)/stamp
 
 ## verify: is the compiled policy the reference's? Fails unless EQUIVALENT; `lads-run verify` itself exits with 0, 1 DIFFERENT or 3 INCONCLUSIVE
 verify: setup
+	$(call first-build,lads_sim,the simulator,4)
 	cargo run --release -p lads-sim --features camera --bin lads-run -- verify --model $(MODEL) $(ARGS)
 
 ## tune: the smallest weights and caches that keep every plan of $(MODEL)'s reference, written into the bundle; ARGS="-o FILE" leaves it as it is
 tune: setup
+	$(call first-build,lads_sim,the simulator,4)
 	cargo run --release -p lads-sim --features camera --bin lads-run -- tune --model $(MODEL) $(ARGS)
 
 ## mutate: changes of every kind to $(MODEL), what each moves, what its verification says and what is left of its success; an hour. ARGS="-o rows.md"
 ##         writes the row of each; ARGS="--every 3 --run-every 8" asks and runs fewer episodes, minutes
 mutate: setup
+	$(call first-build,lads_sim,the simulator,4)
 	cargo run --release -p lads-sim --example mutate -- $(MODEL) $(ARGS)
 
 # OpenVINO is a peer of the benchmarks only; where it does not install, the page says so.

@@ -11,6 +11,7 @@ pub mod evaluation;
 pub mod film;
 pub mod frames;
 pub mod output;
+mod queue;
 pub mod random;
 pub mod recordings;
 #[cfg(feature = "report")]

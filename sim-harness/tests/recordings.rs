@@ -296,7 +296,7 @@ fn commanded_plans_are_followed_and_encoded() {
     }
     assert_eq!(replayed(&policy, &log(&policy, &evaluated)).differences, []);
 
-    let agreement = plans::agreement(&policy, &evaluated.traces).unwrap();
+    let agreement = plans::agreement(&policy, Isa::detect(), &evaluated.traces).unwrap();
     let full: usize = evaluated
         .traces
         .iter()
@@ -304,7 +304,7 @@ fn commanded_plans_are_followed_and_encoded() {
         .sum();
     assert_eq!(agreement.segments, full);
     let recordings = evaluated.traces.iter().map(|trace| trace.steps.as_slice());
-    let encoded = plans::encode(&policy, recordings).unwrap();
+    let encoded = plans::encode(&policy, Isa::detect(), recordings).unwrap();
     let agreed = encoded.iter().flatten().zip([1, 0, 2].iter().cycle());
     assert!(encoded.iter().all(|plans| plans.len() <= 3));
     if encoded.iter().all(|plans| plans.len() == 3) {
@@ -319,7 +319,7 @@ fn commanded_plans_are_followed_and_encoded() {
         &steps[1..=horizon],
         &steps[..horizon - 1],
     ];
-    let of_parts = plans::encode(&policy, parts).unwrap();
+    let of_parts = plans::encode(&policy, Isa::detect(), parts).unwrap();
     assert_eq!(
         of_parts.iter().map(Vec::len).collect::<Vec<_>>(),
         [2, 2, 1, 0]

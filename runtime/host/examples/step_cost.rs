@@ -4,14 +4,32 @@
 //! `cargo run --release -p lads-host --example step_cost -- MODEL STEPS` prints nanoseconds per
 //! step; benches/python.py compares it with Python.
 
+use std::process::ExitCode;
 use std::time::Instant;
 
 use lads_core::{Data, Instruction};
 
-fn main() -> Result<(), Box<dyn std::error::Error>> {
+fn main() -> ExitCode {
+    match measure() {
+        Ok(nanoseconds) => {
+            println!("{nanoseconds:.1}");
+            ExitCode::SUCCESS
+        }
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+fn measure() -> Result<f64, Box<dyn std::error::Error>> {
     let mut arguments = std::env::args().skip(1);
     let (model, steps) = match (arguments.next(), arguments.next()) {
-        (Some(model), Some(steps)) => (model, steps.parse::<u32>()?),
+        (Some(model), Some(steps)) => {
+            let number = steps.parse::<u32>();
+            let number = number.map_err(|_| format!("{steps} is no number of steps"))?;
+            (model, number)
+        }
         _ => return Err("give a policy and a number of steps".into()),
     };
     let mut loaded = lads_host::open(model.as_ref())?.load()?;
@@ -35,6 +53,5 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         }
         best = best.min(start.elapsed().as_nanos() as f64 / f64::from(steps));
     }
-    println!("{best:.1}");
-    Ok(())
+    Ok(best)
 }

@@ -85,7 +85,8 @@ mod x86_64 {
         // Rounding and the masks of exceptions stay as Rust wants them. Neither `readonly` nor `nomem`: loads and stores, and so
         // the arithmetic between them, stay on their side of the switch, as the head of this module explains.
         unsafe {
-            asm!("ldmxcsr [{}]", in(reg) &raw const mode, options(nostack, preserves_flags));
+            // Not `preserves_flags`, which takes in the register's sticky flags of exceptions.
+            asm!("ldmxcsr [{}]", in(reg) &raw const mode, options(nostack));
         }
     }
 }

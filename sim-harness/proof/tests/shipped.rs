@@ -1,4 +1,5 @@
-//! Tests the shipped references: they can be read, are what their own contracts say, and record all that is compared.
+//! Tests the shipped references: they can be read, are what their own contracts say, come from the training and record all that is
+//! compared.
 
 use std::path::Path;
 
@@ -46,6 +47,7 @@ fn shipped_references_are_whole() {
             action_len: len("action"),
         };
         reference.check(&subject).unwrap();
+        assert_eq!(reference.weights_from, "the run's checkpoint", "{name}");
         assert!(reference.float_noise.is_some());
         let episodes = reference.instructions.iter().flat_map(|row| &row.episodes);
         let mut traces = episodes.filter_map(|episode| Some((episode, episode.trace.as_ref()?)));

@@ -7,7 +7,6 @@
 
 use std::collections::HashMap;
 use std::num::NonZeroUsize;
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc;
 
 use serde_json::json;
@@ -19,6 +18,7 @@ use crate::expert::Performer;
 use crate::instructions::Instruction;
 use crate::kitchen::spec::{ACTION_NAMES, CONTROL_PERIOD_S, OBSERVATION_NAMES, SUB_TASK_NAMES};
 use crate::kitchen::{self, Kitchen, Noise, Scene};
+use crate::queue::Queue;
 
 /// Longest demonstration in control steps: shorter than an episode of 280 steps, so that a policy that is a little slower still finishes.
 pub const MAX_STEPS: usize = 270;
@@ -87,16 +87,16 @@ pub fn collect(
     if !(0.0..=1.0).contains(&settings.recovery_noise) {
         return Err(CollectError::BadNoise);
     }
-    let next = AtomicUsize::new(0);
+    let queue = Queue::new(0..instructions.len());
     let mut results: Vec<Option<(Vec<Demonstration>, Tally)>> = vec![None; instructions.len()];
     std::thread::scope(|scope| -> Result<(), CollectError> {
         let (sender, receiver) = mpsc::channel();
         for _ in 0..settings.threads.get().min(instructions.len()) {
-            let (sender, next) = (sender.clone(), &next);
+            let (sender, queue) = (sender.clone(), &queue);
             scope.spawn(move || {
+                let _halts = queue.halts_on_panic();
                 let mut kitchen = Kitchen::new(scene, settings.noise);
-                loop {
-                    let index = next.fetch_add(1, Ordering::Relaxed);
+                while let Some(index) = queue.take(1).map(|taken| taken.start) {
                     let Some(instruction) = instructions.get(index) else {
                         return;
                     };

@@ -5,7 +5,7 @@
 //! episode that does not finish, or a panic in one; then all threads stop after their current episode.
 
 use std::panic::resume_unwind;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 
 use lads_compiler::{CompileError, Contract};
@@ -16,6 +16,7 @@ use thiserror::Error;
 use crate::environment::{Environment, EpisodeSeed};
 use crate::faults::Faults;
 use crate::plans::PlanBook;
+use crate::queue::Queue;
 use crate::random::Stream;
 use crate::results::{self, Asked};
 use crate::rollout::{Actor, Driver, Episode, Observer, Pictures, RolloutError, Task, Timing};
@@ -133,15 +134,6 @@ pub struct Evaluated {
     pub timing: Timing,
 }
 
-/// Raises its flag when a panic unwinds through its scope.
-struct OnPanic<'f>(&'f AtomicBool);
-
-impl Drop for OnPanic<'_> {
-    fn drop(&mut self) {
-        self.0.fetch_or(thread::panicking(), Ordering::Relaxed);
-    }
-}
-
 /// Episodes that one thread ran, with their places in the queue.
 struct Share {
     episodes: Vec<(usize, Episode, Option<Trace>)>,
@@ -188,18 +180,17 @@ impl Evaluation<'_> {
         stop: &AtomicBool,
         finished: &(dyn Fn() + Sync),
     ) -> Result<Evaluated, EvaluationError> {
-        let queue = AtomicUsize::new(0);
-        // Raised by a thread that failed, so that the others do not work for nothing.
-        let failed = AtomicBool::new(false);
+        let queue = Queue::new(0..self.len());
         let next = || {
-            let halted = stop.load(Ordering::Relaxed) || failed.load(Ordering::Relaxed);
-            let place = (!halted).then(|| queue.fetch_add(1, Ordering::Relaxed))?;
-            (place < self.len()).then_some(place)
+            let stopped = stop.load(Ordering::Relaxed);
+            Some((!stopped).then(|| queue.take(1))??.start)
         };
         let work = || {
-            let _raised = OnPanic(&failed);
+            let _halts = queue.halts_on_panic();
             let done = self.worker(open, &next, finished);
-            failed.fetch_or(done.is_err(), Ordering::Relaxed);
+            if done.is_err() {
+                queue.halt();
+            }
             done
         };
         let threads = self.threads.clamp(1, self.len().max(1));

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read as _, Seek as _, SeekFrom, Write as _};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use std::thread;
 
@@ -19,6 +19,7 @@ use thiserror::Error;
 use super::{Frames, Rendering};
 use crate::environment::Environment;
 use crate::film::FilmError;
+use crate::queue::Queue;
 
 /// `format` of the metadata.
 pub const FORMAT: &str = "lads-frames";
@@ -161,14 +162,14 @@ pub fn make(
     }
     let (mut file, mut done) = resume(&part, &head, rendering.frame_len(), all)?;
     progress(done);
-    let next = AtomicUsize::new(done);
-    let halted = AtomicBool::new(false);
+    // A chunk that never comes, because a thread panicked, would let the later ones pile up.
+    let queue = Queue::new(done..all);
     thread::scope(|scope| {
         let (sender, receiver) = mpsc::sync_channel(2 * threads.max(1));
         for _ in 0..threads.max(1) {
-            let (sender, next, halted) = (sender.clone(), &next, &halted);
+            let (sender, queue) = (sender.clone(), &queue);
             scope.spawn(move || {
-                let _halts = HaltsOnPanic(halted);
+                let _halts = queue.halts_on_panic();
                 let mut frames = match Frames::new(open().as_ref(), rendering) {
                     Ok(frames) => frames,
                     Err(error) => {
@@ -177,13 +178,11 @@ pub fn make(
                         return;
                     }
                 };
-                loop {
-                    let first = next.fetch_add(CHUNK, Ordering::Relaxed);
-                    let over = stop.load(Ordering::Relaxed) || halted.load(Ordering::Relaxed);
-                    if first >= all || over {
+                while let Some(rows) = queue.take(CHUNK) {
+                    if stop.load(Ordering::Relaxed) {
                         return;
                     }
-                    let rows = first..all.min(first + CHUNK);
+                    let first = rows.start;
                     let drawn = states.draw(rows, &mut frames);
                     let failed = drawn.is_err();
                     if sender.send((first, drawn)).is_err() || failed {
@@ -203,7 +202,7 @@ pub fn make(
             }
             Ok(())
         });
-        halted.store(true, Ordering::Relaxed);
+        queue.halt();
         // Who waits to send may go.
         drop(receiver);
         outcome
@@ -213,17 +212,6 @@ pub fn make(
         std::fs::rename(&part, path).map_err(io_error(path))?;
     }
     Ok(Progress { done, all })
-}
-
-/// Halts the other threads if its own panics: a chunk that never comes would let the later ones pile up.
-struct HaltsOnPanic<'h>(&'h AtomicBool);
-
-impl Drop for HaltsOnPanic<'_> {
-    fn drop(&mut self) {
-        if thread::panicking() {
-            self.0.store(true, Ordering::Relaxed);
-        }
-    }
 }
 
 fn io_error(path: &Path) -> impl Fn(io::Error) -> CacheError {

@@ -8,7 +8,9 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use lads_core::{ChannelId, Contract, Controller, Data, EncodeError, FollowError, Policy, Role};
+use lads_core::{
+    ChannelId, Contract, Controller, Data, EncodeError, FollowError, Isa, Policy, Role,
+};
 use lads_host::{Memory, MemoryError};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -239,11 +241,14 @@ impl Segment {
 /// shorter than one segment, which has none.
 pub fn encode<'t>(
     policy: &Policy<'_>,
+    isa: Isa,
     recordings: impl IntoIterator<Item = &'t [Step]>,
 ) -> Result<Vec<Vec<u32>>, PlanError> {
     let encoder = Segment::of(policy).ok_or(PlanError::Encode(EncodeError::NoEncoder))?;
     let mut memory = Memory::of(policy).map_err(PlanError::Memory)?;
-    let mut controller = memory.controller(policy).map_err(PlanError::Memory)?;
+    let mut controller = memory
+        .controller_with(policy, isa)
+        .map_err(PlanError::Memory)?;
     let mut of_segment = |segment: &[Step]| {
         let observations: Vec<f32> = segment.iter().flat_map(|s| s.observation.clone()).collect();
         let actions: Vec<f32> = segment.iter().flat_map(|s| s.executed.clone()).collect();
@@ -263,8 +268,12 @@ pub fn encode<'t>(
 }
 
 /// Encodes every executed segment and compares with the plan that was in force.
-pub fn agreement(policy: &Policy<'_>, traces: &[Trace]) -> Result<Agreement, PlanError> {
-    let encoded = encode(policy, traces.iter().map(|trace| trace.steps.as_slice()))?;
+pub fn agreement(policy: &Policy<'_>, isa: Isa, traces: &[Trace]) -> Result<Agreement, PlanError> {
+    let encoded = encode(
+        policy,
+        isa,
+        traces.iter().map(|trace| trace.steps.as_slice()),
+    )?;
     let encoder = Segment::of(policy).ok_or(PlanError::Encode(EncodeError::NoEncoder))?;
     let mut total = Agreement::default();
     for (trace, encoded) in traces.iter().zip(&encoded) {

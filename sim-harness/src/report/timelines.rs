@@ -6,6 +6,8 @@ use kuva::render::plots::Plot;
 
 use super::Report;
 use super::charts::{COLORS, Chart, HALF, Mark, chart, sized};
+use crate::environment::Completion;
+use crate::results::{self, Asked};
 use crate::trace::Trace;
 
 /// Completions that are nearer than this share of an episode have one label in a timeline.
@@ -43,7 +45,8 @@ fn timeline(report: &Report<'_>, trace: &Trace) -> Chart {
         .with_x_axis_max(steps)
         .with_y_axis_min(0.0)
         .with_y_axis_max(HEADROOM * report.plans as f64);
-    let marks = marks(report, trace);
+    let asked = results::asked(report.contract, trace.instruction as usize);
+    let marks = marks(report.sub_tasks, asked.as_ref(), &trace.outcome.completions);
     // Numbers of completions that are close to each other stand at the first of their lines.
     let mut together: Vec<(f64, Vec<&Mark>)> = Vec::new();
     for mark in &marks {
@@ -73,25 +76,49 @@ fn timeline(report: &Report<'_>, trace: &Trace) -> Chart {
     }
 }
 
-/// Lists the completions of an episode in their order, and whether the instruction asks for them.
-fn marks(report: &Report<'_>, trace: &Trace) -> Vec<Mark> {
-    let known = crate::results::asked(report.contract, trace.instruction as usize);
-    let asked = |name: &str| {
-        // A sentence outside the table asks for what `--sub-tasks` says, which is not in the contract.
-        known
-            .as_ref()
-            .is_none_or(|known| known.sub_tasks.contains(&name))
-    };
-    let mut completions: Vec<_> = trace.outcome.completions.iter().collect();
+/// Lists the completions of an episode in their order, and whether the instruction asks for them; a sentence outside the table asks for
+/// what `--sub-tasks` says, which is not in the contract.
+fn marks(sub_tasks: &[&str], asked: Option<&Asked<'_>>, completions: &[Completion]) -> Vec<Mark> {
+    let mut completions: Vec<_> = completions.iter().collect();
     completions.sort_by_key(|done| done.step);
-    let mark = |(number, done): (usize, &crate::environment::Completion)| {
-        let name = report.sub_tasks.get(done.sub_task).copied().unwrap_or("?");
+    let mark = |(number, done): (usize, &Completion)| {
+        let name = sub_tasks.get(done.sub_task).copied().unwrap_or("?");
         Mark {
             number,
             name: name.to_owned(),
             step: done.step,
-            asked: asked(name),
+            asked: asked.is_none_or(|asked| asked.sub_tasks.contains(&name)),
         }
     };
     (1..).zip(completions).map(mark).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_nobody_asked_for_is_marked() {
+        let asked = Asked {
+            id: "k",
+            text: "move the kettle",
+            split: "seen",
+            sub_tasks: vec!["kettle"],
+        };
+        let completions = [(1, 30), (0, 20)].map(|(sub_task, step)| Completion { sub_task, step });
+        let listed = |asked| {
+            let marks = marks(&["kettle", "microwave"], asked, &completions);
+            let told = |mark: Mark| (mark.number, mark.name, mark.step, mark.asked);
+            marks.into_iter().map(told).collect::<Vec<_>>()
+        };
+        let [first, second] = [(1, "kettle", 20), (2, "microwave", 30)];
+        let told = |(number, name, step): (usize, &str, usize), asked| {
+            (number, name.to_owned(), step, asked)
+        };
+        assert_eq!(
+            listed(Some(&asked)),
+            [told(first, true), told(second, false)]
+        );
+        assert_eq!(listed(None), [told(first, true), told(second, true)]);
+    }
 }

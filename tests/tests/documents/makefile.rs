@@ -66,6 +66,31 @@ fn every_phony_name_has_a_rule() {
     );
 }
 
+/// Tests that nobody waits for a build of minutes without a word.
+#[test]
+fn every_release_build_says_what_it_takes() {
+    let text = makefile();
+    let lines: Vec<_> = text.lines().collect();
+    let builds = |line: &str| {
+        ["run", "build"].iter().any(|command| {
+            let words = line.trim_start_matches('\t').strip_prefix("cargo ");
+            words.is_some_and(|words| words.starts_with(&format!("{command} --release")))
+        })
+    };
+    let (mut found, mut silent) = (0, vec![]);
+    for pair in lines.windows(2) {
+        if let [before, line] = pair
+            && builds(line)
+        {
+            found += 1;
+            if !before.starts_with("\t$(call first-build,") {
+                silent.push(line);
+            }
+        }
+    }
+    assert!(found > 10 && silent.is_empty(), "{found}: {silent:#?}");
+}
+
 #[test]
 fn every_rule_with_a_help_line_is_there() {
     let text = makefile();

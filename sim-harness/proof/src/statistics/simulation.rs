@@ -333,7 +333,7 @@ fn the_same_policy_is_equivalent_where_there_are_enough_pairs() {
     assert!(exactly(&mut regions, rounding, 500).equivalent > 0.99);
 }
 
-/// Prints the tables of README.md; some minutes.
+/// Prints the tables of README.md and holds their sizes to the bounds, with as many pairs as the smaller tests have no time for.
 #[test]
 #[ignore = "minutes; prints the tables of README.md"]
 fn size_and_power() {
@@ -350,23 +350,24 @@ fn size_and_power() {
     ] {
         println!("\n{title}\n\n{heading}\n{rule}");
         for world in worlds(loss) {
-            let row = NUMBERS
-                .map(|n| format!("{:.1}", 100.0 * exactly(&mut regions, world, n).equivalent));
+            let found = NUMBERS.map(|n| exactly(&mut regions, world, n).equivalent);
+            let row = found.map(|found| format!("{:.1}", 100.0 * found));
             println!("| {} | {} |", world.name(), row.join(" | "));
+            let bounded = loss < MARGIN || found.iter().all(|&found| found <= 0.05);
+            assert!(bounded, "{}: {found:?}", world.name());
         }
     }
     println!("\nDIFFERENT in % by one rate of ten\n\n{heading}\n{rule}");
     for loss in [0.0, 0.1, 0.2, 0.4] {
-        let row = NUMBERS.map(|n| {
-            format!(
-                "{:.2}",
-                100.0 * exactly(&mut regions, World::Apart { p: 0.8, loss }, n).beyond
-            )
-        });
+        let world = World::Apart { p: 0.8, loss };
+        let found = NUMBERS.map(|n| exactly(&mut regions, world, n).beyond);
+        let row = found.map(|found| format!("{:.2}", 100.0 * found));
         println!(
             "| independent, p = 0.8, loss {loss} | {} |",
             row.join(" | ")
         );
+        let bounded = loss > 0.0 || found.iter().all(|&found| 10.0 * found <= 0.01);
+        assert!(bounded, "{found:?}");
     }
     for (title, loss) in [
         ("though it is 0.1 (size: at most 5)", N_MARGIN),
@@ -374,13 +375,12 @@ fn size_and_power() {
     ] {
         println!("\nN-rate: EQUIVALENT in % by loss {title}\n\n{heading}\n{rule}");
         for world in N_WORLDS {
-            let row = NUMBERS.map(|n| {
-                format!(
-                    "{:.1}",
-                    100.0 * n_rates(world, loss, n, trials, 13).equivalent
-                )
-            });
+            let found = NUMBERS.map(|n| n_rates(world, loss, n, trials, 13).equivalent);
+            let row = found.map(|found| format!("{:.1}", 100.0 * found));
             println!("| {} | {} |", world.0, row.join(" | "));
+            let bound = 0.05 + slack(0.05, trials);
+            let bounded = loss < N_MARGIN || found.iter().all(|&found| found <= bound);
+            assert!(bounded, "{}: {found:?}", world.0);
         }
     }
 }

@@ -136,7 +136,7 @@ pub fn encode(asked: &Encode) -> Result<ExitCode, End> {
         .flights
         .iter()
         .map(|flight| flight.trace.steps.as_slice());
-    let plans = plans::encode(&policy, recordings).map_err(|error| about(&error))?;
+    let plans = plans::encode(&policy, program.isa(), recordings).map_err(|error| about(&error))?;
     let sequence = |(flight, plans): (&Flight, Vec<u32>)| PlanSequence {
         instruction: flight.instruction_id.clone(),
         episode: Some(flight.trace.episode),

@@ -127,7 +127,7 @@ fn rollouts(
         return Ok(ExitCode::SUCCESS);
     }
     if files.monitor {
-        let agreement = plans::agreement(&evaluation.policy, &evaluated.traces);
+        let agreement = plans::agreement(&evaluation.policy, evaluation.isa, &evaluated.traces);
         results.plan_agreement =
             Some(agreement.map_err(|error| refused(format!("--monitor: {error}; leave it out")))?);
     }

@@ -7,7 +7,6 @@
 use std::collections::HashMap;
 use std::num::NonZeroUsize;
 use std::path::Path;
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc;
 
 use safetensors::Dtype;
@@ -24,6 +23,7 @@ use crate::collect::FIRST_EPISODE;
 use crate::dataset::{self, DatasetError, Tensor, f32_bytes, i64_bytes};
 use crate::environment::{Environment, EpisodeSeed};
 use crate::instructions::Instruction;
+use crate::queue::Queue;
 use crate::random::Stream;
 
 /// Fourth number of the entropy of the stream that actions and the order of clauses are drawn from.
@@ -80,25 +80,21 @@ pub fn collect(
     if settings.episodes == 0 {
         return Err(NoEpisodes);
     }
-    let next = AtomicUsize::new(0);
+    let queue = Queue::new(0..settings.episodes);
     let chunks = settings.episodes.div_ceil(CHUNK);
     let mut parts: Vec<Vec<Trajectory>> = vec![Vec::new(); chunks];
     std::thread::scope(|scope| {
         let (sender, receiver) = mpsc::channel();
         for _ in 0..settings.threads.get().min(chunks) {
-            let (sender, next) = (sender.clone(), &next);
+            let (sender, queue) = (sender.clone(), &queue);
             scope.spawn(move || {
+                let _halts = queue.halts_on_panic();
                 let mut lorel = Lorel::new(scene);
-                loop {
-                    let chunk = next.fetch_add(1, Ordering::Relaxed);
-                    let first = chunk * CHUNK;
-                    if first >= settings.episodes {
-                        return;
-                    }
-                    let last = settings.episodes.min(first + CHUNK);
+                while let Some(episodes) = queue.take(CHUNK) {
+                    let (chunk, finished) = (episodes.start / CHUNK, episodes.len());
                     let run = |episode| trajectory(&mut lorel, settings.seed, episode as u64);
-                    let done: Vec<_> = (first..last).filter_map(run).collect();
-                    if sender.send((chunk, last - first, done)).is_err() {
+                    let done: Vec<_> = episodes.filter_map(run).collect();
+                    if sender.send((chunk, finished, done)).is_err() {
                         return;
                     }
                 }
