@@ -72,8 +72,10 @@ test: setup lint test-rust
 ## test-torch: the tests in Python, of the exporter, of parity and of the package; downloads PyTorch (2.9 GB in all on x86-64 Linux)
 test-torch: test-exporter test-python
 
-## test-full: both, and every command that README.md and the other documents show, as typed, in a copy of the project; hours
+## test-full: both, the verdict's size with up to 1,000 pairs, and every command that README.md and the other documents show, as typed, in a copy
+##            of the project; hours
 test-full: test test-torch
+	cargo test --release -p lads-proof -- --ignored --nocapture size
 	cargo test -p lads-tests --test documents -- --ignored --nocapture
 
 ## setup: MuJoCo and the simulator's assets into vendor/ (idempotent)
