@@ -151,8 +151,12 @@ fn a_log_replays_and_its_plans_run() {
     assert_schema(&results);
     assert!(out(&["replay", log]).starts_with("EQUAL: 1 episodes"));
     out(&["encode", log, "--json", plans]);
-    let table = out(&[&first[..], &["--plans", plans, "--monitor"]].concat());
+    let commanded = [&first[..], &["--plans", plans, "--monitor"]].concat();
+    let (table, again) = self::results(&commanded, &json);
     assert!(table.contains("mkbs"));
+    // Plans that are read from a success, its last steps too, succeed.
+    let succeeds = |results: &Value| results["instructions"][0]["runs"][0]["success"] == true;
+    assert!(succeeds(&results) && succeeds(&again), "{table}");
 
     let mut cut = fs::read(log).unwrap();
     cut.truncate(cut.len() - 9);

@@ -22,6 +22,24 @@ fn inspect_tells_what_the_contract_and_the_image_hold() {
         for name in names.chain(contract.instructions().map(|known| known.text)) {
             assert!(text.contains(name), "{name} is not in: {text}");
         }
+        // What an action means: relative to what, times what, in which unit.
+        let mut scaled = 0;
+        for (channel, told) in contract
+            .channels()
+            .zip(json["contract"]["channels"].as_array().unwrap())
+        {
+            assert_eq!(told["reference"], channel.reference());
+            assert!(text.contains(channel.reference()), "{text}");
+            for (element, told) in channel.elements().zip(told["elements"].as_array().unwrap()) {
+                assert_eq!(told["physical_unit"], element.physical_unit);
+                if element.scale != 1.0 {
+                    let meaning = format!("= {} + {} * value", element.offset, element.scale);
+                    assert!(text.contains(&meaning), "{meaning}: {text}");
+                    scaled += 1;
+                }
+            }
+        }
+        assert!(scaled > 0);
         let sizes = &json["sizes"];
         assert_eq!(sizes["image_bytes"], policy.image_bytes());
         let [arena, state] = [policy.arena_len(), policy.state_len()].map(|len| 4 * len);
