@@ -58,3 +58,24 @@ fn shipped_references_are_whole() {
         }));
     }
 }
+
+#[test]
+fn shipped_certificates_are_of_equivalent_policies() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models/certificates");
+    let page = std::fs::read_to_string(folder.join("README.md")).unwrap();
+    let mut count = 0;
+    for entry in std::fs::read_dir(&folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.extension().is_none_or(|extension| extension != "json") {
+            continue;
+        }
+        let text = std::fs::read_to_string(&path).unwrap();
+        let certificate: serde_json::Value = serde_json::from_str(&text).unwrap();
+        assert_eq!(certificate["format"], "lads-certificate");
+        assert_eq!(certificate["verdict"], "EQUIVALENT", "{}", path.display());
+        let name = path.file_name().unwrap().to_str().unwrap();
+        assert!(page.contains(name), "{name} is not in README.md");
+        count += 1;
+    }
+    assert!(count > 0);
+}
