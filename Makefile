@@ -38,17 +38,17 @@ run: setup
 
 ## report: the same with charts, as one HTML page
 report: setup
-	$(call first-build,kuva,the charts,4)
+	$(call first-build,kuva,the charts,5)
 	cargo run --release -p lads-sim --features report,record --bin lads-run -- --model $(MODEL) --report report.html $(ARGS)
 
 ## compare: several policies of one environment on one page, INPUTS="A.onnx B.results.json models/tables.json"; ARGS="--episodes 10"
 compare: setup
-	$(call first-build,kuva,the charts,4)
+	$(call first-build,kuva,the charts,5)
 	cargo run --release -p lads-sim --features report,record --bin lads-run -- report $(INPUTS) -o report.html $(ARGS)
 
 ## record: the first episode of an instruction as episode.gif; ARGS="--instruction kbls"
 record: setup
-	$(call first-build,gif,the pictures,4)
+	$(call first-build,gif,the pictures,5)
 	cargo run --release -p lads-sim --features report,record --bin lads-run -- record episode.gif --model $(MODEL) --episodes 1 $(ARGS)
 
 ## viewer: the policy at real time in a window (X display); ARGS="--instruction kbls --episodes 3"
