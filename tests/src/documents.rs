@@ -96,6 +96,27 @@ pub struct Document {
     pub anchors: BTreeSet<String>,
 }
 
+impl Document {
+    /// Arguments of every call of a program that the document shows or speaks of, without what follows them in a line; none of the log of
+    /// changes, which speaks of commands that were. Of inline code the values of options may be missing, and `...` is left out.
+    pub fn calls(&self, program: &str) -> Vec<String> {
+        if self.name == "CHANGELOG.md" {
+            return vec![];
+        }
+        let blocks = self.blocks.iter().filter(|block| block.when().is_some());
+        let lines = blocks
+            .flat_map(Block::commands)
+            .chain(self.inline.iter().cloned());
+        let arguments = lines.filter_map(|line| {
+            let line = line.strip_prefix("target/release/").unwrap_or(&line);
+            let typed = line.strip_prefix(program)?.strip_prefix(' ')?;
+            let alone = typed.split(['|', '>', '<', ';', '#', '&']).next()?;
+            Some(alone.replace("...", ""))
+        });
+        arguments.collect()
+    }
+}
+
 /// Reads all documents of the project, in the order of their names.
 ///
 /// # Panics

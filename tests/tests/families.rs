@@ -26,7 +26,7 @@ const SPARSE: usize = 997;
 /// all of them take minutes.
 const MOST: usize = 30_000;
 
-/// Where this variable of the environment is set, every byte is flipped, which takes hours of one core for all families.
+/// Where this variable of the environment is set, every byte is flipped, which takes more than an hour of one core for all families.
 const EVERY_BYTE: &str = "LADS_EVERY_BYTE";
 
 fn image(kind: &str) -> Image {

@@ -178,33 +178,11 @@ fn every_option_of_lads_exists() {
     let program = built(&["--bin", "lads"]).join("lads");
     let mut count = 0;
     for document in documents() {
-        // A log of changes speaks of commands that were.
-        if document.name == "CHANGELOG.md" {
-            continue;
-        }
-        let blocks = document
-            .blocks
-            .iter()
-            .filter(|block| block.when().is_some());
-        let shown = blocks.flat_map(Block::commands);
-        for line in shown.chain(document.inline.iter().cloned()) {
-            let line = line.strip_prefix("target/release/").unwrap_or(&line);
-            let Some(typed) = line.strip_prefix("lads ") else {
-                continue;
-            };
-            // Without what follows its arguments in a line; what the reader fills in may be missing.
-            let alone = typed.split(['|', '>', '<', ';', '#', '&']).next();
-            let arguments = alone.unwrap_or_default().replace("...", "");
-            let said = run(
-                &project_path("."),
-                &format!("'{}' {arguments} --help", program.display()),
-            );
-            if let Err(error) = said {
-                assert!(
-                    error.contains("a value is required"),
-                    "{}: {line}: {error}",
-                    document.name
-                );
+        for arguments in document.calls("lads") {
+            let script = format!("'{}' {arguments} --help", program.display());
+            if let Err(error) = run(&project_path("."), &script) {
+                let spoken_of = error.contains("a value is required");
+                assert!(spoken_of, "{}: lads {arguments}: {error}", document.name);
             }
             count += 1;
         }
