@@ -224,7 +224,7 @@ $(MATURIN)/stamp: runtime/python/pyproject.toml
 
 ## wheel: the Python package `lads` for this platform, into target/wheels
 wheel: $(MATURIN)/stamp
-	$(call first-build,pyo3,the package,2)
+	$(call first-build,pyo3,the package,3)
 	rm -f target/wheels/lads-*.whl
 	$(MATURIN)/bin/python -m maturin build --quiet --release --manifest-path runtime/python/Cargo.toml --out target/wheels
 
