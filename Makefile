@@ -72,10 +72,11 @@ test: setup lint test-rust
 ## test-torch: the tests in Python, of the exporter, of parity and of the package; downloads PyTorch (2.9 GB in all on x86-64 Linux)
 test-torch: test-exporter test-python
 
-## test-full: both, the verdict's size with up to 1,000 pairs, and every command that README.md and the other documents show, as typed, in a copy
-##            of the project; hours
-test-full: test test-torch
+## test-full: both, the verdict's size with up to 1,000 pairs, every byte of an image of every family flipped, and every command that README.md and
+##            the other documents show, as typed, in a copy of the project; hours
+test-full: test test-torch $(FAMILIES)/stamp
 	cargo test --release -p lads-proof -- --ignored --nocapture size
+	LADS_EVERY_BYTE=1 LADS_FAMILIES=$(abspath $(FAMILIES)) cargo test -p lads-tests --test families -- --ignored --nocapture damaged
 	cargo test -p lads-tests --test documents -- --ignored --nocapture
 
 ## setup: MuJoCo and the simulator's assets into vendor/ (idempotent)
@@ -122,7 +123,7 @@ FAMILIES := target/families
 WITH_FAMILIES := $(if $(wildcard $(VENV)/stamp),LADS_FAMILIES=$(abspath $(FAMILIES)))
 FAMILY = --target $(HOST) -p lads-tests --test families
 
-$(FAMILIES)/stamp: tests/parity/families.py $(wildcard exporter/lads_exporter/*.py exporter/lads_exporter/*/*.py)
+$(FAMILIES)/stamp: tests/parity/families.py $(wildcard exporter/lads_exporter/*.py exporter/lads_exporter/*/*.py) | $(VENV)/stamp
 	$(PY) tests/parity/families.py $(FAMILIES)
 	touch $@
 
