@@ -25,6 +25,8 @@ RUNTIME := -p lads-core -p lads-image -p lads-kernels -p lads-compiler -p lads-h
 PUBLISHED := -p lads-kernels -p lads-image -p lads-core -p lads-compiler -p lads-host -p lads-import -p lads-pace -p lads-proof -p lads-record -p lads-ffi -p lads-cli
 
 PREFIX  ?= /usr/local
+# A random policy of every family, for tests of all of them.
+FAMILIES := target/families
 
 .PHONY: run report compare record viewer say language verify tune mutate frames features test test-torch test-full setup lint test-rust test-runtime test-exporter test-python test-targets wheel sanitize fuzz package msrv deny unused book lock cluster test-cluster collect train export table reference install bench clean help
 
@@ -119,7 +121,6 @@ PADDED = --skip touches_no_byte
 MEMCHECK = CARGO_TARGET_$(shell echo $(HOST) | tr a-z- A-Z_)_RUNNER="valgrind --quiet --error-exitcode=99" PROPTEST_CASES=8
 
 # Small random policies of every family. Where the exporter's environment (PyTorch) is, sanitizers and fuzzers see the images of all of them.
-FAMILIES := target/families
 WITH_FAMILIES := $(if $(wildcard $(VENV)/stamp),LADS_FAMILIES=$(abspath $(FAMILIES)))
 FAMILY = --target $(HOST) -p lads-tests --test families
 
